@@ -1,6 +1,8 @@
-"""Build the wheel and the archive of sources, check them, install each into a fresh environment, and run it there.
+"""Build the wheel and the archive of sources, check them, install each into a fresh environment,
+and run it there.
 
-Usage: python .ci/dist.py FOLDER, which gets the two files. Needs an index of packages, as pip has it.
+Usage: python .ci/dist.py FOLDER, which gets the two files. Needs an index of packages, as pip has
+it.
 """
 
 import os
@@ -19,17 +21,33 @@ def run(*words: str | Path, folder: Path | None = None) -> str:
     """Run a program, in the folder; what it printed. Its failure is ours."""
     print("$", *words, flush=True)
     # Neither these sources nor kernels compiled of them.
-    environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "NUMBA_CACHE_DIR")}
+    environment = {
+        name: value
+        for name, value in os.environ.items()
+        if name not in ("PYTHONPATH", "NUMBA_CACHE_DIR")
+    }
     return subprocess.run(
-        [str(word) for word in words], cwd=folder, env=environment | {"PYTHONUTF8": "1"}, check=True,
-        stdout=subprocess.PIPE, encoding="utf-8",
-    ).stdout  # fmt: skip
+        [str(word) for word in words],
+        cwd=folder,
+        env=environment | {"PYTHONUTF8": "1"},
+        check=True,
+        stdout=subprocess.PIPE,
+        encoding="utf-8",
+    ).stdout
 
 
 def environment_of(folder: Path, *requirements: str | Path) -> Path:
     """A fresh environment with these packages; the folder of its programs."""
     venv.create(folder, with_pip=True)
-    run(folder / SCRIPTS / "python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *requirements)
+    run(
+        folder / SCRIPTS / "python",
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--disable-pip-version-check",
+        *requirements,
+    )
     return folder / SCRIPTS
 
 
@@ -40,9 +58,37 @@ def try_out(built: Path, folder: Path) -> None:
     version = run(programs / "tetopt", "--version", folder=folder).split()[-1]
     if f"-{version}" not in built.name:
         raise SystemExit(f"{built.name}: expected its version, tetopt says that it is {version}")
-    run(programs / "tetopt", "phantom", "sphere", "-o", "sphere.nii.gz", "--voxel-mm", "4", folder=folder)
-    run(programs / "tetopt", "mesh", "sphere.nii.gz", "-o", "sphere.vtu", "--nodes", "300", folder=folder)
-    print(run(programs / "tetopt", "quality", "sphere.vtu", "--image", "sphere.nii.gz", "--check", folder=folder))
+    run(
+        programs / "tetopt",
+        "phantom",
+        "sphere",
+        "-o",
+        "sphere.nii.gz",
+        "--voxel-mm",
+        "4",
+        folder=folder,
+    )
+    run(
+        programs / "tetopt",
+        "mesh",
+        "sphere.nii.gz",
+        "-o",
+        "sphere.vtu",
+        "--nodes",
+        "300",
+        folder=folder,
+    )
+    print(
+        run(
+            programs / "tetopt",
+            "quality",
+            "sphere.vtu",
+            "--image",
+            "sphere.nii.gz",
+            "--check",
+            folder=folder,
+        )
+    )
 
 
 def main(out: Path) -> None:

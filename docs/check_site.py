@@ -1,6 +1,8 @@
-"""Look at every page of a built site: python check_site.py HTML_FOLDER; it ends with 1 where a link leads nowhere.
+"""Look at every page of a built site: python check_site.py HTML_FOLDER; it ends with 1 where a link
+leads nowhere.
 
-Nothing but links that a reader clicks may point to another place: pages, scripts and pictures come from the folder.
+Nothing but links that a reader clicks may point to another place: pages, scripts and pictures come
+from the folder.
 """
 
 import sys
@@ -33,14 +35,20 @@ class Page(HTMLParser):
 
 def faults_of(site: Path) -> list[str]:
     """A line for each link or load that leads nowhere."""
-    files = [path for path in sorted(site.rglob("*.html")) if "_static" not in path.parts]  # the theme's own templates
+    # the theme's own templates
+    files = [path for path in sorted(site.rglob("*.html")) if "_static" not in path.parts]
     pages = {path: Page(path.read_text(encoding="utf-8")) for path in files}
     faults = []
     for path, page in pages.items():
         where = path.relative_to(site)
-        for is_load, address in [*((False, link) for link in page.links), *((True, load) for load in page.loads)]:
+        for is_load, address in [
+            *((False, link) for link in page.links),
+            *((True, load) for load in page.loads),
+        ]:
             parts = urlsplit(address)
-            if parts.scheme == "data" or (parts.scheme in ("http", "https", "mailto") and not is_load):
+            if parts.scheme == "data" or (
+                parts.scheme in ("http", "https", "mailto") and not is_load
+            ):
                 continue
             if parts.scheme or parts.netloc:
                 faults.append(f"{where}: loads {address}, which is not in the site")
@@ -48,7 +56,11 @@ def faults_of(site: Path) -> list[str]:
             target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
             if not target.is_file():
                 faults.append(f"{where}: {address} is not there")
-            elif parts.fragment and target in pages and unquote(parts.fragment) not in pages[target].names:
+            elif (
+                parts.fragment
+                and target in pages
+                and unquote(parts.fragment) not in pages[target].names
+            ):
                 faults.append(f"{where}: {address} has no such place on its page")
     return faults if pages else [f"{site}: no page"]
 

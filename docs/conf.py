@@ -1,4 +1,6 @@
-"""The documentation's site, which `make docs` builds into docs/_build/html; nothing is fetched for it."""
+"""The documentation's site, which `make docs` builds into docs/_build/html; nothing is fetched
+for it.
+"""
 
 import html
 import inspect
@@ -42,14 +44,18 @@ default_role = "py:obj"  # names in docstrings are links where they are public
 templates_path = ["_templates"]
 numpydoc_show_class_members = False
 numpydoc_xref_param_type = True
-numpydoc_xref_aliases = {name: f"tetopt.{name}" for name in tetopt.__all__ if inspect.isclass(getattr(tetopt, name))}
+numpydoc_xref_aliases = {
+    name: f"tetopt.{name}" for name in tetopt.__all__ if inspect.isclass(getattr(tetopt, name))
+}
 numpydoc_xref_ignore = "all"  # words of types that are not ours
 numpydoc.xref.DEFAULT_LINKS.clear()  # to Python's own pages, which are not fetched
 autodoc_typehints = "none"  # the docstrings say types, shapes and units
 autodoc_member_order = "bysource"
 python_maximum_signature_line_length = 72  # longer ones have a line for each parameter
 # Names that differ by case alone would be one file on Windows and macOS.
-autosummary_filename_map = {f"tetopt.{name}": f"tetopt.{name}_record" for name in ("Content", "Quality")}
+autosummary_filename_map = {
+    f"tetopt.{name}": f"tetopt.{name}_record" for name in ("Content", "Quality")
+}
 copybutton_exclude = ".linenos, .gp, .go"
 
 sphinx_gallery_conf = {
@@ -92,14 +98,19 @@ def described(app, doctree):
         if node.tagname == "paragraph":
             text = node.astext().replace("\n", " ")
         elif node.tagname == "imgsgnode" and text:
-            titles = "" if node["alt"].startswith("plot ") else f" {node['alt']}"  # else the program's own name
+            # else the program's own name
+            titles = "" if node["alt"].startswith("plot ") else f" {node['alt']}"
             node["alt"] = html.escape(text) + titles  # sphinx-gallery escapes nothing
 
 
 def setup(app):
-    """Fields of records are in their docstring; what Python says of them ("Alias for field number 0") is left out."""
+    """Fields of records are in their docstring; what Python says of them ("Alias for field
+    number 0") is left out.
+    """
     app.connect("doctree-read", described)
     app.connect(
         "autodoc-skip-member",
-        lambda app, what, name, value, skip, options: True if type(value).__name__ == "_tuplegetter" else None,
+        lambda app, what, name, value, skip, options: (
+            True if type(value).__name__ == "_tuplegetter" else None
+        ),
     )

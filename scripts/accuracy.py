@@ -1,10 +1,12 @@
 """Nodes and seconds that meshers need for the same error: prints and writes JSON.
 
-    python scripts/accuracy.py -o accuracy.json [IMAGE] --cgal CGAL --head LABELS --cgal-sized CGAL_SIZED
+    python scripts/accuracy.py -o accuracy.json [IMAGE] --cgal CGAL --head LABELS --cgal-sized
+    CGAL_SIZED
 
-tetopt meshes IMAGE, by default the MNI152 T1, with 5,000 nodes. pytetwild and CGAL mesh its classes, with more nodes
-until they leave as little of the variance unexplained. Then CGAL meshes the labels of a head, and tetopt the same with
-fewer nodes, as long as no label's Dice is below CGAL's. For the programs, see `scripts/benchmark.py`.
+tetopt meshes IMAGE, by default the MNI152 T1, with 5,000 nodes. pytetwild and CGAL mesh its
+classes, with more nodes until they leave as little of the variance unexplained. Then CGAL meshes
+the labels of a head, and tetopt the same with fewer nodes, as long as no label's Dice is below
+CGAL's. For the programs, see `scripts/benchmark.py`.
 """
 
 from __future__ import annotations
@@ -29,18 +31,24 @@ from tetopt.study.pipelines import PIPELINES, PipelineInput
 from tetopt.system.files import checked_output, save_json
 
 NODES = 5_000
-HEAD_COUNTS = (30_000, 40_000, 60_000, 90_000, HEAD_NODES)  # of tetopt on the head, until its Dice suffices
+# of tetopt on the head, until its Dice suffices
+HEAD_COUNTS = (30_000, 40_000, 60_000, 90_000, HEAD_NODES)
 ERROR_TOLERANCE = 0.03  # of the error: a search ends this close below it
 MOST_RUNS = 8
-Mesher = Callable[[float], tuple[tetopt.Mesh, float]]  # of a number of nodes to the mesh and its seconds
+# of a number of nodes to the mesh and its seconds
+Mesher = Callable[[float], tuple[tetopt.Mesh, float]]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure, print each row and write a JSON file."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("image", type=Path, nargs="?", help="volume to measure on")
     parser.add_argument("-o", "--output", type=Path, required=True, help="JSON file")
-    parser.add_argument("--cgal", required=True, help="program that meshes labels with CGAL's Mesh_3")
+    parser.add_argument(
+        "--cgal", required=True, help="program that meshes labels with CGAL's Mesh_3"
+    )
     parser.add_argument("--cgal-sized", help="the same with a sizing field")
     parser.add_argument("--head", type=Path, help="labels of a whole head")
     parser.add_argument("--force", action="store_true", help="replace an existing file")
@@ -56,23 +64,41 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def same_error(path: Path, cgal: str) -> dict[str, Any]:
-    """Nodes and seconds of tetopt, and of the others at its unexplained fraction of the variance."""
+    """Nodes and seconds of tetopt, and of the others at its unexplained fraction of the
+    variance.
+    """
     image = tetopt.load_image(path)
     variance = float(np.var(image.data, dtype=np.float64)) * image.volume
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        ours = [sys.executable, "-m", "tetopt", "mesh", str(path), "-o", str(folder / "ours.vtu"), "--force"]
+        ours = [
+            sys.executable,
+            "-m",
+            "tetopt",
+            "mesh",
+            str(path),
+            "-o",
+            str(folder / "ours.vtu"),
+            "--force",
+        ]
         seconds = min(process_seconds([*ours, "--nodes", str(NODES)])[0] for _ in range(2))
         error = tetopt.E_D(image, tetopt.load_mesh(folder / "ours.vtu").mesh) / variance
         rows: dict[str, Any] = {"tetopt": {"nodes": NODES, "seconds": seconds, "error": error}}
-        for peer, mesher in {"cgal": _cgal(cgal, image, folder), "pytetwild": _pytetwild(image)}.items():
+        for peer, mesher in {
+            "cgal": _cgal(cgal, image, folder),
+            "pytetwild": _pytetwild(image),
+        }.items():
             rows[peer] = _at_error(mesher, lambda mesh: tetopt.E_D(image, mesh) / variance, error)
             print(peer, rows[peer], flush=True)
     return rows
 
 
-def _at_error(mesher: Mesher, error_of: Callable[[tetopt.Mesh], float], goal: float) -> dict[str, Any]:
-    """Return the run with the fewest nodes whose error is at most the goal, by secants of log error over log nodes."""
+def _at_error(
+    mesher: Mesher, error_of: Callable[[tetopt.Mesh], float], goal: float
+) -> dict[str, Any]:
+    """Return the run with the fewest nodes whose error is at most the goal, by secants of log
+    error over log nodes.
+    """
     runs: list[tuple[int, float, float]] = []
     request, slope = 3.0 * NODES, -0.6
     for _ in range(MOST_RUNS):
@@ -86,18 +112,24 @@ def _at_error(mesher: Mesher, error_of: Callable[[tetopt.Mesh], float], goal: fl
             slope = float(np.clip(np.log(e / f) / np.log(n / m), -1.5, -0.2)) if n != m else slope
         near = min(runs, key=lambda run: abs(np.log(run[2] / goal)))
         aim = (1.0 - ERROR_TOLERANCE / 2) * goal
-        request *= float(np.clip((aim / near[2]) ** (1.0 / slope) * near[0] / runs[-1][0], 0.25, 4.0))
+        request *= float(
+            np.clip((aim / near[2]) ** (1.0 / slope) * near[0] / runs[-1][0], 0.25, 4.0)
+        )
     fewest = min((run for run in runs if run[2] <= goal), default=min(runs, key=lambda run: run[2]))
     return {"nodes": fewest[0], "seconds": fewest[1], "error": fewest[2], "runs": runs}
 
 
 def _pytetwild(image: tetopt.Image) -> Mesher:
-    """Return pytetwild as a mesher of the image's classes, in one run: the number of nodes need not be met."""
+    """Return pytetwild as a mesher of the image's classes, in one run: the number of nodes need
+    not be met.
+    """
     tetwild.TETWILD_RUNS = 1
 
     def mesher(nodes: float) -> tuple[tetopt.Mesh, float]:
         produced = PIPELINES["pytetwild"].function(PipelineInput(image, None, round(nodes)))
-        return produced.mesh, sum(each for step, each in produced.seconds.items() if step != "search")
+        return produced.mesh, sum(
+            each for step, each in produced.seconds.items() if step != "search"
+        )
 
     return mesher
 
@@ -115,7 +147,9 @@ def _cgal(program: str, image: tetopt.Image, folder: Path) -> Mesher:
 
 
 def mesh_of(path: Path, image: tetopt.Image) -> tuple[tetopt.Mesh, NDArray[np.int64]]:
-    """Read the mesh that CGAL's program wrote for an image padded by a voxel, and its cells' labels."""
+    """Read the mesh that CGAL's program wrote for an image padded by a voxel, and its cells'
+    labels.
+    """
     data = path.read_bytes()
     n_points, n_cells = np.frombuffer(data, np.int32, 2)
     points = np.frombuffer(data, np.float64, 3 * n_points, 8).reshape(-1, 3) / image.spacing - 1.0
@@ -129,14 +163,19 @@ def mesh_of(path: Path, image: tetopt.Image) -> tuple[tetopt.Mesh, NDArray[np.in
 
 
 def same_dice(path: Path, cgal: str) -> dict[str, Any]:
-    """Nodes, seconds and Dice of CGAL on a head, and of tetopt with the fewest nodes that reach CGAL's Dice."""
+    """Nodes, seconds and Dice of CGAL on a head, and of tetopt with the fewest nodes that reach
+    CGAL's Dice.
+    """
     labels = tetopt.load_image(path)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         command, _ = sized_head(cgal, labels, HEAD_NODES, folder)
         seconds, _ = process_seconds(command)
         mesh, of_cell = mesh_of(folder / "mesh.bin", labels)
-        rows: dict[str, Any] = {"counts": HEAD_COUNTS, "cgal": {"nodes": len(mesh.points), "seconds": seconds}}
+        rows: dict[str, Any] = {
+            "counts": HEAD_COUNTS,
+            "cgal": {"nodes": len(mesh.points), "seconds": seconds},
+        }
         rows["cgal"]["dice"] = dice = _dice(labels, mesh, of_cell)
         for nodes in HEAD_COUNTS:
             seconds, _ = process_seconds(head_command(path, folder, nodes), allowed=(0, 1))

@@ -3,10 +3,10 @@
     python scripts/measure.py DATA [--only NAME ...]
     python scripts/measure.py --pages
 
-DATA is a folder with the images of `FILES`. Each measurement runs its commands one after the other, in a folder of its
-own, and replaces its entry in docs/measured/measured.json, with version, commit, date and machine. Pages are written
-from scripts/templates and that file (`--pages`: without measuring). Leave the machine idle: the whole takes an
-two hours on two cores, with CGAL.
+DATA is a folder with the images of `FILES`. Each measurement runs its commands one after the other,
+in a folder of its own, and replaces its entry in docs/measured/measured.json, with version, commit,
+date and machine. Pages are written from scripts/templates and that file (`--pages`: without
+measuring). Leave the machine idle: the whole takes an two hours on two cores, with CGAL.
 """
 
 from __future__ import annotations
@@ -47,7 +47,8 @@ PROGRAMS = {
     "CGAL_SIZED": "the same with a sizing field",
     "CGAL_LABELS": "Python script that runs it, for `tetopt compare --pipeline`",
 }
-PICTURES = {"mni152": ("compared/slices.png", "demo.png")}  # of a measurement: its file, and the name in docs/pictures
+# of a measurement: its file, and the name in docs/pictures
+PICTURES = {"mni152": ("compared/slices.png", "demo.png")}
 
 FILES = {
     "T1": "mni_icbm152_t1_tal_nlin_sym_09a_converted.nii.gz",
@@ -67,7 +68,10 @@ FILES = {
 
 def runs(folder: Path) -> dict[str, Any]:
     """Summaries of the runs whose `run.json` files are in a folder, by name."""
-    return {path.stem: run_summary(json.loads(path.read_text())) for path in sorted(folder.glob("*.json"))}
+    return {
+        path.stem: run_summary(json.loads(path.read_text()))
+        for path in sorted(folder.glob("*.json"))
+    }
 
 
 def run_summary(run: dict[str, Any]) -> dict[str, Any]:
@@ -82,7 +86,9 @@ def run_summary(run: dict[str, Any]) -> dict[str, Any]:
             "folded": surface["folded"],
             "is_lost": row["is_lost"],
         }
-    contacts = [c for c in run.get("contacts") or [] if c["ratio"] is None or c["ratio"] > TOLERATED_CONTACT]
+    contacts = [
+        c for c in run.get("contacts") or [] if c["ratio"] is None or c["ratio"] > TOLERATED_CONTACT
+    ]
     return {
         "nodes": run["size"]["n_nodes_in_all"],
         "cells": quality["n_cells"],
@@ -93,7 +99,9 @@ def run_summary(run: dict[str, Any]) -> dict[str, Any]:
         "min_dihedral": quality["min_dihedral"],
         "p1_dihedral": quality["p1_dihedral"],
         "slivers": quality["kinds"]["sliver"],
-        "initial": {key: run["quality_initial"][key] for key in ("mean_rho", "p1_rho", "min_dihedral")},
+        "initial": {
+            key: run["quality_initial"][key] for key in ("mean_rho", "p1_rho", "min_dihedral")
+        },
         "seconds": run["seconds"]["all"],
         "peak_gb": run["memory"]["peak_bytes"] / 1e9,
         "mask": run.get("mask"),
@@ -118,7 +126,9 @@ def comparison(folder: Path) -> dict[str, Any]:
                 raise SystemExit(f"measure: {result['name']}: {result['failure']}")
             run = result["median"]
             times = {"seconds": run["seconds_total"], "peak_gb": run["peak_bytes"] / 1e9}
-            meshes.setdefault(result["name"], {})[order] = mesh_summary(run, report["options"]["average"]) | times
+            meshes.setdefault(result["name"], {})[order] = (
+                mesh_summary(run, report["options"]["average"]) | times
+            )
     return {"reference": report["reference"], "meshes": meshes}
 
 
@@ -132,7 +142,9 @@ def mesh_summary(measured: dict[str, Any], average: str) -> dict[str, Any]:
         **{key: quality[key] for key in ("mean_rho", "p1_rho", "min_dihedral", "p1_dihedral")},
         "bad": sum(quality["kinds"].values()) / quality["n_cells"],
         "cond": {nu: solution["cond"] for nu, solution in measured["fem"].items()},
-        "cg_iterations": {nu: solution["cg_iterations"] for nu, solution in measured["fem"].items()},
+        "cg_iterations": {
+            nu: solution["cg_iterations"] for nu, solution in measured["fem"].items()
+        },
         "errors": {nu: {average: solution["errors"]} for nu, solution in measured["fem"].items()},
         "labels": {str(row["label"]): {"dice": row["dice"]} for row in measured["labels"]},
     }
@@ -146,9 +158,12 @@ def benchmark(folder: Path) -> dict[str, Any]:
 
 
 class Measurement(NamedTuple):
-    """Commands, run in a folder of their own, and the function that reads the rows from their files."""
+    """Commands, run in a folder of their own, and the function that reads the rows from their
+    files.
+    """
 
-    commands: tuple[str, ...]  # $NAME: an image's path, or a program's; as words of a shell, which is not used
+    # $NAME: an image's path, or a program's; as words of a shell, which is not used
+    commands: tuple[str, ...]
     rows: Callable[[Path], Any]
 
 
@@ -157,14 +172,16 @@ CGAL = "--pipeline 'cgal=$PYTHON $CGAL_LABELS {labels} -o {output} --size {size}
 MEASUREMENTS = {
     "mni152": Measurement(
         (
-            f"tetopt compare $T1 {COMPARED} --nodes 5000 --pipelines tetopt,tetopt-uniform,pytetwild,bcc {CGAL} "
+            f"tetopt compare $T1 {COMPARED} --nodes 5000 --pipelines "
+            f"tetopt,tetopt-uniform,pytetwild,bcc {CGAL} "
             "--reference-dofs 1000000",
         ),
         comparison,
     ),
     "tissues": Measurement(
         (
-            f"tetopt compare $T1 --labels $TISSUES {COMPARED} --nodes 5000 --pipelines tetopt,pytetwild {CGAL} "
+            f"tetopt compare $T1 --labels $TISSUES {COMPARED} --nodes 5000 --pipelines "
+            f"tetopt,pytetwild {CGAL} "
             "--reference-dofs 1000000",
         ),
         comparison,
@@ -194,22 +211,29 @@ MEASUREMENTS = {
     ),
     "labels": Measurement(
         (
-            "tetopt mesh $TISSUES --labels $TISSUES -o tissues.vtu --json tissues.json --nodes 15000 --force",
-            "tetopt mesh $TISSUES --labels $TISSUES --background 0 -o within.vtu --json within.json --nodes 15000 "
+            "tetopt mesh $TISSUES --labels $TISSUES -o tissues.vtu --json tissues.json --nodes "
+            "15000 --force",
+            "tetopt mesh $TISSUES --labels $TISSUES --background 0 -o within.vtu --json "
+            "within.json --nodes 15000 "
             "--force",
-            "tetopt mesh $CT_SLAB --labels $CT_LABELS -o organs.vtu --json organs.json --nodes 5000 --force",
+            "tetopt mesh $CT_SLAB --labels $CT_LABELS -o organs.vtu --json organs.json --nodes "
+            "5000 --force",
         ),
         runs,
     ),
     "masks": Measurement(
         (
-            "tetopt mesh $HIPPOCAMPUS --background 0 -o hippocampus.vtu --json hippocampus.json --nodes 1500 --force",
+            "tetopt mesh $HIPPOCAMPUS --background 0 -o hippocampus.vtu --json hippocampus.json "
+            "--nodes 1500 --force",
             "tetopt mesh $T1 --background 0 -o brain.vtu --json brain.json --nodes 15000 --force",
         ),
         runs,
     ),
     "edges": Measurement(
-        ("python tests/benchmarks/default_sizes.py $CT $PROSTATE -o edges.json --orders 1 --ratios 1.4 1.15 1.0",),
+        (
+            "python tests/benchmarks/default_sizes.py $CT $PROSTATE -o edges.json --orders 1 "
+            "--ratios 1.4 1.15 1.0",
+        ),
         listed("edges.json"),
     ),
     "averages": Measurement(
@@ -224,23 +248,46 @@ MEASUREMENTS = {
         listed("curved.json"),
     ),
     "accuracy": Measurement(
-        ("python scripts/accuracy.py -o accuracy.json $T1 --cgal $CGAL --head $HEAD --cgal-sized $CGAL_SIZED --force",),
+        (
+            "python scripts/accuracy.py -o accuracy.json $T1 --cgal $CGAL --head $HEAD "
+            "--cgal-sized $CGAL_SIZED --force",
+        ),
         listed("accuracy.json"),
     ),
     "speed": Measurement(
-        ("python scripts/benchmark.py -o bench.json --cgal $CGAL --cgal-sized $CGAL_SIZED --head $HEAD --force",),
+        (
+            "python scripts/benchmark.py -o bench.json --cgal $CGAL --cgal-sized $CGAL_SIZED "
+            "--head $HEAD --force",
+        ),
         benchmark,
     ),
 }
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Measure, keep the rows, and write the pages; 2 with one line if an image or a program is missing."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    """Measure, keep the rows, and write the pages; 2 with one line if an image or a program is
+    missing.
+    """
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("data", type=Path, nargs="?", help="folder with the images")
-    parser.add_argument("--only", nargs="+", choices=[*MEASUREMENTS], default=[*MEASUREMENTS], help="what to measure")
-    parser.add_argument("--pages", action="store_true", help="write the pages from the numbers in measured.json")
-    parser.add_argument("--folder", type=Path, default=ROOT / "measured", help="where runs write files (%(default)s)")
+    parser.add_argument(
+        "--only",
+        nargs="+",
+        choices=[*MEASUREMENTS],
+        default=[*MEASUREMENTS],
+        help="what to measure",
+    )
+    parser.add_argument(
+        "--pages", action="store_true", help="write the pages from the numbers in measured.json"
+    )
+    parser.add_argument(
+        "--folder",
+        type=Path,
+        default=ROOT / "measured",
+        help="where runs write files (%(default)s)",
+    )
     for name, words in PROGRAMS.items():
         parser.add_argument(f"--{name.lower().replace('_', '-')}", type=Path, dest=name, help=words)
     options = parser.parse_args(argv)
@@ -248,13 +295,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         if options.data is None:
             parser.error("expected the folder with the images, got none; give it, or use --pages")
         given = {name: options.data / file for name, file in FILES.items()}
-        given |= {name: getattr(options, name) for name in PROGRAMS if getattr(options, name) is not None}
+        given |= {
+            name: getattr(options, name) for name in PROGRAMS if getattr(options, name) is not None
+        }
         paths = {name: str(path.resolve()) for name, path in given.items() if path.is_file()}
         needed = {name: words_of(name) for name in options.only}
         paths["PYTHON"] = sys.executable
         missing = {each for words in needed.values() for each in words} - set(paths)
         if missing:
-            print(f"measure: expected a file for each of {', '.join(sorted(missing))}, got none", file=sys.stderr)
+            print(
+                f"measure: expected a file for each of {', '.join(sorted(missing))}, got none",
+                file=sys.stderr,
+            )
             return 2
         for name in options.only:
             measure(name, paths, options.folder / name)
@@ -273,10 +325,15 @@ def words_of(name: str) -> set[str]:
 
 def measure(name: str, paths: dict[str, str], folder: Path) -> None:
     """Run a measurement's commands, and replace its entry in `DATA`."""
-    if (folder / LOG).exists():  # of an earlier measurement, whose outputs would be rejected or read again
+    # of an earlier measurement, whose outputs would be rejected or read again
+    if (folder / LOG).exists():
         shutil.rmtree(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    entry: dict[str, Any] = {"version": tetopt.__version__, "commit": commit(), "date": f"{datetime.date.today()}"}
+    entry: dict[str, Any] = {
+        "version": tetopt.__version__,
+        "commit": commit(),
+        "date": f"{datetime.date.today()}",
+    }
     entry |= {"machine": machine(), "load": os.getloadavg()[0], "commands": []}
     for command in MEASUREMENTS[name].commands:
         words = [Template(word).substitute(paths) for word in shlex.split(command)]
@@ -284,9 +341,12 @@ def measure(name: str, paths: dict[str, str], folder: Path) -> None:
         before, begin = os.times(), time.perf_counter()
         with (folder / LOG).open("a") as log:
             code = subprocess.run(runnable(words), cwd=folder, stdout=log, stderr=log).returncode
-        # A mesh that violates a requirement (1) is measured, and its row names it; a program that failed is not.
+        # A mesh that violates a requirement (1) is measured, and its row names it; a program that
+        # failed is not.
         if code != 0 and not (code == 1 and words[:2] == ["tetopt", "mesh"]):
-            raise SystemExit(f"measure: {name}: exit code {code} of {shlex.join(words)}; see {folder / LOG}")
+            raise SystemExit(
+                f"measure: {name}: exit code {code} of {shlex.join(words)}; see {folder / LOG}"
+            )
         after, wall = os.times(), time.perf_counter() - begin
         cpu = sum(after[2:4]) - sum(before[2:4])
         entry["commands"].append({"command": command, "wall": wall, "cpu": cpu})
@@ -299,7 +359,14 @@ def measure(name: str, paths: dict[str, str], folder: Path) -> None:
 
 def save_picture(folder: Path, drawn: str, name: str) -> None:
     """Put a picture that a measurement drew into docs/pictures, with few colours."""
-    shrink = [ROOT / "docs" / "draw_documents.py", "-o", folder, "--force", "--shrink", folder / drawn]
+    shrink = [
+        ROOT / "docs" / "draw_documents.py",
+        "-o",
+        folder,
+        "--force",
+        "--shrink",
+        folder / drawn,
+    ]
     subprocess.run([sys.executable, *map(str, shrink)], check=True)
     shutil.copyfile(folder / Path(drawn).name, ROOT / "docs" / "pictures" / name)
 
@@ -307,22 +374,35 @@ def save_picture(folder: Path, drawn: str, name: str) -> None:
 def runnable(words: list[str]) -> list[str]:
     """The command with this Python, and with the project's own scripts by their whole paths."""
     first = {"tetopt": [sys.executable, "-m", "tetopt"], "python": [sys.executable]}[words[0]]
-    return [*first, *(str(ROOT / word) if (ROOT / word).suffix == ".py" else word for word in words[1:])]
+    return [
+        *first,
+        *(str(ROOT / word) if (ROOT / word).suffix == ".py" else word for word in words[1:]),
+    ]
 
 
 def commit() -> str:
-    """The commit that is measured, with `+` where files differ from it, other than those that this script writes."""
+    """The commit that is measured, with `+` where files differ from it, other than those that
+    this script writes.
+    """
     git, written = ["git", "-C", str(ROOT)], (":!docs/measured", ":!docs/pictures", ":!README.md")
-    name = subprocess.run([*git, "rev-parse", "--short", "HEAD"], check=True, capture_output=True, text=True).stdout
-    differs = subprocess.run([*git, "diff", "--quiet", "HEAD", "--", ":/", *written]).returncode != 0
+    name = subprocess.run(
+        [*git, "rev-parse", "--short", "HEAD"], check=True, capture_output=True, text=True
+    ).stdout
+    differs = (
+        subprocess.run([*git, "diff", "--quiet", "HEAD", "--", ":/", *written]).returncode != 0
+    )
     return name.strip() + "+" * differs
 
 
 def machine() -> str:
     """The machine in words."""
-    models = re.findall(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text()) or [platform.processor()]
+    models = re.findall(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text()) or [
+        platform.processor()
+    ]
     memory = psutil.virtual_memory().total / 1e9
-    return f"{os.cpu_count()} cores ({models[0]}), {memory:.0f} GB, Python {platform.python_version()}"
+    return (
+        f"{os.cpu_count()} cores ({models[0]}), {memory:.0f} GB, Python {platform.python_version()}"
+    )
 
 
 def rounded(value: Any) -> Any:
@@ -348,13 +428,20 @@ def pages() -> dict[Path, str]:
     )
     environment.filters |= STYLES
     measured = json.loads(DATA.read_text())
-    environment.globals |= {"m": measured, "about": lambda *names: about(measured, names), "head": head, "line": line}
+    environment.globals |= {
+        "m": measured,
+        "about": lambda *names: about(measured, names),
+        "head": head,
+        "line": line,
+    }
     texts = {}
     for template in sorted(TEMPLATES.glob("*.md")):
         text = environment.get_template(template.name).render()
         if template.name == README:
             before, rest = (ROOT / README).read_text(encoding="utf-8").split(MARKS[0])
-            texts[ROOT / README] = f"{before}{MARKS[0]}\n\n{text}\n{MARKS[1]}{rest.split(MARKS[1])[1]}"
+            texts[ROOT / README] = (
+                f"{before}{MARKS[0]}\n\n{text}\n{MARKS[1]}{rest.split(MARKS[1])[1]}"
+            )
         else:
             texts[PAGES / template.name] = text
     return texts
@@ -393,12 +480,23 @@ def head(*titles: str) -> str:
     return f"| {' | '.join(titles)} |\n|{'---|' * len(titles)}"
 
 
-def line(title: str, rows: dict[str, Any], names: Sequence[str], path: str, style: str = "f", *digits: int) -> str:
-    """A row of a table: of each of the named rows, the value at a path of keys with slashes between.
+def line(
+    title: str,
+    rows: dict[str, Any],
+    names: Sequence[str],
+    path: str,
+    style: str = "f",
+    *digits: int,
+) -> str:
+    """A row of a table: of each of the named rows, the value at a path of keys with slashes
+    between.
 
     A mesh that could not be compressed has empty `errors` and `cond`, and a dash.
     """
-    values = [reduce(lambda value, key: value and value[key], path.split("/"), rows[name]) for name in names]
+    values = [
+        reduce(lambda value, key: value and value[key], path.split("/"), rows[name])
+        for name in names
+    ]
     words = ["–" if value == {} else STYLES[style](value, *digits) for value in values]
     return f"| {title} | {' | '.join(words)} |"
 

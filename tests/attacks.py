@@ -14,7 +14,8 @@ def outside(folder):
     (place / "deep").mkdir(parents=True)
     (place / "notes.txt").write_text("years of work")
     (place / "deep" / "more.txt").write_text("and more")
-    with suppress(PermissionError):  # as root: a device of its own, which code that follows links may ruin
+    # as root: a device of its own, which code that follows links may ruin
+    with suppress(PermissionError):
         os.mknod(place / "zero", stat.S_IFCHR | 0o666, os.makedev(1, 5))
     return place
 
@@ -24,8 +25,12 @@ def planted(kind, place, elsewhere):
     if place.is_dir() and not place.is_symlink():
         shutil.rmtree(place)
     place.unlink(missing_ok=True)
-    targets = {"file link": elsewhere / "notes.txt", "folder link": elsewhere, "hanging link": elsewhere / "new",
-               "device link": elsewhere / "zero" if (elsewhere / "zero").exists() else "/dev/zero"}  # fmt: skip
+    targets = {
+        "file link": elsewhere / "notes.txt",
+        "folder link": elsewhere,
+        "hanging link": elsewhere / "new",
+        "device link": elsewhere / "zero" if (elsewhere / "zero").exists() else "/dev/zero",
+    }
     if kind in targets:
         place.symlink_to(targets[kind])
     elif kind == "hard link":

@@ -1,4 +1,6 @@
-"""Folders of cohorts as runs leave them, made up: numbers that scatter, failures, and names that mean harm."""
+"""Folders of cohorts as runs leave them, made up: numbers that scatter, failures, and names that
+mean harm.
+"""
 
 import io
 import json
@@ -25,34 +27,63 @@ def run_of(rng, affine=None, mask_volume=None, lost=None, violated=None, absent=
     n_cells = round(45000 * float(np.exp(0.03 * rng.normal())))
     sizes = volume * np.array([0.9, 0.003, 0.003]) * np.exp(0.1 * rng.normal(size=3))
     labels = [
-        {"label": number, "voxels": round(size), "volume": float(size), "dice": float(rng.normal(0.95, 0.006)),
-         "n_cells": 0 if number == lost else 300, "is_lost": number == lost}
+        {
+            "label": number,
+            "voxels": round(size),
+            "volume": float(size),
+            "dice": float(rng.normal(0.95, 0.006)),
+            "n_cells": 0 if number == lost else 300,
+            "is_lost": number == lost,
+        }
         for number, size in zip(LABELS, sizes, strict=True)
         if number != absent
-    ]  # fmt: skip
+    ]
     return {
         "image": f"T1 {HOSTILE}.nii.gz",
         "image_sha256": rng.bytes(16).hex(),
-        "inputs": {"images": [HOSTILE], "weights": [1.0], "mask": "mask.nii.gz", "sha256": {HOSTILE: "0"}},
+        "inputs": {
+            "images": [HOSTILE],
+            "weights": [1.0],
+            "mask": "mask.nii.gz",
+            "sha256": {HOSTILE: "0"},
+        },
         "box": {"shape": [180, 220, 170], "affine": np.asarray(affine).tolist()},
         "options": {"nodes": 8000, "k_D": 0.85, "volume": None, "method": "fast"},
-        "request": {"options": {"nodes": 8000, "young": "3.0", "format": ".vtu"}, "sha256": rng.bytes(16).hex()},
+        "request": {
+            "options": {"nodes": 8000, "young": "3.0", "format": ".vtu"},
+            "sha256": rng.bytes(16).hex(),
+        },
         "versions": {"tetopt": "0.1.0", "numpy": "2.4.6"},
-        "energies": {"E": 0.8, "E_D_fraction_of_variance": float(0.12 * np.exp(0.08 * rng.normal()))},
+        "energies": {
+            "E": 0.8,
+            "E_D_fraction_of_variance": float(0.12 * np.exp(0.08 * rng.normal())),
+        },
         "quality": {
-            "ndim": 3, "mean_rho": float(rng.normal(0.245, 0.003)), "min_dihedral": 12.0 + float(rng.exponential(0.05)),
-            "max_dihedral": float(rng.normal(158.0, 1.0)), "errors": {"mean": 0.09}, "n_under_10_degrees": 0,
+            "ndim": 3,
+            "mean_rho": float(rng.normal(0.245, 0.003)),
+            "min_dihedral": 12.0 + float(rng.exponential(0.05)),
+            "max_dihedral": float(rng.normal(158.0, 1.0)),
+            "errors": {"mean": 0.09},
+            "n_under_10_degrees": 0,
         },
         "history": [{"iteration": k, "E": 1.0 / (1.0 + k)} for k in range(4)],
         "seconds": {"load": 0.1 * seconds, "optimize": 0.8 * seconds, "all": seconds},
-        "memory": {"predicted_bytes": 1.3e9, "peak_bytes": round(1.1e9 * float(np.exp(0.04 * rng.normal())))},
+        "memory": {
+            "predicted_bytes": 1.3e9,
+            "peak_bytes": round(1.1e9 * float(np.exp(0.04 * rng.normal()))),
+        },
         "violated": violated or {},
         "size": {"order": 1, "n_nodes": 8000, "n_nodes_in_all": 8000, "n_cells": n_cells},
-        "mask": {"voxels": round(volume), "volume": volume, "dice": float(rng.normal(0.985, 0.001)), "components": 1},
+        "mask": {
+            "voxels": round(volume),
+            "volume": volume,
+            "dice": float(rng.normal(0.985, 0.001)),
+            "components": 1,
+        },
         "labels": labels,
         "interfaces": [{"label": each["label"], "area": 1000.0} for each in labels],
         "label_names": {str(number): name for number, name in LABELS.items()},
-    }  # fmt: skip
+    }
 
 
 def thumbnail(rng, is_flipped=False):
@@ -61,11 +92,15 @@ def thumbnail(rng, is_flipped=False):
     draw = PIL.ImageDraw.Draw(picture)
     for left in (0, 128):
         wide, tall = rng.integers(38, 50), rng.integers(48, 60)
-        draw.ellipse((left + 64 - wide, 64 - tall, left + 64 + wide, 64 + tall), fill=170, outline=250)
+        draw.ellipse(
+            (left + 64 - wide, 64 - tall, left + 64 + wide, 64 + tall), fill=170, outline=250
+        )
         y = 90 if is_flipped else 30
         draw.ellipse((left + 54, y - 10, left + 74, y + 10), fill=90)
     noise = rng.integers(0, 3, (128, 256)) * 12
-    pixels = np.where(np.asarray(picture) > 0, np.clip(np.asarray(picture) + noise, 0, 255), 0).astype(np.uint8)
+    pixels = np.where(
+        np.asarray(picture) > 0, np.clip(np.asarray(picture) + noise, 0, 255), 0
+    ).astype(np.uint8)
     stream = io.BytesIO()
     PIL.Image.fromarray(pixels // 8 * 8).convert("P").save(stream, "PNG", optimize=True)
     return stream.getvalue()
@@ -84,26 +119,41 @@ def save_run(out, key, run, picture=None, suffix=".vtu"):
 def save_failure(out, key, reason):
     (out / "logs").mkdir(parents=True, exist_ok=True)
     log_path(out, key).write_text("tetopt: " + reason)
-    failure_path(out, key).write_text(json.dumps({"key": key, "reason": reason, "command": "tetopt mesh"}))
+    failure_path(out, key).write_text(
+        json.dumps({"key": key, "reason": reason, "command": "tetopt mesh"})
+    )
 
 
 ODD = {  # what is wrong with each of these, of a hundred
-    7: {"affine": np.diag([-1.0, -1.0, 1.2, 1.0])}, 19: {"mask_volume": 0.61e6}, 31: {"lost": 17},
-    43: {"violated": {"min_dihedral": "3 of 45000 cells have a dihedral angle below 12 degrees, down to 8.10"}},
+    7: {"affine": np.diag([-1.0, -1.0, 1.2, 1.0])},
+    19: {"mask_volume": 0.61e6},
+    31: {"lost": 17},
+    43: {
+        "violated": {
+            "min_dihedral": "3 of 45000 cells have a dihedral angle below 12 degrees, down to 8.10"
+        }
+    },
     59: {"absent": 53},
-}  # fmt: skip
+}
 
 
 def save_cohort(out, n):
-    """A cohort of n subjects, a twentieth of them odd and a twentieth failed; the keys that are expected."""
+    """A cohort of n subjects, a twentieth of them odd and a twentieth failed; the keys that are
+    expected.
+    """
     rng = np.random.default_rng(n)
     out.mkdir(parents=True, exist_ok=True)
     pictures = [thumbnail(rng, k == 0) for k in range(21)]
     for k in range(n):
         if k % 20 == 2 and k % 100 != 82:
-            reason = ["image.nii.gz: expected a NIfTI image, got a file that ends early", f"ended by SIGKILL {HOSTILE}"]
+            reason = [
+                "image.nii.gz: expected a NIfTI image, got a file that ends early",
+                f"ended by SIGKILL {HOSTILE}",
+            ]
             save_failure(out, key_of(k), reason[(k // 20) % 2])
         elif k % 100 != 82:
             odd = ODD.get(k % 100, {})
-            save_run(out, key_of(k), run_of(rng, **odd), pictures[0 if "affine" in odd else 1 + k % 20])
+            save_run(
+                out, key_of(k), run_of(rng, **odd), pictures[0 if "affine" in odd else 1 + k % 20]
+            )
     return [key_of(k) for k in range(n)]

@@ -20,11 +20,22 @@ def mesh_words(image, folder, *options):
 
 
 def labelled_lattice_words(folder):
-    """`tetopt mesh` of an image and its labels, written to a folder, as a lattice of 60 nodes; no output yet."""
+    """`tetopt mesh` of an image and its labels, written to a folder, as a lattice of 60 nodes;
+    no output yet.
+    """
     image = sample_image(3)
     tetopt.save_image(folder / "a.nii.gz", image)
     tetopt.save_image(folder / "l.nii.gz", tetopt.Image(1.0 * (image.data > 30), image.affine))
-    return ["mesh", folder / "a.nii.gz", "--labels", folder / "l.nii.gz", "--spacing", "8", "--iterations", "0"]
+    return [
+        "mesh",
+        folder / "a.nii.gz",
+        "--labels",
+        folder / "l.nii.gz",
+        "--spacing",
+        "8",
+        "--iterations",
+        "0",
+    ]
 
 
 def numbers_in(path):

@@ -27,14 +27,19 @@ from tetopt.report import summary
 from tetopt.system import budget
 
 # The same examples in every run; few where the kernels run as plain Python.
-settings.register_profile("tetopt", deadline=None, derandomize=True, max_examples=4 if numba.config.DISABLE_JIT else 12)
+settings.register_profile(
+    "tetopt", deadline=None, derandomize=True, max_examples=4 if numba.config.DISABLE_JIT else 12
+)
 settings.load_profile("tetopt")
-# As in a terminal, here and in all processes that tests start: in the background of a script SIGINT is ignored.
+# As in a terminal, here and in all processes that tests start: in the background of a script SIGINT
+# is ignored.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The tests of the longest files first, which `--no-loadscope-reorder` keeps so; the others as they were."""
+    """The tests of the longest files first, which `--no-loadscope-reorder` keeps so; the others
+    as they were.
+    """
     folder = Path(__file__).resolve().parent
     ranks = {folder / name: rank for rank, name in enumerate(LONGEST_FILES)}
     items.sort(key=lambda item: ranks.get(item.path, len(ranks)))
@@ -42,13 +47,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(autouse=True)
 def wide_lines(monkeypatch):
-    """Sentences on one line, as tests look for parts of them; `test_cli_width.py` has lines as users see them."""
+    """Sentences on one line, as tests look for parts of them; `test_cli_width.py` has lines as
+    users see them.
+    """
     monkeypatch.setattr("tetopt.cli.console.LINE_WIDTH", 1000)
 
 
 @pytest.fixture(scope="session", autouse=True)
 def built_once():
-    """The line of each command is built once, versions are looked up once, and control groups once a second.
+    """The line of each command is built once, versions are looked up once, and control groups once
+    a second.
 
     Together they take longer than most commands.
     """
@@ -90,7 +98,8 @@ def pytest_runtest_setup(item):
 
 @pytest.fixture(scope="session", autouse=True)
 def blank_pictures():
-    """Figures are composed, and written blank where no test looks at them, as drawing one takes half a second.
+    """Figures are composed, and written blank where no test looks at them, as drawing one takes
+    half a second.
 
     Tests marked `drawn` look at them.
     """
@@ -119,18 +128,25 @@ def data_dir() -> Path:
 
 @pytest.fixture(scope="session")
 def opengl() -> None:
-    """Skips where VTK finds no OpenGL that draws without a display; asked in a child, since it may end the process."""
+    """Skips where VTK finds no OpenGL that draws without a display; asked in a child, since it
+    may end the process.
+    """
     program = (
         "import numpy as np, pyvista as p; q = p.Plotter(off_screen=True); q.add_mesh(p.Sphere()); "
         "assert np.ptp(q.screenshot(return_img=True)) > 0"
     )
-    if subprocess.run([sys.executable, "-c", program], capture_output=True, check=False).returncode != 0:
+    if (
+        subprocess.run([sys.executable, "-c", program], capture_output=True, check=False).returncode
+        != 0
+    ):
         pytest.skip("no OpenGL that renders off screen")
 
 
 @pytest.fixture(scope="session", autouse=True)
 def described_numbers():
-    """Whatever JSON a test has tetopt write in this process keeps to its schema, if its kind has one."""
+    """Whatever JSON a test has tetopt write in this process keeps to its schema, if its kind has
+    one.
+    """
     save_text = tetopt.system.files.save_text
 
     def checked(path, text):
@@ -145,19 +161,26 @@ def described_numbers():
 
 @pytest.fixture(scope="session")
 def scheduler():
-    """The address of one with a worker in this process: a cohort there starts no other, and loads no kernels again."""
+    """The address of one with a worker in this process: a cohort there starts no other, and
+    loads no kernels again.
+    """
     from distributed import LocalCluster
 
     with LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, protocol="tcp://", dashboard_address="127.0.0.1:0",
+        n_workers=1,
+        threads_per_worker=1,
+        processes=False,
+        protocol="tcp://",
+        dashboard_address="127.0.0.1:0",
         silence_logs=50,
-    ) as cluster:  # fmt: skip
+    ) as cluster:
         yield cluster.scheduler_address
 
 
 @pytest.fixture(scope="session", autouse=True)
 def read_here():
-    """Files are read in this process, where a test is not of the child that reads them, which takes half a second.
+    """Files are read in this process, where a test is not of the child that reads them, which takes
+    half a second.
 
     Marked `apart` are tests of the child, and of files at which libraries may end the process.
     """
@@ -166,7 +189,8 @@ def read_here():
     def answered(job, seconds):
         if marks & {"apart", "deep", "slow"}:
             return of_child(job, seconds)
-        vtk = sys.modules.get("vtkmodules.vtkCommonCore")  # its readers' words go where they went before
+        # its readers' words go where they went before
+        vtk = sys.modules.get("vtkmodules.vtkCommonCore")
         window = None if vtk is None else vtk.vtkOutputWindow.GetInstance()
         stream = BytesIO()
         with warnings.catch_warnings(action="ignore"):  # which nobody hears in a child

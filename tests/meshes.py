@@ -36,7 +36,10 @@ OBTUSE_TRIANGLE = (np.array([[0.0, 0.0], [1.0, 0.0], [-0.5, np.sqrt(0.75)]]), np
 #      \|/      obtuse: as the cube corner, but node 3 raised over (-1, -1), outside of the base
 #       1
 
-REGULAR_TET = (np.array([[1.0, 1, 1], [-1, 1, -1], [1, -1, -1], [-1, -1, 1]]), np.array([[0, 1, 2, 3]]))
+REGULAR_TET = (
+    np.array([[1.0, 1, 1], [-1, 1, -1], [1, -1, -1], [-1, -1, 1]]),
+    np.array([[0, 1, 2, 3]]),
+)
 CUBE_CORNER = (np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]), np.array([[0, 1, 2, 3]]))
 OBTUSE_TET = (np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [-1, -1, 1]]), np.array([[0, 1, 2, 3]]))
 
@@ -49,8 +52,10 @@ OBTUSE_TET = (np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [-1, -1, 1]]), np.arr
 #     0---1            4
 
 TWO_TRIANGLES = (np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]), np.array([[0, 2, 3], [0, 1, 2]]))
-TWO_TETS = (np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0.25, 0.25, 1], [0.25, 0.25, -1]]),
-            np.array([[0, 1, 2, 3], [0, 2, 1, 4]]))  # fmt: skip
+TWO_TETS = (
+    np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0.25, 0.25, 1], [0.25, 0.25, -1]]),
+    np.array([[0, 1, 2, 3], [0, 2, 1, 4]]),
+)
 
 # A square cut into four by its centre (node 4), and two such squares that share the edge 1 4
 #
@@ -68,11 +73,13 @@ SQUARE = (
 )
 TWO_SQUARES = (
     np.array([[0.0, 0], [1, 0], [2, 0], [0, 1], [1, 1], [2, 1], [0.5, 0.5], [1.5, 0.5]]),
-    np.array([[0, 1, 6], [1, 4, 6], [4, 3, 6], [3, 0, 6], [1, 2, 7], [2, 5, 7], [5, 4, 7], [4, 1, 7]]),
+    np.array(
+        [[0, 1, 6], [1, 4, 6], [4, 3, 6], [3, 0, 6], [1, 2, 7], [2, 5, 7], [5, 4, 7], [4, 1, 7]]
+    ),
 )
 
-# The unit cube in five: node 4x + 2y + z at (x, y, z); the regular cell 0 on the even corners 0 3 5 6, then the
-# corners 1, 2, 4 and 7.
+# The unit cube in five: node 4x + 2y + z at (x, y, z); the regular cell 0 on the even corners 0 3 5
+# 6, then the corners 1, 2, 4 and 7.
 #
 #        3-------7
 #       /|      /|      z
@@ -86,7 +93,8 @@ FIVE_TET_CUBE = (
     np.array([[0, 3, 5, 6], [1, 0, 3, 5], [2, 0, 6, 3], [4, 0, 5, 6], [7, 3, 6, 5]]),
 )
 
-# Bad tetrahedra, each as (points, kind); t is small. In the drawings all four nodes lie (almost) in the page.
+# Bad tetrahedra, each as (points, kind); t is small. In the drawings all four nodes lie (almost) in
+# the page.
 #
 #     sliver      cap         spade       wedge       needle
 #     3---2         2           2           2         0-1------2-3
@@ -105,20 +113,28 @@ def sliver(t):
 
 
 def cap(t):
-    """An equilateral triangle of inradius 1 and a node t above its centre: angles atan(t) at the base."""
+    """An equilateral triangle of inradius 1 and a node t above its centre: angles atan(t) at the
+    base.
+    """
     turns = np.radians([0.0, 120.0, 240.0])
     base = np.column_stack([2 * np.cos(turns), 2 * np.sin(turns), np.zeros(3)])
     return np.vstack([base, [0.0, 0.0, t]])
 
 
 def spade(t):
-    """A triangle of height 2 and a node t above the middle of its base: angles atan(t sqrt(5) / 2) at its sides."""
+    """A triangle of height 2 and a node t above the middle of its base: angles atan(t sqrt(5) /
+    2) at its sides.
+    """
     return np.array([[-1.0, 0, 0], [1.0, 0, 0], [0, 2.0, 0], [0, 0, t]])
 
 
 def wedge(t):
-    """A triangle with a corner doubled, t apart, upright: the angle at the far edge 0 1 is 2 atan(t / 2 sqrt 3)."""
-    return np.array([[-1.0, 0, 0], [1.0, 0, 0], [0, np.sqrt(3.0), t / 2], [0, np.sqrt(3.0), -t / 2]])
+    """A triangle with a corner doubled, t apart, upright: the angle at the far edge 0 1 is 2
+    atan(t / 2 sqrt 3).
+    """
+    return np.array(
+        [[-1.0, 0, 0], [1.0, 0, 0], [0, np.sqrt(3.0), t / 2], [0, np.sqrt(3.0), -t / 2]]
+    )
 
 
 def needle(t):
@@ -136,8 +152,14 @@ def single(points):
 
 
 # By dimension: single cells, and everything conforming
-SINGLE = {2: [EQUILATERAL, RIGHT_TRIANGLE, OBTUSE_TRIANGLE], 3: [REGULAR_TET, CUBE_CORNER, OBTUSE_TET]}
-SMALL = {2: [*SINGLE[2], TWO_TRIANGLES, SQUARE, TWO_SQUARES], 3: [*SINGLE[3], TWO_TETS, FIVE_TET_CUBE]}
+SINGLE = {
+    2: [EQUILATERAL, RIGHT_TRIANGLE, OBTUSE_TRIANGLE],
+    3: [REGULAR_TET, CUBE_CORNER, OBTUSE_TET],
+}
+SMALL = {
+    2: [*SINGLE[2], TWO_TRIANGLES, SQUARE, TWO_SQUARES],
+    3: [*SINGLE[3], TWO_TETS, FIVE_TET_CUBE],
+}
 ALL_SMALL = [*SMALL[2], *SMALL[3]]
 
 
@@ -153,7 +175,9 @@ def random_rotation(rng, n):
 
 
 def random_affine(rng, n, *, is_sheared=True):
-    """Voxels of unequal size, 0.3 to 5 mm, rotated, flipped along some axes, sheared, and moved by up to 100 mm."""
+    """Voxels of unequal size, 0.3 to 5 mm, rotated, flipped along some axes, sheared, and moved
+    by up to 100 mm.
+    """
     columns = np.diag(rng.choice([-1.0, 1.0], n) * np.exp(rng.uniform(np.log(0.3), np.log(5.0), n)))
     if is_sheared:
         columns = (np.eye(n) + np.triu(rng.uniform(-0.6, 0.6, (n, n)), 1)) @ columns
@@ -169,11 +193,13 @@ def box_corners(shape):
 
 
 def split_box(rng, shape, n_nodes, step=0.5):
-    """A conforming mesh of an image's box in index space; nodes put in are multiples of `step`, 1, 1/2, 1/4 voxel.
+    """A conforming mesh of an image's box in index space; nodes put in are multiples of `step`, 1,
+    1/2, 1/4 voxel.
 
-    The box cut along its diagonal, then nodes put in one by one: every cell that holds the new node, on its
-    boundary too, is replaced by the cells that have the node in place of one corner. Barycentric coordinates are
-    exact, so it is a tiling whatever the nodes, and it is full of thin cells and of ties.
+    The box cut along its diagonal, then nodes put in one by one: every cell that holds the new
+    node, on its boundary too, is replaced by the cells that have the node in place of one corner.
+    Barycentric coordinates are exact, so it is a tiling whatever the nodes, and it is full of thin
+    cells and of ties.
     """
     n = len(shape)
     scale = max(round(1 / step), 2)
@@ -208,11 +234,17 @@ def _split(cell, node):
     sides = [dot(gradient, node) + constant for gradient, constant in _functions(tuple(cell))]
     if min(sides) < 0:
         return [cell]
-    return [[node if k == i else p for k, p in enumerate(cell)] for i, side in enumerate(sides) if side > 0]
+    return [
+        [node if k == i else p for k, p in enumerate(cell)]
+        for i, side in enumerate(sides)
+        if side > 0
+    ]
 
 
 def delaunay_box(rng, shape, n_nodes):
-    """A Delaunay mesh of an image's box in index space: random nodes inside and on the walls, nothing snapped."""
+    """A Delaunay mesh of an image's box in index space: random nodes inside and on the walls,
+    nothing snapped.
+    """
     low, high = -0.5, np.array(shape) - 0.5
     nodes = rng.uniform(low, high, (n_nodes, len(shape)))
     is_on_wall = rng.random(nodes.shape) < 0.15
@@ -224,7 +256,9 @@ def delaunay_box(rng, shape, n_nodes):
 
 
 def with_bent_edges(mesh, fraction):
-    """The mesh with midpoints moved at random by about a fraction of the edge, or less where a cell would fold."""
+    """The mesh with midpoints moved at random by about a fraction of the edge, or less where a
+    cell would fold.
+    """
     edges = numbered_edges(mesh.cells)[0]
     ends = mesh.points[edges]
     moves = np.random.default_rng(6).normal(size=(len(edges), mesh.ndim)) * np.linalg.norm(

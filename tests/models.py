@@ -1,4 +1,6 @@
-"""One model for the tests of every format and solver: materials, overlapping sets, a load, labels, an oblique box."""
+"""One model for the tests of every format and solver: materials, overlapping sets, a load,
+labels, an oblique box.
+"""
 
 from functools import cache
 
@@ -14,7 +16,14 @@ from tetopt.model.labels import TABLE_TEXT, LabelTable, table_words
 from tetopt.model.loads import parse_loads
 from tetopt.model.materials import binned, materials
 from tetopt.model.model import Model
-from tetopt.model.sets import Sets, box_of, enclosing_facets, nodes_of, standard_sets, with_requested
+from tetopt.model.sets import (
+    Sets,
+    box_of,
+    enclosing_facets,
+    nodes_of,
+    standard_sets,
+    with_requested,
+)
 
 ABOUT = {"tetopt": "0.1.0", "image": "two spheres & <more>.nii.gz", "image_sha256": "ab" * 32}
 
@@ -34,17 +43,23 @@ def sample_image(n=3):
 
 @cache
 def ball_mesh(n=3):
-    """A ball (a disk) of 40 mm around (30, 30, 30) mm: a lattice of a cube, each shell of it made round."""
+    """A ball (a disk) of 40 mm around (30, 30, 30) mm: a lattice of a cube, each shell of it
+    made round.
+    """
     cube = tetopt.lattice_mesh(tetopt.Image(np.zeros((20,) * n)), blocks=(6,) * n)
     offset = cube.points - cube.points.mean(axis=0)
     length = np.sqrt((offset**2).sum(axis=1, keepdims=True))
-    round_ = offset * np.abs(offset).max(axis=1, keepdims=True) / np.where(length > 0.0, length, 1.0)
+    round_ = (
+        offset * np.abs(offset).max(axis=1, keepdims=True) / np.where(length > 0.0, length, 1.0)
+    )
     return tetopt.Mesh(30.0 + 2.0 * round_, cube.cells)
 
 
 @cache
 def sample_model(n=3, bins=3):
-    """A model in RAS and kPa with `bins` materials (None: as many as cells have), a compression by 5 %."""
+    """A model in RAS and kPa with `bins` materials (None: as many as cells have), a compression
+    by 5 %.
+    """
     image = sample_image(n)
     mesh = tetopt.lattice_mesh(image, nodes=60)
     fields = tetopt.cell_fields(mesh, image)
@@ -52,7 +67,9 @@ def sample_model(n=3, bins=3):
     fields["label"] = labels
     sets = standard_sets(mesh, box_of(image), labels)
     corner = ",".join(str(x) for x in mesh.points[0])
-    sets = with_requested(mesh, sets, ["dark=below:20", f"corner=point:{corner}:12"], fields["mean"])
+    sets = with_requested(
+        mesh, sets, ["dark=below:20", f"corner=point:{corner}:12"], fields["mean"]
+    )
     table = materials(1.0 + fields["mean"] / 7.0, np.where(labels == 1, 0.3, 0.45), len(mesh.cells))
     if bins is not None:
         table = binned(table, volumes(mesh.points, mesh.cells), bins)
@@ -61,33 +78,45 @@ def sample_model(n=3, bins=3):
 
 
 def unlabelled(model):
-    return model._replace(cell_data={name: values for name, values in model.cell_data.items() if name != "label"})
+    return model._replace(
+        cell_data={name: values for name, values in model.cell_data.items() if name != "label"}
+    )
 
 
 def labelled_model(n=3):
-    """Cells of the labels 0, 2, 3 and 7 with their sets, 7 by name; a set of the user's within one."""
+    """Cells of the labels 0, 2, 3 and 7 with their sets, 7 by name; a set of the user's within
+    one.
+    """
     model = sample_model(n)._replace(materials=None, loads=())
     height = model.mesh.points[model.mesh.cells].mean(axis=1)[:, -1]
     labels = np.array([0, 2, 3, 7])[np.searchsorted(np.quantile(height, [0.25, 0.5, 0.75]), height)]
     names = {7: "Right kidney"}
     sets = standard_sets(model.mesh, box_of(sample_image(n)), labels, names)
     return model._replace(
-        cell_data=model.cell_data | {"label": labels}, sets=sets,
+        cell_data=model.cell_data | {"label": labels},
+        sets=sets,
         about=ABOUT | {TABLE_TEXT: table_words(LabelTable(names, {}))},
-    )  # fmt: skip
+    )
 
 
 @cache
 def quadratic_model(n=3, bins=3):
-    """The same of order 2, with point data of every node ("displacement") and of the corners alone ("warmth")."""
+    """The same of order 2, with point data of every node ("displacement") and of the corners
+    alone ("warmth").
+    """
     model, rng = sample_model(n, bins), np.random.default_rng(n)
     n_nodes = len(quadratic(model.mesh.points, model.mesh.cells)[0])
-    fields = {"displacement": rng.normal(size=(n_nodes, n)), "warmth": rng.normal(size=len(model.mesh.points))}
+    fields = {
+        "displacement": rng.normal(size=(n_nodes, n)),
+        "warmth": rng.normal(size=len(model.mesh.points)),
+    }
     return model._replace(order=2, point_data=fields)
 
 
 def all_nodes(values, mesh):
-    """A field of the corners with the mean of an edge's ends at its middle, as the docstrings say it."""
+    """A field of the corners with the mean of an edge's ends at its middle, as the docstrings
+    say it.
+    """
     nodes, cells = quadratic(mesh.points, mesh.cells)
     filled = np.concatenate([values, np.empty(len(nodes) - len(values))])
     for cell in cells:
@@ -116,7 +145,9 @@ def our_compression(model, nu):
     """What `tetopt.fem` makes of the model's two loads, the first of which holds."""
     fixed, pushed = (nodes_of(model.mesh, model.sets.facets[load.set_name]) for load in model.loads)
     push = model.loads[1].numbers
-    return compression(model.mesh, young_of(model), nu, fixed_nodes=fixed, pushed_nodes=pushed, displacement=push)
+    return compression(
+        model.mesh, young_of(model), nu, fixed_nodes=fixed, pushed_nodes=pushed, displacement=push
+    )
 
 
 def cell_energies(mesh, young, nu, u):
@@ -124,7 +155,9 @@ def cell_energies(mesh, young, nu, u):
     strain = strains(mesh, u)
     lame, mu = lame_constants(np.broadcast_to(young, len(mesh.cells)), nu, mesh.ndim)
     spread = np.einsum("cii->c", strain) ** 2
-    return volumes(mesh.points, mesh.cells) * (0.5 * lame * spread + mu * (strain**2).sum(axis=(1, 2)))
+    return volumes(mesh.points, mesh.cells) * (
+        0.5 * lame * spread + mu * (strain**2).sum(axis=(1, 2))
+    )
 
 
 def each_once(nodes):
@@ -132,7 +165,8 @@ def each_once(nodes):
     return sorted(map(tuple, np.sort(nodes, axis=1).tolist()))
 
 
-# What a model can be loaded by, each kind alone and together; on what `sample_model` has, in 3-D and in 2-D.
+# What a model can be loaded by, each kind alone and together; on what `sample_model` has, in 3-D
+# and in 2-D.
 LOAD_CASES = {
     "compression": ["compress:5%"],
     "free components": ["hold:{high}", "move:{low}:{free},1.5"],
@@ -154,29 +188,48 @@ LOAD_CASES = {
 
 def load_words(case, n=3):
     """The words of a load case."""
-    names = {"high": "superior", "low": "inferior", "side": "left", "free": "free,free", "pull": "0.1,-0.2"}
+    names = {
+        "high": "superior",
+        "low": "inferior",
+        "side": "left",
+        "free": "free,free",
+        "pull": "0.1,-0.2",
+    }
     if n == 2:
         names = {"high": "y_max", "low": "y_min", "side": "x_min", "free": "free", "pull": "0.1"}
     return [words.format(**names) for words in LOAD_CASES[case]]
 
 
 def loaded_model(case, n=3, order=1, moduli="cells"):
-    """`sample_model` under a load case, or under other words; cells of two densities, moduli of cells or of nodes."""
+    """`sample_model` under a load case, or under other words; cells of two densities, moduli of
+    cells or of nodes.
+    """
     model = sample_model(n)
     table = model.materials
     density = np.where(model.cell_data["label"] == 1, 1500.0, 1000.0)
     table = materials(young_of(model), table.nu[table.of_cell], len(model.mesh.cells), density)
     words = load_words(case, n) if isinstance(case, str) else case
     loads = parse_loads(words, model.mesh, model.sets)
-    nodal = np.random.default_rng(7).uniform(1.0, 9.0, len(model.mesh.points)) if moduli == "nodes" else None
+    nodal = (
+        np.random.default_rng(7).uniform(1.0, 9.0, len(model.mesh.points))
+        if moduli == "nodes"
+        else None
+    )
     return model._replace(materials=table, loads=loads, order=order, node_young=nodal)
 
 
 def displaced(model, is_prescribed, prescribed, forces, springs):
-    """Displacement (N, 3) of nodes under what a file says of them, by our matrix and a plain factorisation."""
+    """Displacement (N, 3) of nodes under what a file says of them, by our matrix and a plain
+    factorisation.
+    """
     of_cell = model.materials.of_cell
-    K = stiffness(model.mesh, model.materials.young[of_cell], model.materials.nu[of_cell], model.order)
+    K = stiffness(
+        model.mesh, model.materials.young[of_cell], model.materials.nu[of_cell], model.order
+    )
     K = (K + diags_array(np.repeat(springs, 3))).tocsr()
-    u, free = np.where(is_prescribed, prescribed, 0.0).ravel(), np.flatnonzero(~is_prescribed.ravel())
+    u, free = (
+        np.where(is_prescribed, prescribed, 0.0).ravel(),
+        np.flatnonzero(~is_prescribed.ravel()),
+    )
     u[free] = spsolve(K[free][:, free], forces.ravel()[free] - (K @ u)[free])
     return u.reshape(-1, 3)

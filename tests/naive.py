@@ -1,7 +1,8 @@
 """Slow, obvious twins of the package's kernels, in plain Python.
 
-Whatever the contract promises exactly is computed exactly here: with Fractions, or with whole numbers of any size.
-Nothing is imported from the package but the size of its fixed-point grid, which is part of the contract.
+Whatever the contract promises exactly is computed exactly here: with Fractions, or with whole
+numbers of any size. Nothing is imported from the package but the size of its fixed-point grid,
+which is part of the contract.
 """
 
 from __future__ import annotations
@@ -60,7 +61,8 @@ def squared_lengths(corners):
 def circumcentres(points, cells):
     """Centres of the circumscribed spheres, (M, n) float64; flat cells raise LinAlgError.
 
-    With the edges e_k from the first node as rows, the centre c relative to it solves 2 e_k . c = |e_k|^2.
+    With the edges e_k from the first node as rows, the centre c relative to it solves 2 e_k . c =
+    |e_k|^2.
     """
     corners = points[cells]
     edges = corners[:, 1:] - corners[:, :1]
@@ -72,7 +74,8 @@ def circumcentres(points, cells):
 
 
 def E_G_as_printed(points, cells):
-    """Eq. (1): 1/(n+1) sum_i x_i^2 |Omega_i| - integral of x^2, the origin at the mean of the points; exact.
+    """Eq. (1): 1/(n+1) sum_i x_i^2 |Omega_i| - integral of x^2, the origin at the mean of the
+    points; exact.
 
     The integral of x^2 over a simplex of volume v with the corners c_0 .. c_n is
     v / ((n+1)(n+2)) (|sum of c_k|^2 + sum of |c_k|^2).
@@ -90,7 +93,9 @@ def E_G_as_printed(points, cells):
         integral += v * (dot(total, total) + sum(dot(c, c) for c in corners)) / ((n + 1) * (n + 2))
         for a in cell:
             star_volume[a] += v
-    return float(sum(dot(p, p) * v for p, v in zip(points, star_volume, strict=True)) / (n + 1) - integral)
+    return float(
+        sum(dot(p, p) * v for p, v in zip(points, star_volume, strict=True)) / (n + 1) - integral
+    )
 
 
 def E_G_gradient(points, cells):
@@ -102,13 +107,18 @@ def E_G_gradient(points, cells):
         x[node, axis] += 1e-30j
         corners = x[cells[(cells == node).any(axis=1)]]
         v = np.linalg.det(corners[:, 1:] - corners[:, :1]) / factorial(n)
-        squares = sum(((corners[:, i] - corners[:, k]) ** 2).sum(axis=1) for i, k in combinations(range(n + 1), 2))
+        squares = sum(
+            ((corners[:, i] - corners[:, k]) ** 2).sum(axis=1)
+            for i, k in combinations(range(n + 1), 2)
+        )
         gradient[node, axis] = (v * squares).sum().imag / 1e-30 / ((n + 1) * (n + 2))
     return gradient
 
 
 def volume_and_E_G(corners):
-    """Unsigned volume and E_G of one cell, (n+1) rows of n floats; exact up to the last rounding."""
+    """Unsigned volume and E_G of one cell, (n+1) rows of n floats; exact up to the last
+    rounding.
+    """
     corners = exactly(corners)
     n = len(corners) - 1
     v = abs(signed_volume(corners))
@@ -121,7 +131,9 @@ def volume_and_E_G(corners):
 def ticks(image, points):
     """Nodes on the sampling's fixed-point grid, as whole numbers of 2**-bits voxel, and bits."""
     bits = sampling_grid(image, points).bits
-    return [[round(Fraction(float(x)) * 2**bits) for x in row] for row in image.to_index(points)], bits
+    return [
+        [round(Fraction(float(x)) * 2**bits) for x in row] for row in image.to_index(points)
+    ], bits
 
 
 def orientations(corners_of_cells):
@@ -130,9 +142,11 @@ def orientations(corners_of_cells):
 
 
 def barycentric_functions(corners):
-    """For each corner k the affine function (gradient, constant), up to a positive factor its barycentric coordinate.
+    """For each corner k the affine function (gradient, constant), up to a positive factor its
+    barycentric coordinate.
 
-    It is the determinant of the simplex with corner k replaced by the point, times the simplex's orientation.
+    It is the determinant of the simplex with corner k replaced by the point, times the simplex's
+    orientation.
     """
     n = len(corners) - 1
 
@@ -150,9 +164,11 @@ def barycentric_functions(corners):
 
 
 def holds(functions, point):
-    """Whether the point, shifted by (eps^3, eps^2, eps) along the axes (2-D: (eps^2, eps)), is inside a simplex.
+    """Whether the point, shifted by (eps^3, eps^2, eps) along the axes (2-D: (eps^2, eps)), is
+    inside a simplex.
 
-    A barycentric coordinate that is 0 takes the sign of its change under the shift, the last axis first.
+    A barycentric coordinate that is 0 takes the sign of its change under the shift, the last axis
+    first.
     """
     for gradient, constant in functions:
         side = dot(gradient, point) + constant
@@ -164,7 +180,9 @@ def holds(functions, point):
 
 
 def owners(image, mesh):
-    """The cells that hold each voxel centre: a list for each voxel, by index. The contract says at most one."""
+    """The cells that hold each voxel centre: a list for each voxel, by index. The contract says
+    at most one.
+    """
     grid_points, bits = ticks(image, mesh.points)
     holders = {voxel: [] for voxel in product(*map(range, image.shape))}
     for number, cell in enumerate(mesh.cells):
@@ -190,7 +208,9 @@ def cell_of_voxel(image, mesh):
 
 
 def cell_ranges(image, owner, n_cells):
-    """The least and the greatest value in each cell, from the cells of the voxels; inf and -inf where it has none."""
+    """The least and the greatest value in each cell, from the cells of the voxels; inf and -inf
+    where it has none.
+    """
     ranges = [(np.inf, -np.inf)] * n_cells
     for voxel, cell in np.ndenumerate(owner):
         if cell >= 0:
@@ -200,7 +220,9 @@ def cell_ranges(image, owner, n_cells):
 
 
 def moment_sums(image, owner, n_cells, shift):
-    """Count, sum of h - shift and sum of its square over each cell, from the cells of the voxels; exact inside."""
+    """Count, sum of h - shift and sum of its square over each cell, from the cells of the
+    voxels; exact inside.
+    """
     sums = [[Fraction(0)] * 3 for _ in range(n_cells)]
     for voxel, cell in np.ndenumerate(owner):
         if cell >= 0:
@@ -225,7 +247,9 @@ def too_long(points, cells, target):
 
 def stars(cells, n_nodes):
     """The cells of each node, ascending."""
-    return [[number for number, cell in enumerate(cells) if node in cell] for node in range(n_nodes)]
+    return [
+        [number for number, cell in enumerate(cells) if node in cell] for node in range(n_nodes)
+    ]
 
 
 def facets(cells):
@@ -233,7 +257,9 @@ def facets(cells):
     shared = {}
     for number, cell in enumerate(cells):
         for left_out in cell:
-            shared.setdefault(tuple(sorted(int(a) for a in cell if a != left_out)), []).append(number)
+            shared.setdefault(tuple(sorted(int(a) for a in cell if a != left_out)), []).append(
+                number
+            )
     return shared
 
 
@@ -247,7 +273,9 @@ def node_colours(cells, n_nodes):
 
 
 def components(cells):
-    """Number of the facet-connected set of each cell, by flooding from the first cell that has none."""
+    """Number of the facet-connected set of each cell, by flooding from the first cell that has
+    none.
+    """
     neighbours = {number: set() for number in range(len(cells))}
     for shared in facets(cells).values():
         for one in shared:
@@ -269,7 +297,9 @@ def components(cells):
 
 
 def plane_cut(points, cells, height):
-    """From each cell with nodes on both sides (height >= 0, height < 0) to the points where its edges cross 0."""
+    """From each cell with nodes on both sides (height >= 0, height < 0) to the points where its
+    edges cross 0.
+    """
     points, height = exactly(points), [Fraction(float(z)) for z in height]
     crossings = {}
     for number, cell in enumerate(cells):
@@ -278,7 +308,10 @@ def plane_cut(points, cells, height):
             if (height[a] >= 0) != (height[b] >= 0):
                 fraction = height[a] / (height[a] - height[b])
                 places.append(
-                    [float((1 - fraction) * p + fraction * q) for p, q in zip(points[a], points[b], strict=True)]
+                    [
+                        float((1 - fraction) * p + fraction * q)
+                        for p, q in zip(points[a], points[b], strict=True)
+                    ]
                 )
         if places:
             crossings[number] = places
@@ -297,7 +330,9 @@ def grid_stiffness(shape, young, element):
     nodes = tuple(s + 1 for s in shape)
     K = np.zeros((int(np.prod(nodes)) * n,) * 2)
     for voxel in np.ndindex(*shape):
-        ids = [int(np.ravel_multi_index(np.add(voxel, c), nodes)) for c in product((0, 1), repeat=n)]
+        ids = [
+            int(np.ravel_multi_index(np.add(voxel, c), nodes)) for c in product((0, 1), repeat=n)
+        ]
         for (a, i), (b, k) in product(enumerate(ids), repeat=2):
             K[i * n : i * n + n, k * n : k * n + n] += young[voxel] * element[a, b]
     return K
@@ -308,17 +343,24 @@ def interpolation(fine, coarse):
     P = np.zeros((fine + 1, coarse + 1))
     for node in range(fine + 1):
         for other in range(coarse + 1):
-            P[node, other] = max(Fraction(0), 1 - abs(Fraction(node * coarse, max(fine, 1)) - other))
+            P[node, other] = max(
+                Fraction(0), 1 - abs(Fraction(node * coarse, max(fine, 1)) - other)
+            )
     return P
 
 
 def block_means(data, shape):
-    """Means over the voxels of a coarser grid on the same box, cut voxels by their fraction; exact shares."""
+    """Means over the voxels of a coarser grid on the same box, cut voxels by their fraction;
+    exact shares.
+    """
     for axis, new in enumerate(shape):
         old = data.shape[axis]
         fractions = np.zeros((new, old))
         for row, column in product(range(new), range(old)):
-            low, high = max(Fraction(row * old, new), column), min(Fraction((row + 1) * old, new), column + 1)
+            low, high = (
+                max(Fraction(row * old, new), column),
+                min(Fraction((row + 1) * old, new), column + 1),
+            )
             fractions[row, column] = max(Fraction(0), high - low) * Fraction(new, old)
         data = np.moveaxis(np.tensordot(fractions, data, axes=(1, axis)), 0, axis)
     return data
@@ -329,7 +371,12 @@ def block_means(data, shape):
 
 def faces_of(cells):
     """All simplices of some cells, their nodes as frozensets."""
-    return {frozenset(map(int, part)) for cell in cells for k in range(len(cell)) for part in combinations(cell, k + 1)}
+    return {
+        frozenset(map(int, part))
+        for cell in cells
+        for k in range(len(cell))
+        for part in combinations(cell, k + 1)
+    }
 
 
 def euler(simplices):
@@ -337,16 +384,24 @@ def euler(simplices):
 
 
 def is_disc(shared, n):
-    """Whether simplices on the surface of a cell of n + 1 corners are a disc: of facets, with Euler number 1."""
+    """Whether simplices on the surface of a cell of n + 1 corners are a disc: of facets, with
+    Euler number 1.
+    """
     walls = [simplex for simplex in shared if len(simplex) == n]
     return all(any(simplex <= wall for wall in walls) for simplex in shared) and euler(shared) == 1
 
 
 def keeps_topology(cells, labels, cell, label):
-    """Of the old label and the new: what a cell shares with it, and with all others and the outside, is a disc each."""
+    """Of the old label and the new: what a cell shares with it, and with all others and the
+    outside, is a disc each.
+    """
     n = cells.shape[1] - 1
     outer = [sorted(nodes) for nodes, sides in facets(cells).items() if len(sides) == 1]
-    rest = [(nodes, own) for number, (nodes, own) in enumerate(zip(cells, labels, strict=True)) if number != cell]
+    rest = [
+        (nodes, own)
+        for number, (nodes, own) in enumerate(zip(cells, labels, strict=True))
+        if number != cell
+    ]
     mine = faces_of([cells[cell]])
     groups = []
     for one in (labels[cell], label):
@@ -356,7 +411,9 @@ def keeps_topology(cells, labels, cell, label):
 
 
 def fans(cells, chosen, face, is_outside):
-    """Sets of the chosen cells around a node or edge that hang together by facets around it, or by the outside."""
+    """Sets of the chosen cells around a node or edge that hang together by facets around it, or
+    by the outside.
+    """
     around = [number for number, cell in enumerate(cells) if face <= set(cell.tolist())]
     left = {number for number in around if number in chosen}
     links = []
@@ -378,21 +435,34 @@ def fans(cells, chosen, face, is_outside):
 
 
 def pinched(cells, labels, label):
-    """Nodes of each edge and node at which the cells of a label, or all others, are several fans."""
-    own, others = (set(np.flatnonzero((labels == label) == is_own).tolist()) for is_own in (True, False))
+    """Nodes of each edge and node at which the cells of a label, or all others, are several
+    fans.
+    """
+    own, others = (
+        set(np.flatnonzero((labels == label) == is_own).tolist()) for is_own in (True, False)
+    )
     at = faces_of(cells[sorted(own)]) & faces_of(cells[sorted(others)])
     faces = [face for face in at if len(face) < cells.shape[1] - 1]
-    return {face for face in faces if fans(cells, own, face, False) > 1 or fans(cells, others, face, True) > 1}
+    return {
+        face
+        for face in faces
+        if fans(cells, own, face, False) > 1 or fans(cells, others, face, True) > 1
+    }
 
 
 def nonmanifold(cells, labels):
     """From the nodes of each edge and node that is `pinched` for a label to the labels there."""
     bad = set().union(*(pinched(cells, labels, label) for label in set(labels.tolist())))
-    return {face: {int(labels[i]) for i, cell in enumerate(cells) if face <= set(cell.tolist())} for face in bad}
+    return {
+        face: {int(labels[i]) for i, cell in enumerate(cells) if face <= set(cell.tolist())}
+        for face in bad
+    }
 
 
 def labelling_energy(voxels, tension, cells, labels):
-    """Volume of voxels (M, K) that are not of their cell's label, and tension (M, n+1) of facets between labels."""
+    """Volume of voxels (M, K) that are not of their cell's label, and tension (M, n+1) of facets
+    between labels.
+    """
     energy = sum(row.sum() - row[label] for row, label in zip(voxels, labels, strict=True))
     for nodes, sides in facets(cells).items():
         if len(sides) == 2 and labels[sides[0]] != labels[sides[1]]:
@@ -402,7 +472,9 @@ def labelling_energy(voxels, tension, cells, labels):
 
 
 def cheapest_way(cells, costs, sources, ends):
-    """Least cost of the cells between the sources and the nearest end, from facet to facet, by relaxing all of them."""
+    """Least cost of the cells between the sources and the nearest end, from facet to facet, by
+    relaxing all of them.
+    """
     way = {number: 0.0 if number in sources else np.inf for number in range(len(cells))}
     pairs = [sides for sides in facets(cells).values() if len(sides) == 2]
     for _ in cells:
@@ -419,13 +491,19 @@ def distances_across(inside):
     voxels = list(np.ndindex(inside.shape))
     distance = np.zeros(inside.shape)
     for p in voxels:
-        others = [sum((a - b) ** 2 for a, b in zip(p, q, strict=True)) for q in voxels if inside[q] != inside[p]]
+        others = [
+            sum((a - b) ** 2 for a, b in zip(p, q, strict=True))
+            for q in voxels
+            if inside[q] != inside[p]
+        ]
         distance[p] = min(8.0, min(others) ** 0.5)
     return distance
 
 
 def blurred(values, sigma, is_padded=False):
-    """By a Gaussian cut off at 3 sigma; beyond the sides the nearest value goes on, or 0 where it is padded."""
+    """By a Gaussian cut off at 3 sigma; beyond the sides the nearest value goes on, or 0 where
+    it is padded.
+    """
     reach = int(3.0 * sigma + 0.5)
     weights = [np.exp(-0.5 * (k / sigma) ** 2) for k in range(-reach, reach + 1)]
     for axis, n in enumerate(values.shape):
@@ -450,12 +528,16 @@ def largest_around(values, reach):
 
 
 def volume_by_voxels(level, inside, missing, area):
-    """Add to blocks of two voxels what their level lacks of the label, and the surface's area, voxel by voxel."""
+    """Add to blocks of two voxels what their level lacks of the label, and the surface's area,
+    voxel by voxel.
+    """
     mean, square = level, np.zeros(level.shape)
     for axis, n in enumerate(level.shape):
         filtered = np.zeros(level.shape)
         for p in np.ndindex(level.shape):
-            before, after = ((*p[:axis], min(max(p[axis] + k, 0), n - 1), *p[axis + 1 :]) for k in (-1, 1))
+            before, after = (
+                (*p[:axis], min(max(p[axis] + k, 0), n - 1), *p[axis + 1 :]) for k in (-1, 1)
+            )
             filtered[p] = 0.75 * mean[p] + 0.125 * (mean[before] + mean[after])
             square[p] += max(abs(level[p] - level[before]), abs(level[after] - level[p])) ** 2
         mean = filtered
@@ -467,7 +549,9 @@ def volume_by_voxels(level, inside, missing, area):
 
 
 def volume_between_centres(level, inside, missing, area):
-    """The same by the octants (quadrants) of each cube (square) of voxel centres on both sides of the surface."""
+    """The same by the octants (quadrants) of each cube (square) of voxel centres on both sides
+    of the surface.
+    """
     corners = list(product((0, 1), repeat=level.ndim))
     for p in np.ndindex(*(n - 1 for n in level.shape)):
         voxels = [tuple(i + j for i, j in zip(p, corner, strict=True)) for corner in corners]
@@ -479,7 +563,9 @@ def volume_between_centres(level, inside, missing, area):
                 weight = [0.75 if i == j else 0.25 for i, j in zip(corner, middle, strict=True)]
                 value += np.prod(weight) * level[at]
                 for axis, side in enumerate(corner):
-                    rise[axis] += (2 * side - 1) * np.prod(weight[:axis] + weight[axis + 1 :]) * level[at]
+                    rise[axis] += (
+                        (2 * side - 1) * np.prod(weight[:axis] + weight[axis + 1 :]) * level[at]
+                    )
             slope = max(np.linalg.norm(rise), 0.3)
             distance, block = 2.0 * value / slope, tuple(i // 2 for i in voxel)
             missing[block] += (inside[voxel] - min(max(0.5 - distance, 0.0), 1.0)) / len(corners)
@@ -487,7 +573,9 @@ def volume_between_centres(level, inside, missing, area):
 
 
 def volume_missing(level, inside, add_volume):
-    """By how much a level is to be lowered in each voxel, so that it has the label's volume within 3 voxels."""
+    """By how much a level is to be lowered in each voxel, so that it has the label's volume
+    within 3 voxels.
+    """
     blocks = tuple(-(-n // 2) for n in level.shape)
     missing, area = np.zeros(blocks), np.zeros(blocks)
     add_volume(level, inside, missing, area)
@@ -517,7 +605,9 @@ def smooth_level(inside):
     fraction = np.clip((reach - 4.0) / 3.0, 0.0, 1.0)
     level = sign * size
     for _ in range(4):
-        fine, broad = ((once := blurred(level, sigma)) + blurred(level - once, sigma) for sigma in (1.0, 3.0))
+        fine, broad = (
+            (once := blurred(level, sigma)) + blurred(level - once, sigma) for sigma in (1.0, 3.0)
+        )
         smooth = fine + fraction * (broad - fine)
         smooth = smooth - volume_missing(smooth, inside, volume_by_voxels)
         level = sign * np.clip(sign * smooth, least, most)
@@ -530,7 +620,9 @@ def smooth_level(inside):
 
 
 def row_totals(field, block_of_row, ends, totals):
-    """Sums of a box of voxels over each plane's blocks of rows and columns, added to `totals`, voxel after voxel."""
+    """Sums of a box of voxels over each plane's blocks of rows and columns, added to `totals`,
+    voxel after voxel.
+    """
     totals = [[list(row) for row in plane] for plane in totals]
     for p, plane in enumerate(field):
         for r, row in enumerate(plane):
@@ -541,7 +633,9 @@ def row_totals(field, block_of_row, ends, totals):
 
 
 def facet_distance(p, corners):
-    """From a point to a segment, or a triangle: at its foot if that is inside, else to the nearest edge."""
+    """From a point to a segment, or a triangle: at its foot if that is inside, else to the
+    nearest edge.
+    """
     if len(corners) == 2:
         a, b = corners
         along = b - a

@@ -1,4 +1,6 @@
-"""What CalculiX solved for the result files in tests/io/frd: a small model of either order, and its steps."""
+"""What CalculiX solved for the result files in tests/io/frd: a small model of either order, and
+its steps.
+"""
 
 from functools import cache
 from pathlib import Path
@@ -25,13 +27,17 @@ CASES = {
 
 @cache
 def solved_model(order):
-    """An oblique lattice of 14 nodes, or a box of five quadratic cells; a modulus each cell, the bottom held."""
+    """An oblique lattice of 14 nodes, or a box of five quadratic cells; a modulus each cell, the
+    bottom held.
+    """
     mesh = tetopt.lattice_mesh(sample_image(), nodes=14)
     if order == 2:
         points, cells = FIVE_TET_CUBE
         mesh = Mesh(points * [20.0, 25.0, 31.0] + [-31.7, 12.3, 101.1], cells)
     young = 1.0 + np.arange(len(mesh.cells)) % 5
-    moves = [f"{k}/move:superior:{','.join(map(str, u))}" for k, u in enumerate(CASES[order][2], start=1)]
+    moves = [
+        f"{k}/move:superior:{','.join(map(str, u))}" for k, u in enumerate(CASES[order][2], start=1)
+    ]
     return build_model(mesh, young=young, nu=NU, loads=["hold:inferior", *moves], order=order)
 
 

@@ -19,19 +19,32 @@ KINDS = {
 @cache
 def validators():
     """A validator for each kind of file."""
-    schemas = {kind: json.loads((REFERENCE / f"{kind}.schema.json").read_text(encoding="utf-8")) for kind in KINDS}
-    resources = [(each["$id"], referencing.Resource.from_contents(each)) for each in schemas.values()]
+    schemas = {
+        kind: json.loads((REFERENCE / f"{kind}.schema.json").read_text(encoding="utf-8"))
+        for kind in KINDS
+    }
+    resources = [
+        (each["$id"], referencing.Resource.from_contents(each)) for each in schemas.values()
+    ]
     registry = referencing.Registry().with_resources(resources)
-    return {kind: jsonschema.Draft202012Validator(each, registry=registry) for kind, each in schemas.items()}
+    return {
+        kind: jsonschema.Draft202012Validator(each, registry=registry)
+        for kind, each in schemas.items()
+    }
 
 
 def kind_of(value):
     """Of which kind a file's content is; None for another."""
-    return next((kind for kind, keys in KINDS.items() if isinstance(value, dict) and keys <= set(value)), None)
+    return next(
+        (kind for kind, keys in KINDS.items() if isinstance(value, dict) and keys <= set(value)),
+        None,
+    )
 
 
 def assert_described(value):
-    """Every key of a run.json, a report.json or the numbers of a mesh's quality is in its schema, and as that says."""
+    """Every key of a run.json, a report.json or the numbers of a mesh's quality is in its
+    schema, and as that says.
+    """
     if (kind := kind_of(value)) is None:
         return
     wrong = [

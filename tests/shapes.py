@@ -6,12 +6,16 @@ from scipy.sparse.csgraph import connected_components
 
 import tetopt
 
-OBLIQUE = np.array([[0.9, 0.2, -0.1, -20.0], [-0.2, 1.1, 0.3, 7.0], [0.1, -0.2, 1.4, 3.0], [0.0, 0.0, 0.0, 1.0]])
+OBLIQUE = np.array(
+    [[0.9, 0.2, -0.1, -20.0], [-0.2, 1.1, 0.3, 7.0], [0.1, -0.2, 1.4, 3.0], [0.0, 0.0, 0.0, 1.0]]
+)
 
 
 def grid(shape):
     """Index of every voxel, (*shape, n)."""
-    return np.stack(np.meshgrid(*[np.arange(s) for s in shape], indexing="ij"), axis=-1).astype(float)
+    return np.stack(np.meshgrid(*[np.arange(s) for s in shape], indexing="ij"), axis=-1).astype(
+        float
+    )
 
 
 def distance(shape, *centre):
@@ -39,13 +43,19 @@ def shaped(kind, affine=None):
         mask[4:24, 5:25, 16] = True
     else:
         raise ValueError(kind)
-    image = tetopt.Image(50.0 + 20.0 * np.sin(0.5 * at[..., 0]) + 15.0 * np.cos(0.4 * at[..., 1] + at[..., 2]), affine)
+    image = tetopt.Image(
+        50.0 + 20.0 * np.sin(0.5 * at[..., 0]) + 15.0 * np.cos(0.4 * at[..., 1] + at[..., 2]),
+        affine,
+    )
     return image, tetopt.Image(1.0 * mask, affine)
 
 
 def volume_and_area(surface):
-    """Enclosed volume in mm^3, cavities left out, by the divergence theorem, and area in mm^2 with their walls."""
-    centred = surface.points - surface.points.mean(axis=0)  # far from the origin its digits would cancel
+    """Enclosed volume in mm^3, cavities left out, by the divergence theorem, and area in mm^2
+    with their walls.
+    """
+    # far from the origin its digits would cancel
+    centred = surface.points - surface.points.mean(axis=0)
     a, b, c = centred[surface.triangles.T]
     across = np.cross(b - a, c - a)
     return float((a * across).sum() / 6.0), float(np.linalg.norm(across, axis=1).sum() / 2.0)

@@ -1,4 +1,6 @@
-"""States of the fast engine for its tests: small images, random meshes, moves, and what must hold after them."""
+"""States of the fast engine for its tests: small images, random meshes, moves, and what must
+hold after them.
+"""
 
 import numpy as np
 from hypothesis import assume
@@ -13,7 +15,9 @@ from tetopt.engine.repair import repair
 from tetopt.engine.smooth import blocks, sweep
 from tetopt.engine.state import state_of, with_min_dihedral
 
-OBLIQUE = np.array([[0.9, 0.3, 0.2, -7.0], [-0.25, 1.1, 0.1, 3.0], [0.0, 0.4, -2.5, 11.0], [0.0, 0.0, 0.0, 1.0]])
+OBLIQUE = np.array(
+    [[0.9, 0.3, 0.2, -7.0], [-0.25, 1.1, 0.1, 3.0], [0.0, 0.4, -2.5, 11.0], [0.0, 0.0, 0.0, 1.0]]
+)
 
 
 def ball(shape, affine=None):
@@ -56,7 +60,9 @@ class Engine:
 
     @property
     def mesh(self):
-        return tetopt.Mesh(self.image.to_world(from_ticks(self.complex.ticks, self.grid, self.n)), self.cells)
+        return tetopt.Mesh(
+            self.image.to_world(from_ticks(self.complex.ticks, self.grid, self.n)), self.cells
+        )
 
     def change(self, **parts):
         """Replace arrays of the complex, or numbers of the objective."""
@@ -71,7 +77,9 @@ class Engine:
     def fresh(self, cells=None):
         """The state of the mesh, or of other cells, measured from nothing."""
         cells = self.cells if cells is None else cells
-        return build(cells, self.complex.ticks, self.complex.is_frozen, self.objective, self.state.sides)
+        return build(
+            cells, self.complex.ticks, self.complex.is_frozen, self.objective, self.state.sides
+        )
 
     def sweep(self):
         everyone = np.ones(len(self.complex.ticks), dtype=bool)
@@ -90,11 +98,15 @@ class Engine:
         remeasure(self.state)
 
     def assert_sound(self):
-        """A mesh of the box; neighbours, fluxes, sums and shapes as if measured afresh; every voxel in one cell."""
+        """A mesh of the box; neighbours, fluxes, sums and shapes as if measured afresh; every
+        voxel in one cell.
+        """
         assert tetopt.check_mesh(self.mesh, self.image) == []
         fresh, n_cells = self.fresh().complex, len(self.cells)
         for name in ("across", "fluxes", "sums", "E_shape"):
-            np.testing.assert_array_equal(getattr(self.complex, name)[:n_cells], getattr(fresh, name)[:n_cells], name)
+            np.testing.assert_array_equal(
+                getattr(self.complex, name)[:n_cells], getattr(fresh, name)[:n_cells], name
+            )
         assert self.complex.sums[:n_cells, 0].sum() == self.image.data.size
 
 
@@ -111,7 +123,9 @@ def random_case(seed, n, affine=None, power=3.0, k_D=0.5):
 
 
 def assumed_case(*arguments):
-    """`random_case` for hypothesis: a flat cell to begin with has no shape energy, and is not taken."""
+    """`random_case` for hypothesis: a flat cell to begin with has no shape energy, and is not
+    taken.
+    """
     try:
         return random_case(*arguments)
     except tetopt.InputError as error:

@@ -1,4 +1,6 @@
-"""Every public function of a mesh and an image, on meshes that are none: an answer or one refusal, never garbage."""
+"""Every public function of a mesh and an image, on meshes that are none: an answer or one
+refusal, never garbage.
+"""
 
 import inspect
 
@@ -20,7 +22,9 @@ def image_of(n):
 
 
 def joined(one, other):
-    return Mesh(np.vstack([one.points, other.points]), np.vstack([one.cells, other.cells + len(one.points)]))
+    return Mesh(
+        np.vstack([one.points, other.points]), np.vstack([one.cells, other.cells + len(one.points)])
+    )
 
 
 def moved(mesh, by):
@@ -61,14 +65,20 @@ CASES = [(n, name) for n in (2, 3) for name in unusual(2)]
 def test_a_voxel_is_the_first_cell_s_that_holds_it(n, name):
     image, mesh = image_of(n), unusual(n)[name]
     alone = np.array(
-        [tetopt.cell_of_voxel(image, Mesh(mesh.points[cell], np.arange(n + 1)[None])) == 0 for cell in mesh.cells]
+        [
+            tetopt.cell_of_voxel(image, Mesh(mesh.points[cell], np.arange(n + 1)[None])) == 0
+            for cell in mesh.cells
+        ]
     )
     first = np.where(alone.any(axis=0), alone.argmax(axis=0), -1)
     np.testing.assert_array_equal(tetopt.cell_of_voxel(image, mesh), first)
     moments, (low, high) = cell_moments_and_ranges(image, mesh)
     np.testing.assert_array_equal(moments.n_voxels, alone.reshape(len(alone), -1).sum(axis=1))
     for cell in np.flatnonzero(moments.n_voxels):
-        assert (low[cell], high[cell]) == (image.data[alone[cell]].min(), image.data[alone[cell]].max())
+        assert (low[cell], high[cell]) == (
+            image.data[alone[cell]].min(),
+            image.data[alone[cell]].max(),
+        )
 
     overlap = overlap_of(image, mesh)
     twice = alone.sum(axis=0) > 1
@@ -111,13 +121,17 @@ def errors_on(image, mesh):
 WITH_IMAGE = {
     "E_D": tetopt.E_D,
     "cell_fields": lambda image, mesh: tetopt.cell_fields(mesh, image),
-    "field_on_image": lambda image, mesh: tetopt.field_on_image(mesh, mesh.points, image, at="nodes", outside=0.0),
+    "field_on_image": lambda image, mesh: tetopt.field_on_image(
+        mesh, mesh.points, image, at="nodes", outside=0.0
+    ),
     "warped_image": lambda image, mesh: tetopt.warped_image(mesh, 0.0 * mesh.points, image),
     "cell_labels": lambda image, mesh: tetopt.cell_labels(labels_of(image), mesh),
     "cell_moments": tetopt.cell_moments,
     "cell_of_voxel": tetopt.cell_of_voxel,
     "check_mesh": lambda image, mesh: tetopt.check_mesh(mesh, image),
-    "label_contacts": lambda image, mesh: tetopt.label_contacts(labels_of(image), mesh, np.arange(len(mesh.cells)) % 2),
+    "label_contacts": lambda image, mesh: tetopt.label_contacts(
+        labels_of(image), mesh, np.arange(len(mesh.cells)) % 2
+    ),
     "label_fidelity": lambda image, mesh: tetopt.label_fidelity(labels_of(image), mesh),
     "label_interfaces": lambda image, mesh: tetopt.label_interfaces(
         labels_of(image), mesh, np.arange(len(mesh.cells)) % 2
@@ -136,7 +150,9 @@ MORE = {
     "labelled": lambda image, mesh: tetopt.optimize(
         tetopt.content(image, labels_of(image)), mesh, iterations=3, nodes=len(mesh.points)
     ),
-    "masked": lambda image, mesh: tetopt.optimize(tetopt.content(image, mask=labels_of(image)), mesh, iterations=1),
+    "masked": lambda image, mesh: tetopt.optimize(
+        tetopt.content(image, mask=labels_of(image)), mesh, iterations=1
+    ),
     "cell_young": lambda image, mesh: cell_young(image, mesh),
     "node_young": node_young,
     "element_young": lambda image, mesh: element_young(image, mesh, average="gauss", order=2),
@@ -151,7 +167,8 @@ def test_no_public_function_is_left_out():
     taking = {
         name
         for name, function in functions.items()
-        if inspect.isfunction(function) and all(kind & {*inspect.signature(function).parameters} for kind in known)
+        if inspect.isfunction(function)
+        and all(kind & {*inspect.signature(function).parameters} for kind in known)
     }
     assert taking == set(WITH_IMAGE)
 
@@ -159,7 +176,9 @@ def test_no_public_function_is_left_out():
 @pytest.mark.parametrize(("n", "name"), CASES)
 @pytest.mark.parametrize("function", [*WITH_IMAGE, *MORE])
 def test_an_answer_or_one_refusal(function, n, name):
-    """Nan stands for what is not there, such as a distance from no surface; no other number is not finite."""
+    """Nan stands for what is not there, such as a distance from no surface; no other number is
+    not finite.
+    """
     image, mesh = image_of(n), unusual(n)[name]
     said, answer = "", None
     try:

@@ -16,14 +16,23 @@ PLACES = ["/data", "/out", "participant"]
     ("arguments", "words"),
     [
         (PLACES, []),
-        ([*PLACES, "--participant_label", "01", "sub-02"], ["--participant-label=01", "--participant-label=sub-02"]),
-        (["--participant-label=01", *PLACES, "--nodes", "9"], ["--participant-label=01", "--nodes", "9"]),
+        (
+            [*PLACES, "--participant_label", "01", "sub-02"],
+            ["--participant-label=01", "--participant-label=sub-02"],
+        ),
+        (
+            ["--participant-label=01", *PLACES, "--nodes", "9"],
+            ["--participant-label=01", "--nodes", "9"],
+        ),
         (
             [*PLACES, "--session_label", "a", "--max_gb=8", "--k-d", "-1"],
             ["--session-label=a", "--max-gb=8", "--k-d", "-1"],
         ),
         ([*PLACES, "--skip_bids_validation", "--skip-bids-validator"], []),
-        ([*PLACES, "--mask", "der_iv/sub-{subject}_m.nii"], ["--mask", "der_iv/sub-{subject}_m.nii"]),
+        (
+            [*PLACES, "--mask", "der_iv/sub-{subject}_m.nii"],
+            ["--mask", "der_iv/sub-{subject}_m.nii"],
+        ),
         (["/data", "/out", "group", "--suffix", "T2w"], ["--collect", "--suffix", "T2w"]),
     ],
 )
@@ -32,14 +41,27 @@ def test_arguments(arguments, words):
 
 
 def test_folders_may_have_the_names_of_levels():
-    assert cohort_words(["group", "participant", "group"]) == ["cohort", "group", "--output=participant", "--collect"]
+    assert cohort_words(["group", "participant", "group"]) == [
+        "cohort",
+        "group",
+        "--output=participant",
+        "--collect",
+    ]
 
 
 @pytest.mark.parametrize(
     "arguments",
-    [[], ["/data"], ["/data", "/out"], ["/data", "/out", "grop"], ["--nodes", "9", *PLACES],
-     ["participant", "/a", "/b"], [*PLACES, "--participant-label"], ["/data", "/out", "x", "participant"]],
-)  # fmt: skip
+    [
+        [],
+        ["/data"],
+        ["/data", "/out"],
+        ["/data", "/out", "grop"],
+        ["--nodes", "9", *PLACES],
+        ["participant", "/a", "/b"],
+        [*PLACES, "--participant-label"],
+        ["/data", "/out", "x", "participant"],
+    ],
+)
 def test_arguments_that_are_none(arguments, capsys):
     with pytest.raises(InputError, match="expected: python -m tetopt"):
         cohort_words(arguments)
@@ -49,7 +71,9 @@ def test_arguments_that_are_none(arguments, capsys):
 
 @pytest.mark.full
 def test_runs_beside_others_and_the_group_after_them(tmp_path, capsys, scheduler, read_here):
-    """One subject while another run has another's lock; the group waits for that, and tells of it."""
+    """One subject while another run has another's lock; the group waits for that, and tells of
+    it.
+    """
     raw, out = tmp_path / "raw", tmp_path / "out"
     for label in ("01", "02"):
         (raw / f"sub-{label}" / "anat").mkdir(parents=True)
@@ -67,7 +91,10 @@ def test_runs_beside_others_and_the_group_after_them(tmp_path, capsys, scheduler
     (out / "cohort.tsv").unlink()
     assert main([str(raw), str(out), "group"]) == 1
     assert "1 done, 1 not run" in capsys.readouterr().out
-    assert [line.split("\t")[0] for line in (out / "cohort.tsv").read_text().splitlines()[1:]] == ["sub-01", "sub-02"]
+    assert [line.split("\t")[0] for line in (out / "cohort.tsv").read_text().splitlines()[1:]] == [
+        "sub-01",
+        "sub-02",
+    ]
     assert (out / "sub-01" / "sub-01_desc-tetopt_mesh.vtu").exists()
     assert main([str(raw), str(out), "group", "--dry-run"]) == 2
     assert "--collect runs no subjects" in capsys.readouterr().err

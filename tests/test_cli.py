@@ -1,4 +1,6 @@
-"""The command, run as a user runs it: files in, files out, exit codes, one line for every bad input."""
+"""The command, run as a user runs it: files in, files out, exit codes, one line for every bad
+input.
+"""
 
 import functools
 import hashlib
@@ -24,7 +26,17 @@ import tetopt
 import tetopt.cli.mesh
 import tetopt.cli.phantom
 import tetopt.engine.meshing
-from tetopt import Image, Mesh, lattice_mesh, load_image, load_mesh, load_phantom, quality, save_image, save_mesh
+from tetopt import (
+    Image,
+    Mesh,
+    lattice_mesh,
+    load_image,
+    load_mesh,
+    load_phantom,
+    quality,
+    save_image,
+    save_mesh,
+)
 from tetopt.cli.app import COMMANDS, help_line, loaded_command
 from tetopt.cli.console import show_error, show_event
 from tetopt.engine.requirements import ERROR_RATE
@@ -132,7 +144,10 @@ SIZES = ("size_min", "edge_size", "edge_max", "gradation", "sizing")
 def test_json_of_a_run(run, inputs):
     _, numbers, file, _ = run
     assert numbers["image"] == "sphere.nii.gz"
-    assert numbers["image_sha256"] == hashlib.sha256((inputs / "sphere.nii.gz").read_bytes()).hexdigest()
+    assert (
+        numbers["image_sha256"]
+        == hashlib.sha256((inputs / "sphere.nii.gz").read_bytes()).hexdigest()
+    )
     options = numbers["options"]
     assert (options["method"], options["n_t"], options["retessellate"]) == ("paper", 1, "first")
     assert (options["nodes"], options["lattice"], options["boundary"]) == (150, "bcc", "slide")
@@ -171,13 +186,26 @@ def test_json_of_a_run(run, inputs):
 
 def test_mesh_file_of_a_run(run):
     folder, numbers, file, image = run
-    assert list(file.cell_data) == ["mean", "variance", "n_voxels", "min", "max", "volume", "rho", "min_dihedral"]
+    assert list(file.cell_data) == [
+        "mean",
+        "variance",
+        "n_voxels",
+        "min",
+        "max",
+        "volume",
+        "rho",
+        "min_dihedral",
+    ]
     moments = tetopt.cell_moments(image, file.mesh)
     np.testing.assert_array_equal(file.cell_data["n_voxels"], moments.n_voxels)
     np.testing.assert_array_equal(file.cell_data["mean"], moments.mean)
     assert file.cell_data["n_voxels"].sum() == image.data.size
-    assert (file.cell_data["n_voxels"] * file.cell_data["mean"]).sum() == pytest.approx(image.data.sum(), rel=1e-12)
-    np.testing.assert_array_equal(file.cell_data["volume"], volumes(file.mesh.points, file.mesh.cells))
+    assert (file.cell_data["n_voxels"] * file.cell_data["mean"]).sum() == pytest.approx(
+        image.data.sum(), rel=1e-12
+    )
+    np.testing.assert_array_equal(
+        file.cell_data["volume"], volumes(file.mesh.points, file.mesh.cells)
+    )
     texts = {name: values[0] for name, values in file.field_data.items()}
     assert texts["tetopt"] == tetopt.__version__
     assert texts["image"] == "sphere.nii.gz"
@@ -190,12 +218,15 @@ def test_mesh_file_of_a_run(run):
 
 def test_mesh_in_2d(tmp_path, inputs):
     out = tmp_path / "disc.vtu"
-    assert exit_code("mesh", inputs / "disc.nii", "-o", out, "--nodes", "80", "--iterations", "4") == 0
+    assert (
+        exit_code("mesh", inputs / "disc.nii", "-o", out, "--nodes", "80", "--iterations", "4") == 0
+    )
     image, file = load_image(inputs / "disc.nii"), load_mesh(out)
     assert_covers(file.mesh, image)
     assert_round_trips(file.mesh.points, image)
     assert file.cell_data["n_voxels"].sum() == image.data.size
-    # The disc of 20 mm, of intensity 100 on 20: what the cells hold of it lies in its place, (0, 0).
+    # The disc of 20 mm, of intensity 100 on 20: what the cells hold of it lies in its place, (0,
+    # 0).
     weight = file.cell_data["volume"] * (file.cell_data["mean"] - 20.0)
     assert weight.sum() / 80.0 == pytest.approx(np.pi * 20.0**2, rel=0.05)
     assert list(tmp_path.iterdir()) == [out]
@@ -215,7 +246,10 @@ def test_mesh_in_2d(tmp_path, inputs):
 def test_other_options(tmp_path, inputs, options):
     command = mesh_words(inputs / "sphere.nii.gz", tmp_path)
     assert exit_code(*command, "--spacing", "16", "--iterations", "1", *options) == 0
-    image = load_image(inputs / "sphere.nii.gz", crop=[(2, 14), (None, None), (1, 15)] if "--crop" in options else None)
+    image = load_image(
+        inputs / "sphere.nii.gz",
+        crop=[(2, 14), (None, None), (1, 15)] if "--crop" in options else None,
+    )
     file = load_mesh(tmp_path / "a.vtu")
     assert_covers(file.mesh, image)
     stated = numbers_in(tmp_path / "a.json")["options"]
@@ -225,10 +259,13 @@ def test_other_options(tmp_path, inputs, options):
 
 
 @pytest.mark.parametrize(
-    ("name", "size"), [("sphere.nii.gz", ["--nodes", "100", "--uniform"]), ("disc.nii", ["--spacing", "9"])]
+    ("name", "size"),
+    [("sphere.nii.gz", ["--nodes", "100", "--uniform"]), ("disc.nii", ["--spacing", "9"])],
 )
 def test_no_iterations_write_the_lattice_itself(tmp_path, inputs, name, size):
-    assert exit_code("mesh", inputs / name, "-o", tmp_path / "a.vtu", *size, "--iterations", "0") == 0
+    assert (
+        exit_code("mesh", inputs / name, "-o", tmp_path / "a.vtu", *size, "--iterations", "0") == 0
+    )
     expected = lattice_mesh(load_image(inputs / name), **{size[0][2:]: int(size[1])})
     mesh = load_mesh(tmp_path / "a.vtu").mesh
     assert mesh.points.tobytes() == expected.points.tobytes()
@@ -240,14 +277,23 @@ def test_the_table_shows_before_and_after_and_lines_the_progress(tmp_path, input
     assert exit_code(*command, "--nodes", "150", "--iterations", "3") == 0
     numbers, said = numbers_in(tmp_path / "a.json"), capsys.readouterr()
     lines = said.out.splitlines()
-    table = {row[0]: row[1:] for row in (re.split(r"\s{2,}", line.strip()) for line in lines) if len(row) == 3}
+    table = {
+        row[0]: row[1:]
+        for row in (re.split(r"\s{2,}", line.strip()) for line in lines)
+        if len(row) == 3
+    }
     first, last = numbers["quality_initial"], numbers["quality"]
     assert lines[0].split() == ["octree", "optimised"]
     energies = numbers["energies"]
     fractions = [energies[f"E_D_fraction_of_variance{when}"] for when in ("_initial", "")]
-    assert table["E_D, fraction of the image's variance"] == [f"{fraction:.5f}" for fraction in fractions]
+    assert table["E_D, fraction of the image's variance"] == [
+        f"{fraction:.5f}" for fraction in fractions
+    ]
     assert table["rho, mean"] == [f"{first['mean_rho']:.4f}", f"{last['mean_rho']:.4f}"]
-    assert table["smallest angle, degrees"] == [f"{first['min_dihedral']:.2f}", f"{last['min_dihedral']:.2f}"]
+    assert table["smallest angle, degrees"] == [
+        f"{first['min_dihedral']:.2f}",
+        f"{last['min_dihedral']:.2f}",
+    ]
     assert table["rho, mean"][0] != table["rho, mean"][1]
     nodes, cells = last["n_nodes"], last["n_cells"]
     assert lines[-2:] == [
@@ -255,7 +301,9 @@ def test_the_table_shows_before_and_after_and_lines_the_progress(tmp_path, input
         f"all requirements are met; {tmp_path / 'a.vtu'}: {nodes} nodes, {cells} cells",
     ]
     history, lines = numbers["history"], said.err.splitlines()
-    words = "16 x 16 x 16 voxels of 4 x 4 x 4 mm; octree of 148 nodes, 576 cells, edges up to 26.7 mm"
+    words = (
+        "16 x 16 x 16 voxels of 4 x 4 x 4 mm; octree of 148 nodes, 576 cells, edges up to 26.7 mm"
+    )
     first = f"{inputs / 'sphere.nii.gz'}: {words}"
     assert re.fullmatch(rf"{re.escape(first)}; about \d\.\d+ GB of memory", lines[0])
     progress = [line for line in lines[1:] if line.startswith("iteration")]
@@ -271,7 +319,9 @@ def test_a_constant_image_warns_and_works(tmp_path, inputs, capsys):
     command = mesh_words(inputs / "flat.nii", tmp_path)
     assert exit_code(*command, "--nodes", "50", "--iterations", "2") == 0
     captured = capsys.readouterr()
-    warning = f"tetopt: warning: {inputs / 'flat.nii'}: the image is 3 everywhere, so E_D is 0 everywhere"
+    warning = (
+        f"tetopt: warning: {inputs / 'flat.nii'}: the image is 3 everywhere, so E_D is 0 everywhere"
+    )
     assert captured.err.splitlines()[0] == warning
     assert captured.err.count("warning") == 1
     assert "E_D" not in captured.out
@@ -289,7 +339,16 @@ def test_a_name_with_markup_and_letters(tmp_path, inputs, capsys):
     folder = tmp_path / "Schädel [red] :cat:"
     folder.mkdir()
     shutil.copy(inputs / "disc.nii", folder / "ä[1].nii")
-    command = ["mesh", folder / "ä[1].nii", "-o", folder / "a[b].vtu", "--nodes", "30", "--iterations", "1"]
+    command = [
+        "mesh",
+        folder / "ä[1].nii",
+        "-o",
+        folder / "a[b].vtu",
+        "--nodes",
+        "30",
+        "--iterations",
+        "1",
+    ]
     assert exit_code(*command) == 0
     captured = capsys.readouterr()
     assert captured.err.startswith(f"{folder / 'ä[1].nii'}: 32 x 32 voxels")
@@ -299,12 +358,23 @@ def test_a_name_with_markup_and_letters(tmp_path, inputs, capsys):
     assert capsys.readouterr().out.splitlines()[0].strip() == "a[b].vtu"
 
 
-@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one core: there are no two thread counts to compare")
+@pytest.mark.skipif(
+    numba.config.NUMBA_NUM_THREADS < 2, reason="one core: there are no two thread counts to compare"
+)
 def test_the_same_bits_for_any_number_of_threads(tmp_path, inputs):
     hashes = []
     for threads in ("1", "2"):
         out = tmp_path / threads
-        command = ["mesh", inputs / "sphere.nii.gz", "-o", f"{out}.vtu", "--json", f"{out}.json", "--nodes", "400"]
+        command = [
+            "mesh",
+            inputs / "sphere.nii.gz",
+            "-o",
+            f"{out}.vtu",
+            "--json",
+            f"{out}.json",
+            "--nodes",
+            "400",
+        ]
         assert exit_code(*command, "--iterations", "3", "--threads", threads) == 0
         numbers = json.loads(Path(f"{out}.json").read_text())
         assert numbers["machine"]["threads"] == int(threads)
@@ -316,7 +386,9 @@ def test_the_same_bits_for_any_number_of_threads(tmp_path, inputs):
 
 def test_max_seconds_leaves_a_valid_mesh(tmp_path, inputs, capsys):
     command = mesh_words(inputs / "sphere.nii.gz", tmp_path)
-    assert exit_code(*command, "--nodes", "400", "--iterations", "1000", "--max-seconds", "1e-6") == 0
+    assert (
+        exit_code(*command, "--nodes", "400", "--iterations", "1000", "--max-seconds", "1e-6") == 0
+    )
     numbers = numbers_in(tmp_path / "a.json")
     assert numbers["ended"] == "max_seconds"
     assert numbers["options"]["max_seconds"] == 1e-6
@@ -338,7 +410,8 @@ def test_what_is_violated_is_told_in_the_commands_options(capsys):
         tell(problems)
     said = capsys.readouterr().err
     assert said == (
-        "tetopt: requirement violated: min_dihedral: 2 of 9 cells; allow a lower --k-d, or a lower --min-dihedral\n"
+        "tetopt: requirement violated: min_dihedral: 2 of 9 cells; allow a lower --k-d, or a "
+        "lower --min-dihedral\n"
         "tetopt: requirement violated: box: k_D.nii lies beyond\n"
     )
 
@@ -350,9 +423,13 @@ def test_what_is_violated_is_told_in_the_commands_options(capsys):
 def child(arguments, **options):
     environment = os.environ | {"PYTHONPATH": str(Path(tetopt.__file__).parents[1])}
     return subprocess.Popen(
-        [sys.executable, "-m", "tetopt", *map(str, arguments)], env=environment, text=True,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options,
-    )  # fmt: skip
+        [sys.executable, "-m", "tetopt", *map(str, arguments)],
+        env=environment,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        **options,
+    )
 
 
 @pytest.mark.deep
@@ -389,12 +466,17 @@ def test_a_second_ctrl_c_gives_up(tmp_path, inputs, monkeypatch, capsys):
         signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(tetopt.job.meshing, "_prepare", lambda _: None)
-    monkeypatch.setattr(tetopt.engine.meshing, "optimize", functools.wraps(tetopt.engine.meshing.optimize)(impatient))
+    monkeypatch.setattr(
+        tetopt.engine.meshing,
+        "optimize",
+        functools.wraps(tetopt.engine.meshing.optimize)(impatient),
+    )
     before = signal.getsignal(signal.SIGINT)
     assert exit_code("mesh", inputs / "disc.nii", "-o", tmp_path / "a.vtu") == 130
     assert signal.getsignal(signal.SIGINT) is before
     assert capsys.readouterr().err.splitlines()[-3:] == [
-        "interrupted: finishing the current nodes, then writing the mesh (interrupt again to end at once)",
+        "interrupted: finishing the current nodes, then writing the mesh (interrupt again to end "
+        "at once)",
         "interrupted again: unwritten results are discarded",
         "ended by Ctrl-C; written: nothing",
     ]
@@ -446,10 +528,14 @@ BAD_OPTIONS = [
 ]
 
 
-@pytest.mark.parametrize(("options", "match"), BAD_OPTIONS, ids=[options for options, _ in BAD_OPTIONS])
+@pytest.mark.parametrize(
+    ("options", "match"), BAD_OPTIONS, ids=[options for options, _ in BAD_OPTIONS]
+)
 def test_bad_options_of_mesh(tmp_path, inputs, monkeypatch, capfd, options, match):
     monkeypatch.chdir(tmp_path)
-    assert_refused(capfd, ["mesh", inputs / "sphere.nii.gz", "-o", "a.vtu", *options.split()], match)
+    assert_refused(
+        capfd, ["mesh", inputs / "sphere.nii.gz", "-o", "a.vtu", *options.split()], match
+    )
     assert list(tmp_path.iterdir()) == []
 
 
@@ -495,13 +581,21 @@ def test_existing_outputs_are_refused(tmp_path, inputs, capfd):
     new, mesh = tmp_path / "new.nii", mesh_words(inputs / "sphere.nii.gz", tmp_path)
     assert_refused(capfd, mesh, "a.json: already exists; pass --force")
     assert_refused(capfd, ["phantom", "sphere", "-o", tmp_path / "a.nii"], "already exists")
-    assert_refused(capfd, ["phantom", "sphere", "-o", new, "--labels", tmp_path / "b.nii"], "already exists")
-    assert_refused(capfd, ["quality", inputs / "lattice.vtu", "--json", tmp_path / "a.json"], "already exists")
-    assert {p.name: p.read_text() for p in tmp_path.iterdir()} == dict.fromkeys(("a.nii", "b.nii", "a.json"), "old")
+    assert_refused(
+        capfd, ["phantom", "sphere", "-o", new, "--labels", tmp_path / "b.nii"], "already exists"
+    )
+    assert_refused(
+        capfd, ["quality", inputs / "lattice.vtu", "--json", tmp_path / "a.json"], "already exists"
+    )
+    assert {p.name: p.read_text() for p in tmp_path.iterdir()} == dict.fromkeys(
+        ("a.nii", "b.nii", "a.json"), "old"
+    )
 
 
 def test_the_systems_errors_take_one_line(tmp_path, inputs, monkeypatch, capfd):
-    assert_refused(capfd, ["mesh", inputs / "disc.nii", "-o", tmp_path / f"{'a' * 300}.vtu"], "too long")
+    assert_refused(
+        capfd, ["mesh", inputs / "disc.nii", "-o", tmp_path / f"{'a' * 300}.vtu"], "too long"
+    )
 
     def full_disk(*_):
         raise OSError(28, "No space left on device", "a[b].vtu")
@@ -522,7 +616,16 @@ def test_the_checksum_is_of_what_was_read(tmp_path, inputs, monkeypatch):
 
     monkeypatch.setattr(tetopt.job.meshing, "_prepare", lambda _: None)
     monkeypatch.setattr(tetopt.engine.meshing, "optimize", slow)
-    command = ["mesh", tmp_path / "disc.nii", "-o", tmp_path / "a.vtu", "--nodes", "30", "--iterations", "1"]
+    command = [
+        "mesh",
+        tmp_path / "disc.nii",
+        "-o",
+        tmp_path / "a.vtu",
+        "--nodes",
+        "30",
+        "--iterations",
+        "1",
+    ]
     assert exit_code(*command) == 0
     expected = hashlib.sha256((inputs / "disc.nii").read_bytes()).hexdigest()
     assert load_mesh(tmp_path / "a.vtu").field_data["image_sha256"].tolist() == [expected]
@@ -540,7 +643,9 @@ def test_help_names_no_value_of_a_switch_and_breaks_no_word(monkeypatch, capsys,
         text = capsys.readouterr().out
         assert "bool" not in text
         assert re.search(r"--help(,--help-all)? +-h +Show this message", text)
-        assert words != ("mesh", "--help-all") or {"octree", "bcc", "five-tet"} <= set(re.findall(r"[\w-]+", text))
+        assert words != ("mesh", "--help-all") or {"octree", "bcc", "five-tet"} <= set(
+            re.findall(r"[\w-]+", text)
+        )
 
 
 def groups_of_help(capsys, *words):
@@ -548,24 +653,38 @@ def groups_of_help(capsys, *words):
     assert exit_code(*words) == 0
     groups = re.split(r"^╭─ (.+?) ─+╮$", capsys.readouterr().out, flags=re.M)[1:]
     pairs = zip(groups[::2], groups[1::2], strict=True)
-    return {name: re.findall(r"^│ [ *]*(--[a-z-]+)", text, re.M) for name, text in pairs if name != "Arguments"}
+    return {
+        name: re.findall(r"^│ [ *]*(--[a-z-]+)", text, re.M)
+        for name, text in pairs
+        if name != "Arguments"
+    }
 
 
 def test_help_of_mesh_is_in_seven_groups(monkeypatch, capsys):
-    """Each of at most eighteen options, and the help; without `--help-all` the twenty that most users take."""
+    """Each of at most eighteen options, and the help; without `--help-all` the twenty that most
+    users take.
+    """
     monkeypatch.setenv("COLUMNS", "80")
     every = groups_of_help(capsys, "mesh", "--help-all")
     assert {name: len(options) for name, options in every.items()} == {
-        "Options": 5, "Region and labels": 18, "Number and size of cells": 10, "Initial mesh": 4,
-        "Optimisation": 11, "Meshing in parts": 4, "For the solver": 14,
-    }  # fmt: skip
+        "Options": 5,
+        "Region and labels": 18,
+        "Number and size of cells": 10,
+        "Initial mesh": 4,
+        "Optimisation": 11,
+        "Meshing in parts": 4,
+        "For the solver": 14,
+    }
     shown = groups_of_help(capsys, "mesh", "--help")
     assert sum(map(len, shown.values())) == 20 + 1
-    assert all(set(options) < set(every[name]) or name == "Options" for name, options in shown.items())
+    assert all(
+        set(options) < set(every[name]) or name == "Options" for name, options in shown.items()
+    )
     assert {"--output", "--mask", "--nodes", "--young", "--load"} <= {
         each for group in shown.values() for each in group
     }
-    assert groups_of_help(capsys, "cohort", "--help")["Optimisation"] == every["Optimisation"]  # has no shorter one
+    # has no shorter one
+    assert groups_of_help(capsys, "cohort", "--help")["Optimisation"] == every["Optimisation"]
 
 
 def test_help_lists_the_commands(capsys):
@@ -574,7 +693,8 @@ def test_help_lists_the_commands(capsys):
     assert all(re.search(rf"\b{command}\b", captured.out) for command in COMMANDS)
     assert exit_code() == 2
     bare = capsys.readouterr()
-    assert (bare.out + bare.err).strip() == captured.out.strip()  # the help, and no line of complaint
+    # the help, and no line of complaint
+    assert (bare.out + bare.err).strip() == captured.out.strip()
 
 
 def test_version_also_as_a_module(capsys):
@@ -584,7 +704,10 @@ def test_version_also_as_a_module(capsys):
 
 
 # Libraries that take time to load; the order is that of the printed line.
-HEAVY = "matplotlib meshio nibabel numba PIL pyvista scipy.linalg scipy.ndimage scipy.sparse scipy.spatial vtkmodules"
+HEAVY = (
+    "matplotlib meshio nibabel numba PIL pyvista scipy.linalg scipy.ndimage scipy.sparse "
+    "scipy.spatial vtkmodules"
+)
 
 
 @pytest.mark.deep
@@ -596,15 +719,23 @@ HEAVY = "matplotlib meshio nibabel numba PIL pyvista scipy.linalg scipy.ndimage 
         ("import tetopt.cli; tetopt.cli.main(['--version'])", ""),
         ("import tetopt.cli; tetopt.cli.main(['msh'])", ""),
         # The rest is loaded where a run comes to it.
-        ("import tetopt.cli.mesh", "nibabel numba PIL"),  # nibabel loads pydicom where it is installed, and that PIL
+        # nibabel loads pydicom where it is installed, and that PIL
+        ("import tetopt.cli.mesh", "nibabel numba PIL"),
         ("import tetopt; tetopt.mesh_image", "numba"),
     ],
 )
 def test_nothing_is_loaded_before_it_is_used(code, needed):
     environment = os.environ | {"PYTHONPATH": str(Path(tetopt.__file__).parents[1])}
-    code += f"; import sys; print('loaded:', *(name for name in {HEAVY!r}.split() if name in sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1].split()[1:] == sorted(needed.split(), key=HEAVY.split().index)
+    code += (
+        f"; import sys; print('loaded:', *(name for name in {HEAVY!r}.split() if name in "
+        "sys.modules))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.splitlines()[-1].split()[1:] == sorted(
+        needed.split(), key=HEAVY.split().index
+    )
 
 
 @pytest.mark.parametrize("threads", ["0", "1.5", "9" * 5000])
@@ -612,22 +743,38 @@ def test_threads_that_cannot_be_are_refused(inputs, tmp_path, monkeypatch, capfd
     """numba ends with a traceback, or takes another number."""
     monkeypatch.setenv("NUMBA_NUM_THREADS", threads)
     command = ["mesh", inputs / "sphere.nii.gz", "-o", tmp_path / "a.vtu", "--nodes", "60"]
-    assert_refused(capfd, command, "NUMBA_NUM_THREADS: expected a whole number of threads from 1 to 9999, got")
+    assert_refused(
+        capfd, command, "NUMBA_NUM_THREADS: expected a whole number of threads from 1 to 9999, got"
+    )
 
 
 @pytest.mark.parametrize(
     ("name", "value", "words"),
     [
         ("NUMBA_THREADING_LAYER", "foo", "NUMBA_THREADING_LAYER: expected .*workqueue.*, got foo"),
-        ("NUMBA_THREADING_LAYER_PRIORITY", "foo", "NUMBA_THREADING_LAYER_PRIORITY: expected omp tbb workqueue"),
-        ("NUMBA_OPT", "foo", "environment: .*'NUMBA_OPT'.*'foo' could not be parsed; check NUMBA_OPT"),
-        ("MPLBACKEND", "foo", "environment: .*'foo' is not a valid value for backend; check MPLBACKEND"),
+        (
+            "NUMBA_THREADING_LAYER_PRIORITY",
+            "foo",
+            "NUMBA_THREADING_LAYER_PRIORITY: expected omp tbb workqueue",
+        ),
+        (
+            "NUMBA_OPT",
+            "foo",
+            "environment: .*'NUMBA_OPT'.*'foo' could not be parsed; check NUMBA_OPT",
+        ),
+        (
+            "MPLBACKEND",
+            "foo",
+            "environment: .*'foo' is not a valid value for backend; check MPLBACKEND",
+        ),
     ],
 )
 def test_a_variable_of_a_library_with_a_bad_value_is_one_line(tmp_path, name, value, words):
     """In a process of its own, as numba and matplotlib read them once."""
     command = [sys.executable, "-m", "tetopt", "quality", str(tmp_path / "a.vtu")]
-    ended = subprocess.run(command, env=os.environ | {name: value}, capture_output=True, text=True, check=False)
+    ended = subprocess.run(
+        command, env=os.environ | {name: value}, capture_output=True, text=True, check=False
+    )
     assert ended.returncode == 2
     assert re.fullmatch(f"tetopt: {words}.*\n", ended.stderr), ended.stderr
 
@@ -663,7 +810,9 @@ def test_quality_of_a_run(run, inputs, tmp_path, capsys):
     assert report["fit"]["n_empty_cells"] == int((file.cell_data["n_voxels"] == 0).sum())
     captured = capsys.readouterr()
     assert captured.err == ""
-    assert re.search(rf"^voxels inside +{image.data.size} of {image.data.size}$", captured.out, re.M)
+    assert re.search(
+        rf"^voxels inside +{image.data.size} of {image.data.size}$", captured.out, re.M
+    )
     assert re.search(rf"^nodes +{len(file.mesh.points)}$", captured.out, re.M)
 
 
@@ -695,7 +844,9 @@ def test_phantoms_with_labels(tmp_path, name, capsys):
     expected, labels = phantom.image(voxel_mm=voxel), phantom.label_image(voxel_mm=voxel)
     written = nibabel.load(image_path)
     np.testing.assert_array_equal(written.get_fdata().reshape(expected.shape), expected.data)
-    np.testing.assert_array_equal(nibabel.load(label_path).get_fdata().reshape(labels.shape), labels.data)
+    np.testing.assert_array_equal(
+        nibabel.load(label_path).get_fdata().reshape(labels.shape), labels.data
+    )
     n = expected.ndim
     np.testing.assert_allclose(written.affine[:n, :n], expected.affine[:n, :n], rtol=1e-6)
     captured = capsys.readouterr()
@@ -712,8 +863,8 @@ def test_phantoms_with_labels(tmp_path, name, capsys):
 def test_a_sphere_keeps_its_place_in_an_oblique_sheared_world(tmp_path):
     """Through the files: phantom -> image -> mesh -> where the cells' means say that the sphere is.
 
-    A cell weighs its volume, or its number of voxels, times its mean over the background; it stands at the mean
-    world place of the voxel centres that it holds.
+    A cell weighs its volume, or its number of voxels, times its mean over the background; it stands
+    at the mean world place of the voxel centres that it holds.
     """
     (tmp_path / "sphere.toml").write_text(OBLIQUE_TOML)
     assert exit_code("phantom", tmp_path / "sphere.toml", "-o", tmp_path / "a.nii.gz") == 0
@@ -727,7 +878,9 @@ def test_a_sphere_keeps_its_place_in_an_oblique_sheared_world(tmp_path):
     counts = np.bincount(owner, minlength=len(file.mesh.cells))
     np.testing.assert_array_equal(counts, file.cell_data["n_voxels"])
     is_held = counts > 0
-    sums = np.stack([np.bincount(owner, place[:, k], minlength=len(counts)) for k in range(3)], axis=1)
+    sums = np.stack(
+        [np.bincount(owner, place[:, k], minlength=len(counts)) for k in range(3)], axis=1
+    )
     centroids = sums[is_held] / counts[is_held, None]
     true = image.to_index([14.3, -10.1, 28.7])
     for name, allowed in (("volume", 0.05), ("n_voxels", 0.02)):  # voxels
@@ -785,7 +938,9 @@ def test_demo(tmp_path):
     assert numbers["mesh_sha256"] == mesh_hash(file.mesh)
     assert numbers["energies"]["E_D_relative"] < 0.8
     assert file.cell_data["n_voxels"].sum() == np.prod(numbers["image_properties"]["shape"])
-    assert file.cell_data["volume"].sum() == pytest.approx(numbers["image_properties"]["volume_mm"], rel=1e-9)
+    assert file.cell_data["volume"].sum() == pytest.approx(
+        numbers["image_properties"]["volume_mm"], rel=1e-9
+    )
     before = {p.name: p.read_bytes() for p in folder.iterdir()}
     assert exit_code("demo", "-o", folder, "--nodes", "300", "--iterations", "2") == 2
     assert {p.name: p.read_bytes() for p in folder.iterdir()} == before
@@ -809,7 +964,15 @@ def small_run(inputs, folder, iterations):
 @pytest.mark.deep
 def test_a_reader_that_goes_away_loses_no_file(tmp_path, inputs):
     """`tetopt mesh ... | head -1`: mesh and numbers are written, and nothing complains."""
-    command = [sys.executable, "-m", "tetopt", "mesh", inputs / "sphere.nii.gz", "-o", tmp_path / "a.vtu"]
+    command = [
+        sys.executable,
+        "-m",
+        "tetopt",
+        "mesh",
+        inputs / "sphere.nii.gz",
+        "-o",
+        tmp_path / "a.vtu",
+    ]
     command += ["--json", tmp_path / "a.json", "--nodes", "60", "--iterations", "1"]
     run = subprocess.run(
         ["bash", "-c", '"$@" | true; exit "${PIPESTATUS[0]}"', "-", *command],
@@ -819,18 +982,26 @@ def test_a_reader_that_goes_away_loses_no_file(tmp_path, inputs):
     )
     assert run.returncode == 0
     assert "Traceback" not in run.stderr
-    assert numbers_in(tmp_path / "a.json")["quality"]["n_cells"] == len(load_mesh(tmp_path / "a.vtu").mesh.cells)
+    assert numbers_in(tmp_path / "a.json")["quality"]["n_cells"] == len(
+        load_mesh(tmp_path / "a.vtu").mesh.cells
+    )
 
 
 def test_quality_of_overlapping_cells(tmp_path, inputs, capsys):
     mesh = lattice_mesh(load_image(inputs / "sphere.nii.gz"), nodes=60)
-    # Once more a few of them, and not all of the others: together they hold no more voxels than there are.
-    save_mesh(tmp_path / "twice.vtu", Mesh(mesh.points, np.vstack([mesh.cells[3:], mesh.cells[4:5]])))
+    # Once more a few of them, and not all of the others: together they hold no more voxels than
+    # there are.
+    save_mesh(
+        tmp_path / "twice.vtu", Mesh(mesh.points, np.vstack([mesh.cells[3:], mesh.cells[4:5]]))
+    )
     words = [tmp_path / "twice.vtu", "--image", inputs / "sphere.nii.gz"]
     assert exit_code("quality", *words, "--json", tmp_path / "q.json") == 1
     overlap = numbers_in(tmp_path / "q.json")["fit"]["overlap"]
     assert overlap["cells"] == [1, len(mesh.cells) - 3]
-    assert f"cells 1 and {len(mesh.cells) - 3} both contain voxel {overlap['voxel']}" in capsys.readouterr().err
+    assert (
+        f"cells 1 and {len(mesh.cells) - 3} both contain voxel {overlap['voxel']}"
+        in capsys.readouterr().err
+    )
     assert exit_code("segment", words[2], words[0], "-o", tmp_path / "s.nii.gz") == 2
     assert "twice.vtu: cells overlap: " in capsys.readouterr().err
     assert not (tmp_path / "s.nii.gz").exists()
@@ -867,14 +1038,39 @@ def test_quality_of_a_part(tmp_path, inputs, part, capsys):
     assert inside == all_
 
 
-def test_folders_of_pictures_and_results_are_made_and_none_is_left_where_a_run_is_refused(tmp_path, inputs, capfd):
-    mesh = ["mesh", inputs / "sphere.nii.gz", "-o", tmp_path / "a.vtu", "--iterations", "0", "--spacing", "16"]
-    assert_refused(capfd, [*mesh, "--figures", tmp_path / "new" / "deep", "--mask", tmp_path / "no.nii"], "no.nii")
-    assert_refused(capfd, ["compare", inputs / "disc.nii", "-o", tmp_path / "new"], "expected a volume")
+def test_folders_of_pictures_and_results_are_made_and_none_is_left_where_a_run_is_refused(
+    tmp_path, inputs, capfd
+):
+    mesh = [
+        "mesh",
+        inputs / "sphere.nii.gz",
+        "-o",
+        tmp_path / "a.vtu",
+        "--iterations",
+        "0",
+        "--spacing",
+        "16",
+    ]
+    assert_refused(
+        capfd,
+        [*mesh, "--figures", tmp_path / "new" / "deep", "--mask", tmp_path / "no.nii"],
+        "no.nii",
+    )
+    assert_refused(
+        capfd, ["compare", inputs / "disc.nii", "-o", tmp_path / "new"], "expected a volume"
+    )
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "file").write_text("a file")
-    assert_refused(capfd, [*mesh, "--figures", tmp_path / "file"], "expected a folder for the results, found a file")
-    assert_refused(capfd, [*mesh, "--figures", tmp_path / "file" / "a"], "a: cannot create the folder for the results")
+    assert_refused(
+        capfd,
+        [*mesh, "--figures", tmp_path / "file"],
+        "expected a folder for the results, found a file",
+    )
+    assert_refused(
+        capfd,
+        [*mesh, "--figures", tmp_path / "file" / "a"],
+        "a: cannot create the folder for the results",
+    )
     assert exit_code(*mesh, "--figures", tmp_path / "new" / "deep") == 0
     names = {"slice.png", "rho.png", "energies.png", "thumbnail.png"}
     assert {each.name for each in (tmp_path / "new" / "deep").iterdir()} == names
@@ -887,9 +1083,15 @@ def test_folders_of_pictures_and_results_are_made_and_none_is_left_where_a_run_i
         (["--spacing", "3"], "no single spacing"),
         (["--nodes", "900000"], "too many for 16 x 16 x 16 voxels; use at most 5000"),
         (["--target-error", "1.5"], "expected a fraction of the image's variance, 0 to 1, got 1.5"),
-        (["--nodes", "100", "--edge-size", "6"], "100 nodes are too few for 16 x 16 x 16 voxels and these limits"),
+        (
+            ["--nodes", "100", "--edge-size", "6"],
+            "100 nodes are too few for 16 x 16 x 16 voxels and these limits",
+        ),
         (["--edge-size", "0.2"], "sizes: the requested edges are so short that cells are smaller"),
-        (["--size-min", "9", "--edge-max", "8"], "--edge-max: 8 mm is below the smallest size, 9 mm"),
+        (
+            ["--size-min", "9", "--edge-max", "8"],
+            "--edge-max: 8 mm is below the smallest size, 9 mm",
+        ),
         (["--edge-size", "-1"], "--edge-size: expected a length above 0"),
         (["--gradation", "3"], "gradation: expected 0.05 (gentle) to 1, got 3"),
     ],
@@ -897,7 +1099,9 @@ def test_folders_of_pictures_and_results_are_made_and_none_is_left_where_a_run_i
 def test_octree_options(tmp_path, inputs, capsys, extra, words):
     """What an octree cannot do is one line, exit 2, and no file."""
     path = tmp_path / "a.vtu"
-    assert exit_code("mesh", inputs / "sphere.nii.gz", "-o", path, "--lattice", "octree", *extra) == 2
+    assert (
+        exit_code("mesh", inputs / "sphere.nii.gz", "-o", path, "--lattice", "octree", *extra) == 2
+    )
     error = capsys.readouterr().err.strip().splitlines()[-1]
     assert words in error
     assert not path.exists()
@@ -920,10 +1124,21 @@ def test_octree_mesh(tmp_path, inputs, capsys):
 
 @pytest.mark.parametrize(
     ("word", "option"),
-    [("--uniform", "--target-error 0.1"), ("--spacing 8", "--edge-size 9"), ("--method paper", "--edge-max 9")],
+    [
+        ("--uniform", "--target-error 0.1"),
+        ("--spacing 8", "--edge-size 9"),
+        ("--method paper", "--edge-max 9"),
+    ],
 )
 def test_limits_are_for_graded_meshes(tmp_path, inputs, capfd, word, option):
-    command = ["mesh", inputs / "sphere.nii.gz", "-o", tmp_path / "a.vtu", *word.split(), *option.split()]
+    command = [
+        "mesh",
+        inputs / "sphere.nii.gz",
+        "-o",
+        tmp_path / "a.vtu",
+        *word.split(),
+        *option.split(),
+    ]
     assert_refused(capfd, command, f"{option.split()[0]}: needs a graded mesh")
 
 
@@ -933,7 +1148,16 @@ def test_mesh_with_limits(tmp_path, inputs, capfd):
     field = np.where(np.arange(16)[:, None, None] < 5, 13.0, 0.0) * np.ones((1, 16, 16))
     save_image(tmp_path / "sizes.nii.gz", Image(field, image.affine))
     command = mesh_words(inputs / "sphere.nii.gz", tmp_path)
-    words = ["--nodes", "500", "--edge-size", "30", "--sizing", tmp_path / "sizes.nii.gz", "--gradation", "0.9"]
+    words = [
+        "--nodes",
+        "500",
+        "--edge-size",
+        "30",
+        "--sizing",
+        tmp_path / "sizes.nii.gz",
+        "--gradation",
+        "0.9",
+    ]
     assert exit_code(*command, *words) == 0
     mesh = load_mesh(tmp_path / "a.vtu").mesh
     assert len(mesh.points) == 500
@@ -943,7 +1167,10 @@ def test_mesh_with_limits(tmp_path, inputs, capfd):
     sizes = tetopt.Sizes(edge_size=30.0, field=Image(field, image.affine), gradation=0.9)
     assert met["mean"] == pytest.approx(edge_ratios(mesh.points, mesh.cells, sizes).mean)
     assert len(met["edges_of_bins"]) == len(met["fraction"]) + 1
-    line = f"ratio of edges to their target size: {met['mean']:.2f} on average; {met['below']:.1%} are below 0.71"
+    line = (
+        f"ratio of edges to their target size: {met['mean']:.2f} on average; "
+        f"{met['below']:.1%} are below 0.71"
+    )
     assert line in capfd.readouterr().out
     assert exit_code(*command, "--force", "--nodes", "500", "--edge-max", "40") == 0
     numbers = numbers_in(tmp_path / "a.json")
@@ -953,14 +1180,18 @@ def test_mesh_with_limits(tmp_path, inputs, capfd):
 
 
 def test_sizes_make_the_number_of_nodes(tmp_path, inputs):
-    """Alone they say it; where only a part has a target, the rest gets its fraction of the usual number."""
+    """Alone they say it; where only a part has a target, the rest gets its fraction of the usual
+    number.
+    """
     image = load_image(inputs / "sphere.nii.gz")
     command = [*mesh_words(inputs / "sphere.nii.gz", tmp_path), "--iterations", "6", "--force"]
     assert exit_code(*command, "--edge-size", "14") == 0
     needed = nodes_of_sizes(image, tetopt.Sizes(edge_size=14.0))[0]
     assert numbers_in(tmp_path / "a.json")["options"]["nodes"] == needed
     assert len(load_mesh(tmp_path / "a.vtu").mesh.points) == needed
-    field = Image(np.where(np.arange(16)[:, None, None] < 4, 14.0, 0.0) * np.ones((1, 16, 16)), image.affine)
+    field = Image(
+        np.where(np.arange(16)[:, None, None] < 4, 14.0, 0.0) * np.ones((1, 16, 16)), image.affine
+    )
     save_image(tmp_path / "sizes.nii.gz", field)
     assert exit_code(*command, "--sizing", tmp_path / "sizes.nii.gz") == 0
     of_part, fraction = nodes_of_sizes(image, tetopt.Sizes(field=field))
@@ -986,13 +1217,19 @@ def test_only_the_users_longest_edge_is_told_as_missed(tmp_path, inputs, monkeyp
 
 
 def test_target_error(tmp_path, inputs, capfd):
-    """As many nodes as it takes, told in the numbers; the same as asking for that many. A miss exits 1."""
+    """As many nodes as it takes, told in the numbers; the same as asking for that many. A miss
+    exits 1.
+    """
     command = mesh_words(inputs / "sphere.nii.gz", tmp_path)
     assert exit_code(*command, "--target-error", "0.2") == 0
     numbers = numbers_in(tmp_path / "a.json")
-    runs = re.findall(r"run (\d) of up to 6: (\d+) nodes leave ([\d.]+) of the variance", capfd.readouterr().err)
+    runs = re.findall(
+        r"run (\d) of up to 6: (\d+) nodes leave ([\d.]+) of the variance", capfd.readouterr().err
+    )
     assert [int(number) for number, _, _ in runs] == list(range(1, len(runs) + 1))
-    assert float(runs[-1][2]) == pytest.approx(numbers["energies"]["E_D_fraction_of_variance"], rel=1e-3)
+    assert float(runs[-1][2]) == pytest.approx(
+        numbers["energies"]["E_D_fraction_of_variance"], rel=1e-3
+    )
     assert numbers["energies"]["E_D_fraction_of_variance"] <= 0.2
     nodes = numbers["options"]["nodes"]
     assert numbers["options"]["target_error"] == 0.2
@@ -1004,21 +1241,32 @@ def test_target_error(tmp_path, inputs, capfd):
 
 
 def test_target_error_with_the_most_nodes(tmp_path, capfd):
-    """What the error takes is said before the run with the most nodes, which is that of as many; what it left, then."""
+    """What the error takes is said before the run with the most nodes, which is that of as many;
+    what it left, then.
+    """
     x, y = np.indices((120, 100))
     save_image(tmp_path / "a.nii.gz", Image(10.0 * np.sin(x / 9.0) * np.cos(y / 8.0) + x))
     command = mesh_words(tmp_path / "a.nii.gz", tmp_path)
     assert exit_code(*command, "--target-error", "0.001", "--nodes-max", "230") == 1
     numbers, err = numbers_in(tmp_path / "a.json"), " ".join(capfd.readouterr().err.split())
-    (first, left), (last, reached) = re.findall(r"run \d of up to 6: (\d+) nodes leave ([\d.]+) of the variance", err)
-    pattern = (
-        r"an error of 0.001 requires about (\d+) nodes, \d+ s and [\d.]+ [MG]B of memory; (more than .*? has \d+ nodes)"
+    (first, left), (last, reached) = re.findall(
+        r"run \d of up to 6: (\d+) nodes leave ([\d.]+) of the variance", err
     )
+    pattern = r"an error of 0.001 requires about (\d+) nodes, \d+ s and [\d.]+ [MG]B of memory; (more than .*? has \d+ nodes)"
     ((predicted, words),) = re.findall(pattern, err)
-    assert (int(first), int(last), words) == (200, 230, "more than --nodes-max, so that the next run has 230 nodes")
-    assert int(predicted) == pytest.approx(200.0 * (float(left) / (0.925 * 0.001)) ** (1.0 / ERROR_RATE), rel=0.01)
+    assert (int(first), int(last), words) == (
+        200,
+        230,
+        "more than --nodes-max, so that the next run has 230 nodes",
+    )
+    assert int(predicted) == pytest.approx(
+        200.0 * (float(left) / (0.925 * 0.001)) ** (1.0 / ERROR_RATE), rel=0.01
+    )
     assert err.index(words) < err.index(f"{last} nodes leave")
-    assert f"{reached} of the image's variance is unexplained, more than 0.001, which requires about " in err
+    assert (
+        f"{reached} of the image's variance is unexplained, more than 0.001, which requires about "
+        in err
+    )
     assert "allow more (--nodes-max)" in err
     options = numbers["options"]
     assert list(numbers["violated"]) == ["error"]
@@ -1034,7 +1282,10 @@ def test_target_error_with_the_most_nodes(tmp_path, capfd):
         ("--nodes-max 300 --nodes 200", "--nodes-max: needs --target-error"),
         ("--nodes-max 300 --spacing 9", "--nodes-max: needs --target-error"),
         ("--nodes-max 4 --target-error 0.2", "--nodes-max: expected 5 or more, got 4"),
-        ("--nodes-max 8 --target-error 0.2", "--nodes-max: expected a whole number, 9 or more in 3-D, got 8"),
+        (
+            "--nodes-max 8 --target-error 0.2",
+            "--nodes-max: expected a whole number, 9 or more in 3-D, got 8",
+        ),
         ("--nodes-max 60 --target-error 0.2 --edge-max 9", "--nodes-max: sizes require about"),
     ],
 )
@@ -1071,7 +1322,13 @@ def test_segment(tmp_path, inputs, capfd):
 
 
 def test_segment_refuses_other_labels(tmp_path, inputs, capfd):
-    command = ["segment", inputs / "sphere.nii.gz", inputs / "lattice.vtu", "-o", tmp_path / "l.nii"]
+    command = [
+        "segment",
+        inputs / "sphere.nii.gz",
+        inputs / "lattice.vtu",
+        "-o",
+        tmp_path / "l.nii",
+    ]
     other = tetopt.load_phantom("sphere").label_image(voxel_mm=3.3)
     tetopt.save_image(tmp_path / "other.nii", other)
     assert exit_code(*command, "--truth", tmp_path / "other.nii") == 2
@@ -1082,24 +1339,56 @@ def test_segment_refuses_other_labels(tmp_path, inputs, capfd):
 
 
 def test_segment_labels_must_lie_where_the_image_does(tmp_path, inputs, capfd):
-    """Truth of the same shape but elsewhere is refused; truth is cut as the image is; a foreign mesh is told."""
+    """Truth of the same shape but elsewhere is refused; truth is cut as the image is; a foreign
+    mesh is told.
+    """
     sphere = load_image(inputs / "sphere.nii.gz")
     shifted = sphere.affine.copy()
     shifted[0, 3] += 3.0
     save_image(tmp_path / "shifted.nii", Image(sphere.data > 50, shifted))
     save_image(tmp_path / "truth.nii", Image(sphere.data > 50, sphere.affine))
-    command = ["segment", inputs / "sphere.nii.gz", inputs / "lattice.vtu", "-o", tmp_path / "l.nii"]
+    command = [
+        "segment",
+        inputs / "sphere.nii.gz",
+        inputs / "lattice.vtu",
+        "-o",
+        tmp_path / "l.nii",
+    ]
     assert exit_code(*command, "--truth", tmp_path / "shifted.nii") == 2
     capfd.readouterr()
     save_image(tmp_path / "odd.nii", Image(np.where(sphere.data > 50, 1e30, 0.5), sphere.affine))
     assert exit_code(*command, "--truth", tmp_path / "odd.nii") == 2
     assert "labels must be whole numbers" in capfd.readouterr().err
-    mesh = ["mesh", inputs / "sphere.nii.gz", "--slice", "k=5", "-o", tmp_path / "s.vtu", "--nodes", "40"]
+    mesh = [
+        "mesh",
+        inputs / "sphere.nii.gz",
+        "--slice",
+        "k=5",
+        "-o",
+        tmp_path / "s.vtu",
+        "--nodes",
+        "40",
+    ]
     assert exit_code(*mesh, "--iterations", "0") == 0
-    cut = ["segment", inputs / "sphere.nii.gz", tmp_path / "s.vtu", "-o", tmp_path / "l.nii", "--slice", "k=5"]
+    cut = [
+        "segment",
+        inputs / "sphere.nii.gz",
+        tmp_path / "s.vtu",
+        "-o",
+        tmp_path / "l.nii",
+        "--slice",
+        "k=5",
+    ]
     assert exit_code(*cut, "--truth", tmp_path / "truth.nii", "--classes", "2") == 0
     kept = (tmp_path / "truth.nii").read_bytes()
-    over = [*cut[:4], tmp_path / "truth.nii", *cut[5:], "--truth", tmp_path / "truth.nii", "--force"]
+    over = [
+        *cut[:4],
+        tmp_path / "truth.nii",
+        *cut[5:],
+        "--truth",
+        tmp_path / "truth.nii",
+        "--force",
+    ]
     assert exit_code(*over) == 2
     assert (tmp_path / "truth.nii").read_bytes() == kept
 

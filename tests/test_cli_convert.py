@@ -1,4 +1,6 @@
-"""`tetopt convert`, `tetopt surface`, `tetopt mesh` for solvers and from a mesh of the user's, as a user types them."""
+"""`tetopt convert`, `tetopt surface`, `tetopt mesh` for solvers and from a mesh of the user's,
+as a user types them.
+"""
 
 import json
 import re
@@ -27,7 +29,9 @@ MAPPING = "1 + h/7"
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """An image, its labels, a lattice of 60 nodes with both, and the same mesh as gmsh's and LPS files."""
+    """An image, its labels, a lattice of 60 nodes with both, and the same mesh as gmsh's and LPS
+    files.
+    """
     path = tmp_path_factory.mktemp("convert")
     mesh = labelled_lattice_words(path)
     assert exit_code(*mesh, "-o", path / "a.vtu") == 0
@@ -40,10 +44,19 @@ def test_a_mesh_s_file_has_its_sets_and_its_box(folder):
     assert loaded.box.shape == image.shape
     np.testing.assert_array_equal(loaded.box.affine, image.affine)
     assert set(loaded.sets.facets) == {
-        "boundary", "left", "right", "posterior", "anterior", "inferior", "superior", "interface_0_1"
-    }  # fmt: skip
+        "boundary",
+        "left",
+        "right",
+        "posterior",
+        "anterior",
+        "inferior",
+        "superior",
+        "interface_0_1",
+    }
     assert set(loaded.sets.cells) == {"label_0", "label_1"}
-    np.testing.assert_array_equal(loaded.sets.cells["label_1"], np.flatnonzero(loaded.cell_data["label"] == 1))
+    np.testing.assert_array_equal(
+        loaded.sets.cells["label_1"], np.flatnonzero(loaded.cell_data["label"] == 1)
+    )
     low, high = loaded.cell_data["min"], loaded.cell_data["max"]
     assert (low <= loaded.cell_data["mean"] + 1e-9).all()
     assert (high >= loaded.cell_data["mean"] - 1e-9).all()
@@ -53,7 +66,11 @@ def test_a_mesh_s_file_has_its_sets_and_its_box(folder):
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_every_format_is_written(folder, tmp_path, suffix, capsys):
     out = tmp_path / f"out{suffix}"
-    more = [] if FORMATS[suffix].is_surface else ["--young", MAPPING, "--bins", "3", "--set", "dark=below:20"]
+    more = (
+        []
+        if FORMATS[suffix].is_surface
+        else ["--young", MAPPING, "--bins", "3", "--set", "dark=below:20"]
+    )
     assert exit_code("convert", folder / "a.vtu", out, *more, "--space", "lps") == 0
     assert out.stat().st_size > 900
     said = capsys.readouterr().out
@@ -72,7 +89,18 @@ def quadratic_path(folder):
     """The same mesh of order 2, with a displacement of every node."""
     path = folder / "quadratic.vtu"
     assert (
-        exit_code("convert", folder / "a.vtu", path, "--order", "2", "--young", MAPPING, "--load", "compress:5%") == 0
+        exit_code(
+            "convert",
+            folder / "a.vtu",
+            path,
+            "--order",
+            "2",
+            "--young",
+            MAPPING,
+            "--load",
+            "compress:5%",
+        )
+        == 0
     )
     grid = pyvista.read(path)
     grid.point_data["displacement"] = np.asarray(grid.points) ** 2
@@ -90,9 +118,11 @@ def test_convert_keeps_the_order_unless_told_otherwise(folder, quadratic_path, t
         assert exit_code("convert", quadratic_path, out, "--json", numbers) == 0
         order = 2 if form.has_quadratic else 1
         assert numbers_in(numbers)["size"] == {
-            "order": order, "n_nodes": n_corners, "n_nodes_in_all": n_all if order == 2 else n_corners,
+            "order": order,
+            "n_nodes": n_corners,
+            "n_nodes_in_all": n_all if order == 2 else n_corners,
             "n_cells": len(mesh.cells),
-        }  # fmt: skip
+        }
         said = " ".join("".join(capsys.readouterr()).split())
         if order == 2:
             assert f"{n_corners} corner nodes, {n_all} in all, {len(mesh.cells)} cells" in said
@@ -108,13 +138,17 @@ def test_convert_keeps_the_order_unless_told_otherwise(folder, quadratic_path, t
     np.testing.assert_array_equal(loaded.point_data["displacement"], mesh.points**2)
 
 
-def test_forces_that_hold_sets_go_on_with_the_results_in_their_own_axes_and_units(quadratic_path, tmp_path):
+def test_forces_that_hold_sets_go_on_with_the_results_in_their_own_axes_and_units(
+    quadratic_path, tmp_path
+):
     grid, text = pyvista.read(quadratic_path), json.dumps({"left": [1.5, 0.0, -2.0]})
     for name in ("reactions", "reactions_step2", "reactions of mine"):
         grid.field_data[name] = np.frombuffer(text.encode(), dtype=np.uint8)
     grid.save(tmp_path / "a.vtu")
     for options, is_kept in (([], True), (["--units", "MPa"], False)):
-        assert exit_code("convert", tmp_path / "a.vtu", tmp_path / "b.vtu", "--force", *options) == 0
+        assert (
+            exit_code("convert", tmp_path / "a.vtu", tmp_path / "b.vtu", "--force", *options) == 0
+        )
         loaded = tetopt.load_mesh(tmp_path / "b.vtu")
         for name in ("reactions", "reactions_step2"):
             assert loaded.text(name) == (text if is_kept else None)
@@ -128,14 +162,20 @@ def test_commands_take_a_quadratic_mesh(folder, quadratic_path, tmp_path, capsys
     texts = []
     for path in (folder / "a.vtu", quadratic_path):
         numbers = tmp_path / f"{path.stem}.json"
-        assert exit_code("quality", path, "--image", folder / "a.nii.gz", "--check", "--json", numbers) == 0
+        assert (
+            exit_code("quality", path, "--image", folder / "a.nii.gz", "--check", "--json", numbers)
+            == 0
+        )
         texts.append(capsys.readouterr().out)
         labels = tmp_path / f"{path.stem}.nii.gz"
         assert exit_code("segment", folder / "a.nii.gz", path, "-o", labels, "--classes", "2") == 0
         surface = tmp_path / f"{path.stem}.stl"
         assert exit_code("surface", path, "--label", "1", "-o", surface) == 0
         assert exit_code("view", path, "--html", tmp_path / f"{path.stem}.html") == 0
-        started, improved = ["--start", path, "--iterations", "1"], tmp_path / f"{path.stem}_improved.json"
+        started, improved = (
+            ["--start", path, "--iterations", "1"],
+            tmp_path / f"{path.stem}_improved.json",
+        )
         output = ["-o", tmp_path / f"{path.stem}.msh", "--json", improved]
         assert exit_code("mesh", folder / "a.nii.gz", *output, *started) == 0
         capsys.readouterr()
@@ -144,12 +184,17 @@ def test_commands_take_a_quadratic_mesh(folder, quadratic_path, tmp_path, capsys
     linear, both = (numbers_in(tmp_path / f"{name}.json") for name in ("a", "quadratic"))
     assert linear["quality"] == both["quality"]
     assert linear["fit"] == both["fit"]
-    assert (both["size"]["n_nodes_in_all"], linear["size"]["n_nodes_in_all"]) == (n_all, len(mesh.points))
+    assert (both["size"]["n_nodes_in_all"], linear["size"]["n_nodes_in_all"]) == (
+        n_all,
+        len(mesh.points),
+    )
     improved = [numbers_in(tmp_path / f"{name}_improved.json") for name in ("a", "quadratic")]
     assert improved[0]["mesh_sha256"] == improved[1]["mesh_sha256"]
     assert improved[1]["size"]["order"] == 2  # as the mesh read
     for name in ("nii.gz", "stl"):
-        assert (tmp_path / f"a.{name}").stat().st_size == (tmp_path / f"quadratic.{name}").stat().st_size
+        assert (tmp_path / f"a.{name}").stat().st_size == (
+            tmp_path / f"quadratic.{name}"
+        ).stat().st_size
 
 
 @pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".msh", ".msh2"])
@@ -177,14 +222,37 @@ def test_a_mesh_in_metres_is_read_in_millimetres(folder, tmp_path, suffix):
 def test_fields_of_cells_are_written_as_asked(folder, tmp_path, name, options, kept, capsys):
     assert exit_code("convert", folder / "a.vtu", tmp_path / name, *options) == 0
     said, every = capsys.readouterr().err, tetopt.load_mesh(folder / "a.vtu").cell_data
-    assert sorted(tetopt.load_mesh(tmp_path / name).cell_data) == sorted(every if kept is None else kept)
+    assert sorted(tetopt.load_mesh(tmp_path / name).cell_data) == sorted(
+        every if kept is None else kept
+    )
     assert ("8 fields of cells are not written" in said) == (name == "a.msh" and not options)
 
 
 def test_vtu_there_and_back_with_materials_sets_and_loads(folder, tmp_path):
-    options = ["--young", MAPPING, "--nu", "0=0.45,1=0.3", "--load", "compress:5%", "--set", "dark=below:20"]
+    options = [
+        "--young",
+        MAPPING,
+        "--nu",
+        "0=0.45,1=0.3",
+        "--load",
+        "compress:5%",
+        "--set",
+        "dark=below:20",
+    ]
     options += ["--json", tmp_path / "b.json"]
-    assert exit_code("convert", folder / "a.vtu", tmp_path / "b.vtu", *options, "--units", "MPa", "--space", "lps") == 0
+    assert (
+        exit_code(
+            "convert",
+            folder / "a.vtu",
+            tmp_path / "b.vtu",
+            *options,
+            "--units",
+            "MPa",
+            "--space",
+            "lps",
+        )
+        == 0
+    )
     first, loaded = tetopt.load_mesh(folder / "a.vtu"), tetopt.load_mesh(tmp_path / "b.vtu")
     numbers = numbers_in(tmp_path / "b.json")
     assert numbers["materials"]["count"] == len(
@@ -196,14 +264,19 @@ def test_vtu_there_and_back_with_materials_sets_and_loads(folder, tmp_path):
     assert loaded.mesh.points.tobytes() == first.mesh.points.tobytes()  # turned back
     np.testing.assert_array_equal(loaded.mesh.cells, first.mesh.cells)
     means = first.cell_data["mean"]
-    np.testing.assert_allclose(loaded.cell_data["young"], 1.0 + means / 7.0, rtol=1e-14)  # in kPa again
+    # in kPa again
+    np.testing.assert_allclose(loaded.cell_data["young"], 1.0 + means / 7.0, rtol=1e-14)
     raw = pyvista.read(tmp_path / "b.vtu").cell_data["young"]
     np.testing.assert_allclose(raw, (1.0 + means / 7.0) / 1000.0, rtol=1e-15)
-    np.testing.assert_array_equal(loaded.cell_data["nu"], np.where(first.cell_data["label"] == 1, 0.3, 0.45))
+    np.testing.assert_array_equal(
+        loaded.cell_data["nu"], np.where(first.cell_data["label"] == 1, 0.3, 0.45)
+    )
     for kind in (0, 1):
         for name, members in first.sets[kind].items():
             np.testing.assert_array_equal(loaded.sets[kind][name], members)
-    np.testing.assert_array_equal(loaded.sets.cells["dark"], largest_component(first.mesh.cells, means < 20))
+    np.testing.assert_array_equal(
+        loaded.sets.cells["dark"], largest_component(first.mesh.cells, means < 20)
+    )
     assert str(loaded.field_data["units"][0]) == "MPa"
     loads = json.loads(str(loaded.field_data["loads"][0]))
     assert [word.rpartition(":")[0] for word in loads] == ["hold", "move:inferior"]
@@ -221,38 +294,69 @@ def test_vtu_there_and_back_with_materials_sets_and_loads(folder, tmp_path):
 
 
 def test_an_image_gives_the_mean_of_the_mapping(folder, tmp_path):
-    """Of a curved mapping, which is not the mapping of the mean; the geometric one unless another is asked for."""
+    """Of a curved mapping, which is not the mapping of the mean; the geometric one unless
+    another is asked for.
+    """
     image = ["--image", folder / "a.nii.gz"]
     for name, more in (("mean", []), ("image", [*image, "--average", "mean"]), ("default", image)):
-        assert exit_code("convert", folder / "a.vtu", tmp_path / f"{name}.vtu", "--young", "1 + h**2", *more) == 0
+        assert (
+            exit_code(
+                "convert", folder / "a.vtu", tmp_path / f"{name}.vtu", "--young", "1 + h**2", *more
+            )
+            == 0
+        )
     young = {
-        name: tetopt.load_mesh(tmp_path / f"{name}.vtu").cell_data["young"] for name in ("mean", "image", "default")
+        name: tetopt.load_mesh(tmp_path / f"{name}.vtu").cell_data["young"]
+        for name in ("mean", "image", "default")
     }
     loaded = tetopt.load_mesh(folder / "a.vtu")
     fields, mesh = loaded.cell_data, loaded.mesh
     np.testing.assert_allclose(young["image"] - young["mean"], fields["variance"], atol=1e-9)
     assert fields["variance"].max() > 10
-    expected = cell_young(tetopt.load_image(folder / "a.nii.gz"), mesh, lambda h: 1.0 + h**2, "geometric")
+    expected = cell_young(
+        tetopt.load_image(folder / "a.nii.gz"), mesh, lambda h: 1.0 + h**2, "geometric"
+    )
     np.testing.assert_allclose(young["default"], expected, rtol=1e-12)
 
 
 def test_a_file_has_one_modulus_a_cell_of_those_at_gauss_points(folder, tmp_path, capsys):
     for average in ("geometric", "gauss"):
-        options = ["--young", MAPPING, "--average", average, "--image", folder / "a.nii.gz", "--order", "2"]
+        options = [
+            "--young",
+            MAPPING,
+            "--average",
+            average,
+            "--image",
+            folder / "a.nii.gz",
+            "--order",
+            "2",
+        ]
         assert exit_code("convert", folder / "a.vtu", tmp_path / f"{average}.vtu", *options) == 0
-        assert ("one modulus per cell, its geometric mean" in capsys.readouterr().out) == (average == "gauss")
+        assert ("one modulus per cell, its geometric mean" in capsys.readouterr().out) == (
+            average == "gauss"
+        )
         assert exit_code("convert", tmp_path / f"{average}.vtu", tmp_path / f"{average}.inp") == 0
-        assert ("VTK files also have one per Gauss point" in capsys.readouterr().out) == (average == "gauss")
-    first, second = (tetopt.load_mesh(tmp_path / f"{each}.vtu").cell_data["young"] for each in ("geometric", "gauss"))
+        assert ("VTK files also have one per Gauss point" in capsys.readouterr().out) == (
+            average == "gauss"
+        )
+    first, second = (
+        tetopt.load_mesh(tmp_path / f"{each}.vtu").cell_data["young"]
+        for each in ("geometric", "gauss")
+    )
     np.testing.assert_array_equal(first, second)
 
 
 def test_results_of_other_moduli_or_loads_are_left_out(folder, tmp_path, capsys):
     first, solved = tmp_path / "a.vtu", tmp_path / "solved.vtu"
-    assert exit_code("convert", folder / "a.vtu", first, "--young", "2", "--load", "compress:5%") == 0
+    assert (
+        exit_code("convert", folder / "a.vtu", first, "--young", "2", "--load", "compress:5%") == 0
+    )
     assert exit_code("fem", first, "-o", solved) == 0
     fields = {"displacement", "von_mises", "stress_nodes"}
-    said = "dropped results computed with other moduli or loads: strain, stress, von_mises, displacement,"
+    said = (
+        "dropped results computed with other moduli or loads: strain, stress, von_mises, "
+        "displacement,"
+    )
     for options in ([], ["--young", "3"], ["--load", "compress:4%"]):
         capsys.readouterr()
         assert exit_code("convert", solved, tmp_path / "b.vtu", "--force", *options) == 0
@@ -261,16 +365,42 @@ def test_results_of_other_moduli_or_loads_are_left_out(folder, tmp_path, capsys)
         kept = fields & {*loaded.cell_data, *loaded.point_data}
         assert kept == (set() if options else fields)
         assert ("reactions" in loaded.field_data) == (not options)
-    assert exit_code("mesh", folder / "a.nii.gz", "--start", solved, "-o", tmp_path / "c.vtu", "--iterations", "1") == 0
+    assert (
+        exit_code(
+            "mesh",
+            folder / "a.nii.gz",
+            "--start",
+            solved,
+            "-o",
+            tmp_path / "c.vtu",
+            "--iterations",
+            "1",
+        )
+        == 0
+    )
     assert "moduli, loads and results of the input mesh are not kept" in capsys.readouterr().err
     assert not fields & {*tetopt.load_mesh(tmp_path / "c.vtu").point_data}
 
 
 def test_the_error_of_bins_goes_on(folder, tmp_path, capsys):
-    assert exit_code("convert", folder / "a.vtu", tmp_path / "a.vtu", "--young", MAPPING, "--bins", "3") == 0
-    line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("bins: modulus error"))
+    assert (
+        exit_code(
+            "convert", folder / "a.vtu", tmp_path / "a.vtu", "--young", MAPPING, "--bins", "3"
+        )
+        == 0
+    )
+    line = next(
+        line
+        for line in capsys.readouterr().out.splitlines()
+        if line.startswith("bins: modulus error")
+    )
     for source, out in (("a.vtu", "b.vtu"), ("b.vtu", "b.inp")):
-        assert exit_code("convert", tmp_path / source, tmp_path / out, "--json", tmp_path / f"{out}.json") == 0
+        assert (
+            exit_code(
+                "convert", tmp_path / source, tmp_path / out, "--json", tmp_path / f"{out}.json"
+            )
+            == 0
+        )
         assert line in capsys.readouterr().out.splitlines()
         assert numbers_in(tmp_path / f"{out}.json")["materials"]["binning"]["mean"] > 0.0
     assert exit_code("convert", tmp_path / "b.vtu", tmp_path / "c.vtu", "--young", "2") == 0
@@ -278,25 +408,40 @@ def test_the_error_of_bins_goes_on(folder, tmp_path, capsys):
 
 
 def test_what_formats_do_not_hold_as_it_is_is_said(folder, tmp_path, capsys):
-    """Loads that no reader of gmsh's brings back, label 0, groups that are not complete, numbers of no label."""
+    """Loads that no reader of gmsh's brings back, label 0, groups that are not complete, numbers
+    of no label.
+    """
     (tmp_path / "names.csv").write_text("label,name\n1,liver\n")
     more = ["--young", "2", "--load", "compress:5%", "--label-names", tmp_path / "names.csv"]
     last = int(tetopt.load_mesh(folder / "a.vtu").cell_data["label"].max())
-    group, short = f"label 0 is physical group {last + 1}", "facets of smaller sets are missing from boundary"
+    group, short = (
+        f"label 0 is physical group {last + 1}",
+        "facets of smaller sets are missing from boundary",
+    )
     for suffix, expected in {
-        ".msh": [group], ".msh2": [group, short], ".mfem": [f"label 0 is attribute {last + 1}"],
-        ".mesh": [f"label 0 is reference {last + 1}"], ".vtu": [],
-    }.items():  # fmt: skip
+        ".msh": [group],
+        ".msh2": [group, short],
+        ".mfem": [f"label 0 is attribute {last + 1}"],
+        ".mesh": [f"label 0 is reference {last + 1}"],
+        ".vtu": [],
+    }.items():
         assert exit_code("convert", folder / "a.vtu", tmp_path / f"a{suffix}") == 0
         plain = capsys.readouterr().out
         assert all((words in plain) == (words in expected) for words in (*expected, group, short))
         assert exit_code("convert", folder / "a.vtu", tmp_path / f"b{suffix}", *more) == 0
-        assert (f"loads in {suffix} files are not read back" in capsys.readouterr().out) == (".msh" in suffix)
+        assert (f"loads in {suffix} files are not read back" in capsys.readouterr().out) == (
+            ".msh" in suffix
+        )
         assert "not read back" not in plain
         assert "2001" not in plain
         if suffix in (".mfem", ".mesh"):
-            assert exit_code("convert", folder / "a.vtu", tmp_path / f"c{suffix}", "--young", MAPPING) == 0
-            assert "number from 2001 on (label_1, label_0)" in " ".join(capsys.readouterr().out.split())
+            assert (
+                exit_code("convert", folder / "a.vtu", tmp_path / f"c{suffix}", "--young", MAPPING)
+                == 0
+            )
+            assert "number from 2001 on (label_1, label_0)" in " ".join(
+                capsys.readouterr().out.split()
+            )
 
 
 @pytest.mark.parametrize(
@@ -305,12 +450,27 @@ def test_what_formats_do_not_hold_as_it_is_is_said(folder, tmp_path, capsys):
         (["--young", "3500"], "young is 3500 to 3500 kPa, stiffer than soft tissue"),
         (["--young", "0.003"], "young is at most 0.003 kPa, softer than any tissue"),
         (["--young", "3", "--density", "1.06"], "density is at most 1.06 kg/m3 (water: 1000)"),
-        (["--young", "3", "--density", "1060", "--load", "gravity:0,0,-9.81"], "gravity is 9.81 mm/s2"),
-        (["--young", "0=17e6,1=1e5", "--density", "1=1000,0=1.2", "--load", "gravity:0,0,-9810"], None),
+        (
+            ["--young", "3", "--density", "1060", "--load", "gravity:0,0,-9.81"],
+            "gravity is 9.81 mm/s2",
+        ),
+        (
+            ["--young", "0=17e6,1=1e5", "--density", "1=1000,0=1.2", "--load", "gravity:0,0,-9810"],
+            None,
+        ),
     ],
 )
 def test_quantities_in_other_units_are_said(folder, tmp_path, options, said, capsys):
-    image = ["mesh", folder / "a.nii.gz", "--spacing", "8", "--iterations", "0", "-o", tmp_path / "b.inp"]
+    image = [
+        "mesh",
+        folder / "a.nii.gz",
+        "--spacing",
+        "8",
+        "--iterations",
+        "0",
+        "-o",
+        tmp_path / "b.inp",
+    ]
     for words in (
         ["convert", folder / "a.vtu", tmp_path / "a.inp"],
         *([image] if "gravity:0,0,-9.81" in options else []),
@@ -327,10 +487,12 @@ def test_a_mesh_of_gmsh_s_is_measured_and_painted(folder, tmp_path, capsys):
     other = meshio.Mesh(
         first.points,
         [("triangle", skin), ("tetra", first.cells)],
-        cell_data={"gmsh:physical": [np.full(len(skin), 7), np.full(len(first.cells), 8)],
-                   "gmsh:geometrical": [np.full(len(skin), 7), np.full(len(first.cells), 8)]},
+        cell_data={
+            "gmsh:physical": [np.full(len(skin), 7), np.full(len(first.cells), 8)],
+            "gmsh:geometrical": [np.full(len(skin), 7), np.full(len(first.cells), 8)],
+        },
         field_data={"skin": np.array([7, 2]), "tissue": np.array([8, 3])},
-    )  # fmt: skip
+    )
     meshio.gmsh.write(tmp_path / "g.msh", other, fmt_version="2.2", binary=True)
     loaded = tetopt.load_mesh(tmp_path / "g.msh")
     assert loaded.mesh.points.tobytes() == first.points.tobytes()
@@ -344,13 +506,19 @@ def test_a_mesh_of_gmsh_s_is_measured_and_painted(folder, tmp_path, capsys):
     assert exit_code("convert", tmp_path / "g.msh", tmp_path / "g.inp", "--young", MAPPING) == 2
     assert "the mesh has no cell means; give the image (--image)" in capsys.readouterr().err
     assert not (tmp_path / "g.inp").exists()
-    assert exit_code("convert", tmp_path / "g.msh", tmp_path / "c.inp", "--young", "3") == 0  # which needs none
+    # which needs none
+    assert exit_code("convert", tmp_path / "g.msh", tmp_path / "c.inp", "--young", "3") == 0
     assert "1 material, Young's modulus 3 kPa" in capsys.readouterr().out
     options = ["--image", folder / "a.nii.gz", "--young", MAPPING, "--load", "compress:1%"]
     assert exit_code("convert", tmp_path / "g.msh", tmp_path / "g.inp", *options) == 0
     text = (tmp_path / "g.inp").read_text()
     assert "*STATIC" in text
-    for name in ("*NSET, NSET=skin", "*ELSET, ELSET=tissue", "*NSET, NSET=left", "*SURFACE, NAME=boundary"):
+    for name in (
+        "*NSET, NSET=skin",
+        "*ELSET, ELSET=tissue",
+        "*NSET, NSET=left",
+        "*SURFACE, NAME=boundary",
+    ):
         assert f"{name}\n" in text or f"{name}," in text
 
 
@@ -358,13 +526,21 @@ def test_a_mesh_of_gmsh_s_is_measured_and_painted(folder, tmp_path, capsys):
 
 
 def test_a_mesh_is_improved_and_its_boundary_kept(folder, tmp_path, capsys):
-    assert exit_code("convert", folder / "a.vtu", tmp_path / "a.vtu", "--set", "top=plane:0,0,118:0,0,1:5") == 0
+    assert (
+        exit_code(
+            "convert", folder / "a.vtu", tmp_path / "a.vtu", "--set", "top=plane:0,0,118:0,0,1:5"
+        )
+        == 0
+    )
     options = ["--start", tmp_path / "a.vtu", "--iterations", "4", "--json", tmp_path / "b.json"]
     assert exit_code("mesh", folder / "a.nii.gz", "-o", tmp_path / "b.vtu", *options) == 0
     assert "start of" in capsys.readouterr().err
     before, after = (tetopt.load_mesh(tmp_path / name) for name in ("a.vtu", "b.vtu"))
     sides = [
-        {frozenset(map(tuple, corners)) for corners in mesh.points[boundary_facets(mesh.cells)].tolist()}
+        {
+            frozenset(map(tuple, corners))
+            for corners in mesh.points[boundary_facets(mesh.cells)].tolist()
+        }
         for mesh in (before.mesh, after.mesh)
     ]
     assert sides[0] == sides[1]  # to the last bit
@@ -388,7 +564,18 @@ def test_a_mesh_is_improved_and_its_boundary_kept(folder, tmp_path, capsys):
 )
 def test_options_that_ask_for_another_mesh(folder, tmp_path, more, match, capsys):
     more = [folder / each if each.endswith(".gz") else each for each in more]
-    assert exit_code("mesh", folder / "a.nii.gz", "-o", tmp_path / "b.vtu", "--start", folder / "a.vtu", *more) == 2
+    assert (
+        exit_code(
+            "mesh",
+            folder / "a.nii.gz",
+            "-o",
+            tmp_path / "b.vtu",
+            "--start",
+            folder / "a.vtu",
+            *more,
+        )
+        == 2
+    )
     assert match in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
@@ -398,7 +585,12 @@ def test_a_mesh_beside_the_image(folder, tmp_path, capsys):
     away = image.affine.copy()
     away[:3, 3] += 500.0
     tetopt.save_image(tmp_path / "away.nii.gz", tetopt.Image(image.data, away))
-    assert exit_code("mesh", tmp_path / "away.nii.gz", "-o", tmp_path / "b.vtu", "--start", folder / "a.vtu") == 2
+    assert (
+        exit_code(
+            "mesh", tmp_path / "away.nii.gz", "-o", tmp_path / "b.vtu", "--start", folder / "a.vtu"
+        )
+        == 2
+    )
     assert "lies outside the image" in capsys.readouterr().err
 
 
@@ -408,7 +600,15 @@ def test_a_mask_keeps_what_lies_outside_out_of_the_means(folder, tmp_path):
     means = []
     for name, more in (("all", []), ("part", ["--mask", tmp_path / "m.nii.gz"])):
         assert (
-            exit_code("convert", folder / "a.vtu", tmp_path / f"{name}.vtu", "--image", folder / "a.nii.gz", *more) == 0
+            exit_code(
+                "convert",
+                folder / "a.vtu",
+                tmp_path / f"{name}.vtu",
+                "--image",
+                folder / "a.nii.gz",
+                *more,
+            )
+            == 0
         )
         means.append(tetopt.load_mesh(tmp_path / f"{name}.vtu").cell_data["mean"])
     assert means[0].max() > 40
@@ -416,7 +616,9 @@ def test_a_mask_keeps_what_lies_outside_out_of_the_means(folder, tmp_path):
 
 
 def test_an_image_of_another_box_is_rejected_unless_registered(folder, tmp_path, capsys):
-    """A finer grid of the same box, to a voxel, is another contrast; more of the world may be another subject."""
+    """A finer grid of the same box, to a voxel, is another contrast; more of the world may be
+    another subject.
+    """
     image = tetopt.load_image(folder / "a.nii.gz")
     grids = {"finer": (0.5, 0.0), "half_off": (0.25, 0.5), "moved": (1.0, 2.0), "far": (1.0, 99.0)}
     for name, (step, shift) in grids.items():
@@ -437,7 +639,10 @@ def test_an_image_of_another_box_is_rejected_unless_registered(folder, tmp_path,
         assert exit_code(*words, "--registered") == 0
         said = capsys.readouterr().err
         assert "a.vtu was built from a different image" in said
-        assert "% of the nodes lie outside the image or its mask: cells there take the nearest voxel's value" in said
+        assert (
+            "% of the nodes lie outside the image or its mask: cells there take the nearest "
+            "voxel's value" in said
+        )
     assert exit_code(*convert, tmp_path / "far.nii", "--registered") == 2
     assert "no node lies in the image's box" in capsys.readouterr().err
 
@@ -446,7 +651,11 @@ def test_values_of_labels_that_no_cell_has_are_said(folder, tmp_path, capsys):
     """Once for each quantity, and in a run only of the final mesh."""
     mapping = ["--young", "1=2,9=5,*=1", "--nu", "7=0.4,9=0.3,*=0.2"]
     mesh = [*labelled_lattice_words(tmp_path), "-o", tmp_path / "m.inp"]
-    for words in (["convert", folder / "a.vtu", tmp_path / "a.inp"], ["fem", folder / "a.vtu"], mesh):
+    for words in (
+        ["convert", folder / "a.vtu", tmp_path / "a.inp"],
+        ["fem", folder / "a.vtu"],
+        mesh,
+    ):
         assert exit_code(*words, *mapping, "--load", "compress:1%") == 0
         said = re.findall("warning: (values by label: .*)", capsys.readouterr().err)
         assert said == [
@@ -465,19 +674,42 @@ def test_an_optimised_mesh_is_kept_whatever_is_refused_after_it(folder, tmp_path
     assert not (tmp_path / "a.inp").exists()
     before = (tmp_path / "a.vtu").read_bytes()
     for number in (1, 2):  # and nothing is ever replaced by such a mesh, with --force neither
-        assert exit_code("mesh", folder / "a.nii.gz", "-o", tmp_path / "a.inp", *options, "--force") == 2
+        assert (
+            exit_code("mesh", folder / "a.nii.gz", "-o", tmp_path / "a.inp", *options, "--force")
+            == 2
+        )
         assert str(tmp_path / f"a_optimised_{number}.vtu") in capsys.readouterr().err
     assert (tmp_path / "a.vtu").read_bytes() == before
 
 
 def test_loads_on_what_only_the_final_mesh_may_have_are_no_early_error(folder, tmp_path):
     """On an interface of labels, or a set that is asked for; but a set that can never be is one."""
-    base = ["mesh", folder / "a.nii.gz", "--labels", folder / "l.nii.gz", "--young", "2", "--iterations", "1"]
+    base = [
+        "mesh",
+        folder / "a.nii.gz",
+        "--labels",
+        folder / "l.nii.gz",
+        "--young",
+        "2",
+        "--iterations",
+        "1",
+    ]
     loads = ["--load", "hold:interface_0_1", "--load", "move:inferior:1,0,0"]
     assert exit_code(*base, "--nodes", "300", "-o", tmp_path / "a.inp", *loads) == 0
-    loads = ["--set", "top=plane:0,0,118:0,0,1:9", "--load", "hold:top", "--load", "move:inferior:1,0,0"]
+    loads = [
+        "--set",
+        "top=plane:0,0,118:0,0,1:9",
+        "--load",
+        "hold:top",
+        "--load",
+        "move:inferior:1,0,0",
+    ]
     assert exit_code(*base, "--nodes", "90", "-o", tmp_path / "b.inp", *loads) == 0
-    for wrong in (["--load", "move:nosuch:1,0,0"], ["--load", "compress:99%"], ["--set", "left=below:20"]):
+    for wrong in (
+        ["--load", "move:nosuch:1,0,0"],
+        ["--load", "compress:99%"],
+        ["--set", "left=below:20"],
+    ):
         assert exit_code(*base, "--nodes", "90", "-o", tmp_path / "c.inp", *loads, *wrong) == 2
     assert {path.name for path in tmp_path.iterdir()} == {"a.inp", "b.inp"}
 
@@ -485,7 +717,10 @@ def test_loads_on_what_only_the_final_mesh_may_have_are_no_early_error(folder, t
 @pytest.mark.parametrize(
     ("units", "in_units"),
     [
-        ("MPa", ["spring:left:0.0005", "1/pressure:inferior:0.00025", "1/gravity:0.0,-8.0,-9810.0"]),
+        (
+            "MPa",
+            ["spring:left:0.0005", "1/pressure:inferior:0.00025", "1/gravity:0.0,-8.0,-9810.0"],
+        ),
         ("Pa", ["spring:left:500000.0", "1/pressure:inferior:250.0", "1/gravity:0.0,-0.008,-9.81"]),
     ],
 )
@@ -496,7 +731,16 @@ def test_loads_of_all_kinds_density_and_moduli_at_nodes_go_on(folder, tmp_path, 
         *("2/traction:inferior:0.5,-2,0.125", "2/move:inferior:free,1,free"),
     ]
     loads = [part for word in words for part in ("--load", word)]
-    mapping = ["--young", MAPPING, "--density", "1000 + h", "--average", "nodes", "--image", folder / "a.nii.gz"]
+    mapping = [
+        "--young",
+        MAPPING,
+        "--density",
+        "1000 + h",
+        "--average",
+        "nodes",
+        "--image",
+        folder / "a.nii.gz",
+    ]
     first, second = tmp_path / "a.vtu", tmp_path / "b.vtu"
     assert exit_code("convert", folder / "a.vtu", first, *mapping, *loads) == 0
     assert exit_code("convert", first, second, "--units", units, "--space", "lps") == 0
@@ -504,16 +748,25 @@ def test_loads_of_all_kinds_density_and_moduli_at_nodes_go_on(folder, tmp_path, 
     assert texts[1][1:4] == in_units
     size = 1e-3 if units == "Pa" else 1.0
     np.testing.assert_allclose(
-        pyvista.read(second).points * [-1, -1, 1], pyvista.read(first).points * size, rtol=1e-14, atol=1e-300
+        pyvista.read(second).points * [-1, -1, 1],
+        pyvista.read(first).points * size,
+        rtol=1e-14,
+        atol=1e-300,
     )
     assert exit_code("convert", second, tmp_path / "c.vtu") == 0
     again, before = tetopt.load_mesh(tmp_path / "c.vtu"), tetopt.load_mesh(first)
-    np.testing.assert_allclose(again.point_data["young_nodes"], before.point_data["young_nodes"], rtol=1e-14)
+    np.testing.assert_allclose(
+        again.point_data["young_nodes"], before.point_data["young_nodes"], rtol=1e-14
+    )
     np.testing.assert_array_equal(again.cell_data["density"], before.cell_data["density"])
     assert again.cell_data["density"].min() >= 1000.0
     for kept, text in zip(json.loads(again.text("loads")), texts[0], strict=True):
         (load, original) = (parse_load(words, 3) for words in (kept, text))
-        assert (load.kind, load.set_name, load.step) == (original.kind, original.set_name, original.step)
+        assert (load.kind, load.set_name, load.step) == (
+            original.kind,
+            original.set_name,
+            original.step,
+        )
         np.testing.assert_allclose(load.numbers, original.numbers, rtol=1e-14)
     for name, path in (("c.inp", tmp_path / "c.vtu"), ("first.inp", first)):
         assert exit_code("convert", path, tmp_path / name) == 0
@@ -528,7 +781,16 @@ def test_loads_of_all_kinds_density_and_moduli_at_nodes_go_on(folder, tmp_path, 
 
 
 def test_large_deformation_and_means_over_cells_are_said(folder, tmp_path, capsys):
-    mapping = ["--young", MAPPING, "--average", "nodes", "--image", folder / "a.nii.gz", "--load", "compress:5%"]
+    mapping = [
+        "--young",
+        MAPPING,
+        "--average",
+        "nodes",
+        "--image",
+        folder / "a.nii.gz",
+        "--load",
+        "compress:5%",
+    ]
     assert exit_code("convert", folder / "a.vtu", tmp_path / "a.inp", *mapping, "--nonlinear") == 0
     assert "*STEP, NLGEOM" in (tmp_path / "a.inp").read_text()
     assert "linear within cells" in capsys.readouterr().out
@@ -553,8 +815,17 @@ def test_loads_run_or_are_said_to_be_in_comments(folder, tmp_path, capsys):
         assert is_said == (suffix == ".xdmf"), suffix
 
 
-def test_numbers_of_loads_are_printed_without_rounding_errors_and_kept_with_them(folder, tmp_path, capsys):
-    options = ["--young", "3", "--load", "hold:inferior", "--load", f"move:superior:0,0,{0.1 * 3!r}"]
+def test_numbers_of_loads_are_printed_without_rounding_errors_and_kept_with_them(
+    folder, tmp_path, capsys
+):
+    options = [
+        "--young",
+        "3",
+        "--load",
+        "hold:inferior",
+        "--load",
+        f"move:superior:0,0,{0.1 * 3!r}",
+    ]
     assert exit_code("convert", folder / "a.vtu", tmp_path / "b.vtu", *options) == 0
     assert "\nload: move:superior:0.0,0.0,0.3\n" in capsys.readouterr().out
     model = tetopt.build_model(tetopt.load_mesh(tmp_path / "b.vtu"))
@@ -570,7 +841,11 @@ def test_numbers_of_loads_are_printed_without_rounding_errors_and_kept_with_them
     [
         ("a.foo", [], "unknown suffix; known suffixes are .vtu (VTK, ParaView), .vtk"),
         ("a.inp", ["--young", "1 + x"], 'cannot use "x"'),
-        ("a.inp", ["--young", "0:1,100:5,50:3"], "--young: intensities must increase, got 100 and then 50"),
+        (
+            "a.inp",
+            ["--young", "0:1,100:5,50:3"],
+            "--young: intensities must increase, got 100 and then 50",
+        ),
         ("a.inp", ["--young", "2", "--nu", "0:x"], "--nu: expected pairs intensity:value"),
         (
             "a.inp",
@@ -583,15 +858,27 @@ def test_numbers_of_loads_are_printed_without_rounding_errors_and_kept_with_them
         ("a.inp", ["--young", "1=2"], "the mesh also has 0 (1 more)"),
         ("a.inp", ["--crop", "1:3,:,:"], "--crop: needs --image"),
         ("a.inp", ["--registered"], "--registered: needs --image"),
-        ("a.inp", ["--young", "2", "--load", "gravity:0,0,-9810"], "gravity: the cells have no density"),
+        (
+            "a.inp",
+            ["--young", "2", "--load", "gravity:0,0,-9810"],
+            "gravity: the cells have no density",
+        ),
         ("a.vtu", ["--young", "2", "--nonlinear"], "--nonlinear is for .inp, .feb only"),
         ("a.inp", ["--young", "2", "--load", "pressure:nowhere:1"], 'no set of facets "nowhere"'),
         ("a.inp", ["--young", "2", "--load", "pressure:interface_0_1:1"], "lie between two cells"),
         ("a.inp", ["--bins", "4"], "no moduli to group"),
         ("a.inp", ["--average", "mean"], "--average: needs --young"),
-        ("a.inp", ["--young", "h+1", "--average", "voigt"], "average: expected mean, geometric, harmonic, hill"),
+        (
+            "a.inp",
+            ["--young", "h+1", "--average", "voigt"],
+            "average: expected mean, geometric, harmonic, hill",
+        ),
         ("a.inp", ["--young", "h+1", "--bins", "0"], "--bins: expected K"),
-        ("a.inp", ["--fields", "mean"], "--fields: expected none, mean, all and a file .vtu, .vtk, .xdmf, .msh"),
+        (
+            "a.inp",
+            ["--fields", "mean"],
+            "--fields: expected none, mean, all and a file .vtu, .vtk, .xdmf, .msh",
+        ),
         ("a.vtu", ["--fields", "some"], "--fields: expected none, mean, all"),
         ("a.inp", ["--units", "psi"], "--units: expected one of kPa, MPa, Pa, got psi"),
         ("a.inp", ["--space", "xyz"], "--space: expected ras or lps"),
@@ -614,7 +901,10 @@ def test_conversions_that_are_refused(folder, tmp_path, out, more, match, capsys
 
 def test_a_mesh_whose_cells_are_there_several_times_is_no_solver_s(folder, tmp_path, capsys):
     mesh = tetopt.load_mesh(folder / "a.vtu").mesh
-    tetopt.save_mesh(tmp_path / "thrice.vtu", tetopt.Mesh(mesh.points, np.vstack([mesh.cells, mesh.cells[[5, 5]]])))
+    tetopt.save_mesh(
+        tmp_path / "thrice.vtu",
+        tetopt.Mesh(mesh.points, np.vstack([mesh.cells, mesh.cells[[5, 5]]])),
+    )
     assert exit_code("convert", tmp_path / "thrice.vtu", tmp_path / "out.inp") == 2
     assert re.search(r"thrice\.vtu: at \d+ facets cells overlap", capsys.readouterr().err)
     assert not (tmp_path / "out.inp").exists()
@@ -630,22 +920,58 @@ def test_what_will_not_do_is_said_before_the_optimisation(folder, tmp_path, caps
         ("a.inp", ["--set", "low=below:-5"]),
         ("a.inp", ["--set", "low=below:20", "--young", "h - 20"]),
         ("a.inp", ["--set", "all_cells=below:20", "--young", "2"]),
-        ("a.inp", ["--labels", folder / "l.nii.gz", "--young", "2", "--load", "pressure:interface_0_1:1"]),
+        (
+            "a.inp",
+            ["--labels", folder / "l.nii.gz", "--young", "2", "--load", "pressure:interface_0_1:1"],
+        ),
     ):
-        assert exit_code("mesh", folder / "a.nii.gz", "-o", tmp_path / out, "--spacing", "8", *more) == 2
+        assert (
+            exit_code("mesh", folder / "a.nii.gz", "-o", tmp_path / out, "--spacing", "8", *more)
+            == 2
+        )
         said = capsys.readouterr().err
         assert said.count("\n") == 1, said
     for out in ("a.inp", "a.feb", "a.stl"):
         more = [] if out == "a.stl" else ["--young", "2"]
         assert (
-            exit_code("mesh", folder / "a.nii.gz", "--slice", "k=3", "-o", tmp_path / out, "--nodes", "60", *more) == 2
+            exit_code(
+                "mesh",
+                folder / "a.nii.gz",
+                "--slice",
+                "k=3",
+                "-o",
+                tmp_path / out,
+                "--nodes",
+                "60",
+                *more,
+            )
+            == 2
         )
         assert "triangles" in capsys.readouterr().err
-    flat = ["mesh", folder / "a.nii.gz", "--slice", "k=3", "-o", tmp_path / "a.vtu", "--nodes", "60"]
+    flat = [
+        "mesh",
+        folder / "a.nii.gz",
+        "--slice",
+        "k=3",
+        "-o",
+        tmp_path / "a.vtu",
+        "--nodes",
+        "60",
+    ]
     assert exit_code(*flat, "--space", "lps") == 2
     assert "omit --space" in capsys.readouterr().err
     assert (
-        exit_code("mesh", folder / "a.nii.gz", "--target-error", "0.3", "-o", tmp_path / "a.inp", "--load", "foo") == 2
+        exit_code(
+            "mesh",
+            folder / "a.nii.gz",
+            "--target-error",
+            "0.3",
+            "-o",
+            tmp_path / "a.inp",
+            "--load",
+            "foo",
+        )
+        == 2
     )
     assert capsys.readouterr().err.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
@@ -664,7 +990,19 @@ def test_the_surface_of_a_structure(folder, tmp_path, what, suffix, capsys):
     }[what]
     value = {"below": "12", "label": "1", "set": "label_0"}[what]
     out = tmp_path / f"s.{suffix}"
-    assert exit_code("surface", folder / "a.vtu", f"--{what}", value, "-o", out, "--json", tmp_path / "s.json") == 0
+    assert (
+        exit_code(
+            "surface",
+            folder / "a.vtu",
+            f"--{what}",
+            value,
+            "-o",
+            out,
+            "--json",
+            tmp_path / "s.json",
+        )
+        == 0
+    )
     said = capsys.readouterr().out
     assert "watertight, normals out" in said
     surface = trimesh.load_mesh(out)
@@ -724,7 +1062,11 @@ def test_a_page_to_look_at(folder, tmp_path, capsys):
 def test_a_page_opens_on_the_field_and_the_range_asked_for(folder, tmp_path, capsys):
     words = ["view", folder / "a.vtu", "--html", tmp_path / "a.html"]
     assert exit_code(*words, "--field", "rho", "--range", "0.1,0.3") == 0
-    data = json.loads(re.search(r'id="data">(.*?)</script>', (tmp_path / "a.html").read_text(), re.DOTALL).group(1))
+    data = json.loads(
+        re.search(r'id="data">(.*?)</script>', (tmp_path / "a.html").read_text(), re.DOTALL).group(
+            1
+        )
+    )
     assert (data["fields"][0]["name"], data["fields"][0]["limits"]) == ("rho", [0.1, 0.3])
     capsys.readouterr()
     for options, message in (
@@ -739,7 +1081,9 @@ def test_a_page_opens_on_the_field_and_the_range_asked_for(folder, tmp_path, cap
 
 
 @pytest.mark.parametrize(("display", "answer"), [("", True), (":0", False), (":0", True)])
-def test_the_page_is_opened_or_it_is_said_where_it_is(folder, tmp_path, monkeypatch, capsys, display, answer):
+def test_the_page_is_opened_or_it_is_said_where_it_is(
+    folder, tmp_path, monkeypatch, capsys, display, answer
+):
     """Never a browser of the terminal's, which would take it over."""
     opened = []
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
@@ -761,7 +1105,9 @@ def test_the_page_is_opened_or_it_is_said_where_it_is(folder, tmp_path, monkeypa
 def test_the_air_around_is_said_of_a_surface(folder, tmp_path, capsys):
     mean = tetopt.load_mesh(folder / "a.vtu").cell_data["mean"]
     threshold = float(np.median(mean))
-    assert exit_code("surface", folder / "a.vtu", "-o", tmp_path / "a.stl", "--below", threshold) == 0
+    assert (
+        exit_code("surface", folder / "a.vtu", "-o", tmp_path / "a.stl", "--below", threshold) == 0
+    )
     assert "touches the box's faces left" in capsys.readouterr().err
     assert exit_code("surface", folder / "a.vtu", "-o", tmp_path / "b.stl", "--label", "1") == 0
     assert "touches" not in capsys.readouterr().err
@@ -769,15 +1115,27 @@ def test_the_air_around_is_said_of_a_surface(folder, tmp_path, capsys):
 
 def test_a_table_of_other_labels_is_said(folder, tmp_path, capsys):
     table = tmp_path / "names.csv"
-    for text, is_said in (("label,name\n7,liver\n", True), ("label,name\n7,liver\n1,lung\n", False)):
+    for text, is_said in (
+        ("label,name\n7,liver\n", True),
+        ("label,name\n7,liver\n1,lung\n", False),
+    ):
         table.write_text(text)
         for words in (
             ["view", folder / "a.vtu", "--html", tmp_path / "a.html"],
-            ["quality", folder / "a.vtu", "--image", folder / "a.nii.gz", "--labels", folder / "l.nii.gz"],
+            [
+                "quality",
+                folder / "a.vtu",
+                "--image",
+                folder / "a.nii.gz",
+                "--labels",
+                folder / "l.nii.gz",
+            ],
         ):
             force = [] if words[0] == "quality" else ["--force"]
             assert exit_code(*words, *force, "--label-names", table) == 0
-            assert ("contains none of the mesh's labels, 0, 1" in capsys.readouterr().err) == is_said
+            assert (
+                "contains none of the mesh's labels, 0, 1" in capsys.readouterr().err
+            ) == is_said
 
 
 @pytest.mark.parametrize(

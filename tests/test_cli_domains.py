@@ -50,7 +50,14 @@ def inputs(tmp_path_factory):
 def run(inputs, tmp_path_factory):
     out = tmp_path_factory.mktemp("run")
     command = ["mesh", inputs / "image.nii.gz", inputs / "square.nii.gz", "--weights", "1,0.5"]
-    command += ["--mask", inputs / "mask.nii.gz", "--labels", inputs / "labels.nii.gz", "--nodes", "600"]
+    command += [
+        "--mask",
+        inputs / "mask.nii.gz",
+        "--labels",
+        inputs / "labels.nii.gz",
+        "--nodes",
+        "600",
+    ]
     command += ["-o", out / "mesh.vtu", "--json", out / "run.json", "--figures", out]
     command += ["--young", "2", "--load", "compress:2%"]
     assert exit_code(*command) == 0
@@ -94,7 +101,9 @@ def test_the_numbers(run):
 
 
 def test_the_wait_for_a_start_is_said(inputs, tmp_path, monkeypatch, capsys):
-    """Where there is no terminal a line from time to time, of what is read and of the mesh that a run begins with."""
+    """Where there is no terminal a line from time to time, of what is read and of the mesh that
+    a run begins with.
+    """
     waiting, say, is_said = cli_run.waiting, cli_run.log.print, threading.Event()
 
     def print_line(*words, **options):
@@ -111,7 +120,16 @@ def test_the_wait_for_a_start_is_said(inputs, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(cli_run, "LINE_SECONDS", 0.01)
     monkeypatch.setattr(cli_run.log, "print", print_line)
     monkeypatch.setattr(cli_run, "waiting", until_a_line)
-    command = ["mesh", inputs / "image.nii.gz", "--mask", inputs / "mask.nii.gz", "--nodes", "600", "--iterations", "0"]
+    command = [
+        "mesh",
+        inputs / "image.nii.gz",
+        "--mask",
+        inputs / "mask.nii.gz",
+        "--nodes",
+        "600",
+        "--iterations",
+        "0",
+    ]
     assert exit_code(*command, "-o", tmp_path / "a.vtu") == 0
     begun, octree, rest = capsys.readouterr().err.partition("octree of ")
     assert octree
@@ -124,11 +142,19 @@ def test_an_organ_is_compressed_between_its_own_top_and_bottom(run, tmp_path, ca
     """By `mesh`, `convert` and `fem` alike, though nothing of it lies on the box's faces."""
     loaded = tetopt.load_mesh(run / "mesh.vtu")
     push = 0.02 * np.ptp(loaded.mesh.points[:, 2])
-    assert exit_code("convert", run / "mesh.vtu", tmp_path / "a.inp", "--young", "3", "--load", "compress:2%") == 0
+    assert (
+        exit_code(
+            "convert", run / "mesh.vtu", tmp_path / "a.inp", "--young", "3", "--load", "compress:2%"
+        )
+        == 0
+    )
     assert re.search(r"\ninferior +\d+ +[\d.]+ +\d+ *\n", capsys.readouterr().out)
     more = ["--load", "compress:2%", "-o", tmp_path / "solved.vtu"]
     for words in ([], more):  # first the loads that `mesh` wrote
-        assert exit_code("fem", run / "mesh.vtu", *words, "--json", tmp_path / "a.json", "--force") == 0
+        assert (
+            exit_code("fem", run / "mesh.vtu", *words, "--json", tmp_path / "a.json", "--force")
+            == 0
+        )
         (step,) = numbers_in(tmp_path / "a.json")["steps"]
         assert step["largest_displacement"] == pytest.approx(push, rel=0.1)
         assert step["reactions"]["superior"][2] < 0.0 < step["reactions"]["inferior"][2]
@@ -136,8 +162,12 @@ def test_an_organ_is_compressed_between_its_own_top_and_bottom(run, tmp_path, ca
     pressed = nodes_of(solved.mesh, solved.sets.facets["inferior"])
     assert solved.mesh.points[pressed, 2].max() < np.percentile(loaded.mesh.points[:, 2], 25)
     assert exit_code("convert", run / "mesh.vtu", tmp_path / "b.inp", "--load", "hold:top") == 2
-    names = "boundary, left, right, posterior, anterior, inferior, superior, mask_surface, interface"
-    assert f'no set of facets "top"; known sets are {names}' in " ".join(capsys.readouterr().err.split())
+    names = (
+        "boundary, left, right, posterior, anterior, inferior, superior, mask_surface, interface"
+    )
+    assert f'no set of facets "top"; known sets are {names}' in " ".join(
+        capsys.readouterr().err.split()
+    )
 
 
 def test_measured_again(run, inputs, tmp_path, capsys):
@@ -156,7 +186,9 @@ def test_measured_again(run, inputs, tmp_path, capsys):
                 assert one.pop(key) == pytest.approx(other.pop(key))
             assert one == pytest.approx(other, nan_ok=True)
     assert again["contact_totals"] == pytest.approx(first["contact_totals"])
-    assert [each["labels"] for each in again["contacts"]] == [each["labels"] for each in first["contacts"]]
+    assert [each["labels"] for each in again["contacts"]] == [
+        each["labels"] for each in first["contacts"]
+    ]
     said = capsys.readouterr().out
     assert "boundary to the mask's surface, mean, 95 %" in said
     for words in ("volume, mm3", "majority", "contact beyond 1.2 times that"):
@@ -165,7 +197,10 @@ def test_measured_again(run, inputs, tmp_path, capsys):
     assert again["labels"][2]["cells_across"] < 2.0
     assert "layer, %" in said
     assert f"{again['interfaces'][0]['area_ratio']:.3f}" in said
-    assert f"{again['labels'][0]['volume_dice']:.4f}    {again['labels'][0]['dice_majority']:.4f}" in said
+    assert (
+        f"{again['labels'][0]['volume_dice']:.4f}    {again['labels'][0]['dice_majority']:.4f}"
+        in said
+    )
 
 
 @pytest.mark.parametrize("more", [["--background", "60"], ["--labels", "labels.nii.gz"]])
@@ -174,11 +209,23 @@ def test_quality_and_mesh_judge_alike(inputs, tmp_path, monkeypatch, capsys, mor
     monkeypatch.chdir(inputs)
     image = "head.nii.gz" if more[0] == "--background" else "image.nii.gz"
     mesh, numbers, again = (tmp_path / name for name in ("a.vtu", "a.json", "q.json"))
-    command = ["mesh", image, *more, "--target-error", "0.02", "--size-min", "5", "--iterations", "2"]
+    command = [
+        "mesh",
+        image,
+        *more,
+        "--target-error",
+        "0.02",
+        "--size-min",
+        "5",
+        "--iterations",
+        "2",
+    ]
     code = exit_code(*command, "-o", mesh, "--json", numbers)
     said = capsys.readouterr()
     more = [] if more[0] == "--background" else more
-    assert exit_code("quality", mesh, "--image", image, *more, "--check", "--json", again) == code == 1
+    assert (
+        exit_code("quality", mesh, "--image", image, *more, "--check", "--json", again) == code == 1
+    )
     judged = capsys.readouterr()
     first, second = numbers_in(numbers), numbers_in(again)
     fraction = second["fit"]["E_D_fraction_of_variance"]
@@ -190,18 +237,29 @@ def test_quality_and_mesh_judge_alike(inputs, tmp_path, monkeypatch, capsys, mor
     name = re.search("E_D, fraction of .* variance(?= )", said.out)[0]
     assert f"{name} " in judged.out
     assert f"{fraction:.5f}" in judged.out
-    assert re.findall("fraction of its variance.*", said.out) == re.findall("fraction of its variance.*", judged.out)
+    assert re.findall("fraction of its variance.*", said.out) == re.findall(
+        "fraction of its variance.*", judged.out
+    )
 
 
 def test_background(inputs, tmp_path, capsys):
     out = tmp_path / "a.vtu"
-    command = ["mesh", inputs / "head.nii.gz", "--background", "auto", "--uniform", "--nodes", "400"]
+    command = [
+        "mesh",
+        inputs / "head.nii.gz",
+        "--background",
+        "auto",
+        "--uniform",
+        "--nodes",
+        "400",
+    ]
     assert exit_code(*command, "--iterations", "2", "-o", out, "--json", tmp_path / "a.json") == 0
     mesh = tetopt.load_mesh(out).mesh
     ball = (distance((28, 30, 32), 13, 14, 15) < 10).sum()
     numbers = numbers_in(tmp_path / "a.json")
     assert 0.0 < numbers["inputs"]["background"] < 400.0
-    assert tetopt.quality(mesh.points, mesh.cells).volume == pytest.approx(ball, rel=0.05)  # the cavity stays in
+    # the cavity stays in
+    assert tetopt.quality(mesh.points, mesh.cells).volume == pytest.approx(ball, rel=0.05)
     captured = capsys.readouterr()
     assert "E_D, fraction of the image's variance" in captured.out
     assert "boundary to the foreground's surface" in captured.out
@@ -211,7 +269,18 @@ def test_background(inputs, tmp_path, capsys):
 def test_labels_alone(inputs, tmp_path, capsys):
     """An image that is its own labels: whatever numbers they have, each counts as itself."""
     path = inputs / "parts.nii.gz"
-    command = ["mesh", path, "--labels", path, "--nodes", "300", "--iterations", "3", "-o", tmp_path / "a.vtu"]
+    command = [
+        "mesh",
+        path,
+        "--labels",
+        path,
+        "--nodes",
+        "300",
+        "--iterations",
+        "3",
+        "-o",
+        tmp_path / "a.vtu",
+    ]
     assert exit_code(*command, "--json", tmp_path / "a.json") == 0
     assert numbers_in(tmp_path / "a.json")["inputs"]["weights"] == [0.0]
     captured = capsys.readouterr()
@@ -234,13 +303,24 @@ def test_a_label_never_vanishes_silently(tmp_path, capsys):
     command = ["mesh", path, "--labels", path, "--uniform", "--nodes", "60", "--iterations", "0"]
     assert exit_code(*command, "-o", tmp_path / "a.vtu", "--free-volumes") == 1
     said = " ".join(capsys.readouterr().err.split())
-    assert "no voxel of label 1, 3, of 200 voxels or more, lies in a cell with that label; components of labels" in said
-    assert "of 50 voxels or more without a cell: 100 voxels of label 2 at (14, 14, 15) mm; allow more nodes" in said
+    assert (
+        "no voxel of label 1, 3, of 200 voxels or more, lies in a cell with that label; "
+        "components of labels" in said
+    )
+    assert (
+        "of 50 voxels or more without a cell: 100 voxels of label 2 at (14, 14, 15) mm; allow "
+        "more nodes" in said
+    )
     # Labels whose volumes are kept have cells there, too, if not of all their volume.
     assert exit_code(*command, "-o", tmp_path / "b.vtu", "--json", tmp_path / "b.json") == 1
     said = " ".join(capsys.readouterr().err.split())
-    assert "the volume of cells is not 0.6 to 1.5 times that of voxels: 0.312 for label 3; allow more" in said
-    assert all(row["n_cells"] > 0 for row in json.loads((tmp_path / "b.json").read_text())["labels"])
+    assert (
+        "the volume of cells is not 0.6 to 1.5 times that of voxels: 0.312 for label 3; allow more"
+        in said
+    )
+    assert all(
+        row["n_cells"] > 0 for row in json.loads((tmp_path / "b.json").read_text())["labels"]
+    )
 
 
 def test_a_slice_of_all(inputs, tmp_path):
@@ -259,24 +339,53 @@ def test_a_slice_of_a_mask_that_is_stored_upside_down(inputs, tmp_path):
     turned[:3, 3] = image.to_world([0.0, 0.0, image.shape[2] - 1.0])
     turned[:3, 2] *= -1.0
     tetopt.save_image(tmp_path / "turned.nii.gz", tetopt.Image(mask.data[..., ::-1], turned))
-    command = ["mesh", inputs / "image.nii.gz", "--slice", "k=12", "--mask", tmp_path / "turned.nii.gz"]
-    command += ["--nodes", "60", "--iterations", "0", "--json", tmp_path / "a.json", "-o", tmp_path / "a.vtu"]
+    command = [
+        "mesh",
+        inputs / "image.nii.gz",
+        "--slice",
+        "k=12",
+        "--mask",
+        tmp_path / "turned.nii.gz",
+    ]
+    command += [
+        "--nodes",
+        "60",
+        "--iterations",
+        "0",
+        "--json",
+        tmp_path / "a.json",
+        "-o",
+        tmp_path / "a.vtu",
+    ]
     assert exit_code(*command) == 0
     assert numbers_in(tmp_path / "a.json")["mask"]["voxels"] == mask.data[..., 12].sum()
 
 
 def test_files_on_other_grids_are_told(inputs, tmp_path, capsys):
-    """And so are a mask of which half lies elsewhere, and one of the image's shape that is a little off."""
+    """And so are a mask of which half lies elsewhere, and one of the image's shape that is a
+    little off.
+    """
     image, mask = shaped("ball", OBLIQUE)
     moved = OBLIQUE.copy()
     moved[:3, 3] = image.to_world([14.0, 0.0, 0.0])
     tetopt.save_image(tmp_path / "half.nii.gz", tetopt.Image(mask.data, moved))
-    command = ["mesh", inputs / "image.nii.gz", inputs / "square.nii.gz", "--mask", tmp_path / "half.nii.gz"]
-    assert exit_code(*command, "--nodes", "300", "--iterations", "0", "-o", tmp_path / "a.vtu") in (0, 1)
+    command = [
+        "mesh",
+        inputs / "image.nii.gz",
+        inputs / "square.nii.gz",
+        "--mask",
+        tmp_path / "half.nii.gz",
+    ]
+    assert exit_code(*command, "--nodes", "300", "--iterations", "0", "-o", tmp_path / "a.vtu") in (
+        0,
+        1,
+    )
     said = " ".join(capsys.readouterr().err.split())
     assert "square.nii.gz: resampled to the image's grid (linear)" in said
     assert "half.nii.gz: resampled to the image's grid (nearest neighbour)" in said
-    assert "half.nii.gz: 48.7% of it lies outside the image; its box covers 50.0% of the image" in said
+    assert (
+        "half.nii.gz: 48.7% of it lies outside the image; its box covers 50.0% of the image" in said
+    )
     assert "(same shape, different affine); is it from the same scan?" in said
     moved[:3, 3] = image.to_world([1.5, 0.0, 0.0])
     tetopt.save_image(tmp_path / "near.nii.gz", tetopt.Image(mask.data, moved))
@@ -295,11 +404,14 @@ def test_files_on_other_grids_are_told(inputs, tmp_path, capsys):
     assert "near.nii.gz: 0.0% of it lies outside the image" in capsys.readouterr().err
     wide = OBLIQUE.copy()  # the same space: more of it, and its axes the other way
     wide[:3, 3] = image.to_world([-3.0, -3.0, -3.0])
-    tetopt.save_image(tmp_path / "wide.nii.gz", tetopt.Image(np.pad(mask.data, 3, constant_values=1.0), wide))
+    tetopt.save_image(
+        tmp_path / "wide.nii.gz", tetopt.Image(np.pad(mask.data, 3, constant_values=1.0), wide)
+    )
     turned = OBLIQUE @ np.diag([-1.0, 1.0, 1.0, 1.0])
     turned[:3, 3] = image.to_world([image.shape[0] - 1.0, 0.0, 0.0])
     tetopt.save_image(tmp_path / "turned.nii.gz", tetopt.Image(mask.data[::-1], turned))
-    turned[:3, 3] = image.to_world([image.shape[0] + 0.5, 0.0, 0.0])  # and elsewhere, as labels of FreeSurfer
+    # and elsewhere, as labels of FreeSurfer
+    turned[:3, 3] = image.to_world([image.shape[0] + 0.5, 0.0, 0.0])
     tetopt.save_image(tmp_path / "aside.nii.gz", tetopt.Image(mask.data[::-1], turned))
     for name in ("wide", "turned", "aside"):
         exit_code(*command, "--mask", tmp_path / f"{name}.nii.gz")
@@ -309,10 +421,21 @@ def test_files_on_other_grids_are_told(inputs, tmp_path, capsys):
 
 
 def test_a_crop_is_no_other_scan(inputs, tmp_path, capsys):
-    """What a crop leaves out of labels on the same voxels is no fault, and they are not resampled."""
+    """What a crop leaves out of labels on the same voxels is no fault, and they are not
+    resampled.
+    """
     mask = shaped("ball", OBLIQUE)[1]
     tetopt.save_image(tmp_path / "m.nii.gz", mask)
-    command = ["mesh", inputs / "image.nii.gz", "--crop", "14:,:,2:30", "--nodes", "300", "--iterations", "0"]
+    command = [
+        "mesh",
+        inputs / "image.nii.gz",
+        "--crop",
+        "14:,:,2:30",
+        "--nodes",
+        "300",
+        "--iterations",
+        "0",
+    ]
     assert exit_code(*command, "--mask", tmp_path / "m.nii.gz", "-o", tmp_path / "a.vtu") in (0, 1)
     said = capsys.readouterr().err
     assert "m.nii.gz" not in said
@@ -321,7 +444,9 @@ def test_a_crop_is_no_other_scan(inputs, tmp_path, capsys):
 
 def test_a_mesh_of_a_mask_is_checked_as_one(run, inputs, capsys):
     """Without the mask at hand, too: the file says that there was one."""
-    assert exit_code("quality", run / "mesh.vtu", "--image", inputs / "image.nii.gz", "--check") == 0
+    assert (
+        exit_code("quality", run / "mesh.vtu", "--image", inputs / "image.nii.gz", "--check") == 0
+    )
     assert "checked: conforming, oriented; meshed within a mask" in capsys.readouterr().out
 
 
@@ -329,9 +454,22 @@ def test_intensities_are_no_labels(inputs, tmp_path, capsys):
     path = inputs / "noise.nii.gz"
     rng = np.random.default_rng(0)
     tetopt.save_image(path, tetopt.Image(np.rint(3.0 * rng.random((24, 24, 24)))))
-    command = ["mesh", path, "--labels", path, "--nodes", "200", "--iterations", "0", "-o", tmp_path / "a.vtu"]
+    command = [
+        "mesh",
+        path,
+        "--labels",
+        path,
+        "--nodes",
+        "200",
+        "--iterations",
+        "0",
+        "-o",
+        tmp_path / "a.vtu",
+    ]
     exit_code(*command)
-    assert "check that these are labels, not intensities" in " ".join(capsys.readouterr().err.split())
+    assert "check that these are labels, not intensities" in " ".join(
+        capsys.readouterr().err.split()
+    )
 
 
 def test_a_volume_of_a_4d_file(inputs, tmp_path, capsys):
@@ -385,7 +523,14 @@ def test_quality_of_a_mask_beside_the_mesh(tmp_path, capsys):
         mask = np.zeros(image.shape)
         mask[first:last] = 1.0
         tetopt.save_image(tmp_path / "m.nii.gz", tetopt.Image(mask))
-        words = ["quality", tmp_path / "a.vtu", "--image", tmp_path / "a.nii.gz", "--mask", tmp_path / "m.nii.gz"]
+        words = [
+            "quality",
+            tmp_path / "a.vtu",
+            "--image",
+            tmp_path / "a.nii.gz",
+            "--mask",
+            tmp_path / "m.nii.gz",
+        ]
         assert exit_code(*words) == expected
         said = capsys.readouterr()
         assert ("overlap with a Dice of only 0.333" in said.err) == bool(expected)
@@ -400,10 +545,21 @@ def test_the_background_takes_no_label(tmp_path, capsys):
     labels[distance(labels.shape, 38, 6, 6) < 3.1] = 3.0
     labels[6:9, 17:19, 17:19] = 0.0  # enclosed: cells of label 0
     tetopt.save_image(tmp_path / "l.nii.gz", tetopt.Image(labels))
-    command = ["mesh", tmp_path / "l.nii.gz", "--labels", tmp_path / "l.nii.gz", "--background", "0", "--nodes", "900"]
+    command = [
+        "mesh",
+        tmp_path / "l.nii.gz",
+        "--labels",
+        tmp_path / "l.nii.gz",
+        "--background",
+        "0",
+        "--nodes",
+        "900",
+    ]
     assert exit_code(*command, "-o", tmp_path / "a.vtu", "--iterations", "2") == 0
     loaded = tetopt.load_mesh(tmp_path / "a.vtu")
-    assert loaded.cell_data["volume"][loaded.cell_data["label"] == 3].sum() > 0.5 * (labels == 3).sum()
+    assert (
+        loaded.cell_data["volume"][loaded.cell_data["label"] == 3].sum() > 0.5 * (labels == 3).sum()
+    )
     assert "bright ones are removed" not in capsys.readouterr().err
 
 
@@ -415,11 +571,25 @@ def test_a_map_of_one_label(tmp_path, capsys, monkeypatch, more):
     data = np.where(ball, 5.0, 0.0) if more and "m.nii" not in more else np.full(ball.shape, 5.0)
     tetopt.save_image("l.nii.gz", tetopt.Image(data))
     tetopt.save_image("m.nii.gz", tetopt.Image(1.0 * ball))
-    command = ["mesh", "l.nii.gz", "--labels", "l.nii.gz", *more.split(), "--nodes", "150", "--iterations", "1"]
+    command = [
+        "mesh",
+        "l.nii.gz",
+        "--labels",
+        "l.nii.gz",
+        *more.split(),
+        "--nodes",
+        "150",
+        "--iterations",
+        "1",
+    ]
     assert exit_code(*command, "-o", "a.vtu", "--json", "a.json") == 0
     assert np.unique(tetopt.load_mesh("a.vtu").cell_data["label"]).tolist() == [5]
     (row,) = numbers_in(tmp_path / "a.json")["labels"]
-    assert (row["label"], row["voxels"], row["is_lost"]) == (5, ball.sum() if more else ball.size, False)
+    assert (row["label"], row["voxels"], row["is_lost"]) == (
+        5,
+        ball.sum() if more else ball.size,
+        False,
+    )
     capsys.readouterr()
 
 
@@ -430,7 +600,18 @@ def test_label_zero_within_a_mask_has_a_row(tmp_path, monkeypatch, capsys):
     labels = np.where(ball < 9, 2.0, 0.0) * (ball >= 4)
     tetopt.save_image("l.nii.gz", tetopt.Image(labels))
     tetopt.save_image("m.nii.gz", tetopt.Image(1.0 * (ball < 9)))
-    command = ["mesh", "l.nii.gz", "--labels", "l.nii.gz", "--mask", "m.nii.gz", "--nodes", "500", "--iterations", "3"]
+    command = [
+        "mesh",
+        "l.nii.gz",
+        "--labels",
+        "l.nii.gz",
+        "--mask",
+        "m.nii.gz",
+        "--nodes",
+        "500",
+        "--iterations",
+        "3",
+    ]
     assert exit_code(*command, "-o", "a.vtu", "--json", "a.json") == 0
     zero, two = numbers_in(tmp_path / "a.json")["labels"]
     assert (zero["label"], zero["voxels"], two["label"]) == (0, int((ball < 4).sum()), 2)
@@ -441,7 +622,9 @@ def test_label_zero_within_a_mask_has_a_row(tmp_path, monkeypatch, capsys):
 
 
 def test_labels_twice_finer_are_no_other_scan(tmp_path, capsys):
-    """The voxels of the image, once divided, are as many as those of the labels, which begin elsewhere."""
+    """The voxels of the image, once divided, are as many as those of the labels, which begin
+    elsewhere.
+    """
     image = tetopt.Image(np.random.default_rng(0).random((8, 8, 8)), np.diag([2.0, 2.0, 2.0, 1.0]))
     labels = np.zeros((16, 16, 16), np.uint8)
     labels[5:11, 5:11, 5:11] = 3
@@ -449,7 +632,14 @@ def test_labels_twice_finer_are_no_other_scan(tmp_path, capsys):
     affine[:3, 3] = 1.5
     tetopt.save_image(tmp_path / "a.nii.gz", image)
     tetopt.save_image(tmp_path / "l.nii.gz", tetopt.Image(labels, affine))
-    command = ["mesh", tmp_path / "a.nii.gz", "--labels", tmp_path / "l.nii.gz", "-o", tmp_path / "a.vtu"]
+    command = [
+        "mesh",
+        tmp_path / "a.nii.gz",
+        "--labels",
+        tmp_path / "l.nii.gz",
+        "-o",
+        tmp_path / "a.vtu",
+    ]
     assert exit_code(*command, "--nodes", "100", "--iterations", "0") in (0, 1)
     said = capsys.readouterr().err
     assert "divided by 2 x 2 x 2" in said
@@ -459,12 +649,16 @@ def test_labels_twice_finer_are_no_other_scan(tmp_path, capsys):
 def test_a_label_beyond_the_largest_is_refused():
     """Also in 32 bits, in which the largest is rounded to it."""
     labels = tetopt.Image(np.full((4, 4, 4), 2**31, np.float32))
-    with pytest.raises(tetopt.InputError, match="whole numbers from 0 to 2147483647; 64 voxels have other values"):
+    with pytest.raises(
+        tetopt.InputError, match="whole numbers from 0 to 2147483647; 64 voxels have other values"
+    ):
         tetopt.resample_labels(labels, tetopt.Image(np.zeros((4, 4, 4))))
 
 
 def test_labels_and_a_mask_finer_than_the_image_keep_their_voxels(tmp_path):
-    """Tables count the file's own voxels, one of a label 2^31 - 1 in a sheet as thin as they are."""
+    """Tables count the file's own voxels, one of a label 2^31 - 1 in a sheet as thin as they
+    are.
+    """
     fine = tetopt.Image(np.zeros((24, 24, 24)), np.diag([1.0, 1.0, 1.0, 1.0]))
     labels = np.where(distance(fine.shape, 12, 12, 12) < 9, 5.0, 0.0)
     labels[12, 6:18, 6:18] = 2.0**31 - 1
@@ -476,7 +670,16 @@ def test_labels_and_a_mask_finer_than_the_image_keep_their_voxels(tmp_path):
     tetopt.save_image(tmp_path / "m.nii.gz", tetopt.Image(labels > 0))
     tetopt.save_image(tmp_path / "two.nii.gz", tetopt.Image(rng.normal(size=(12, 12, 12)), coarse))
     files = ["--labels", tmp_path / "l.nii.gz", "--mask", tmp_path / "m.nii.gz"]
-    words = ["mesh", tmp_path / "i.nii.gz", tmp_path / "two.nii.gz", *files, "--nodes", "1500", "--iterations", "1"]
+    words = [
+        "mesh",
+        tmp_path / "i.nii.gz",
+        tmp_path / "two.nii.gz",
+        *files,
+        "--nodes",
+        "1500",
+        "--iterations",
+        "1",
+    ]
     assert exit_code(*words, "-o", tmp_path / "a.vtu", "--json", tmp_path / "a.json") in (0, 1)
     numbers = numbers_in(tmp_path / "a.json")
     assert numbers["inputs"]["divided"] == [2, 2, 2]
@@ -486,13 +689,38 @@ def test_labels_and_a_mask_finer_than_the_image_keep_their_voxels(tmp_path):
     mesh = tetopt.load_mesh(tmp_path / "a.vtu")
     assert np.unique(mesh.cell_data["label"]).tolist() == [5, 2**31 - 1]
     assert "label_2147483647" in mesh.sets.cells
-    words = ["quality", tmp_path / "a.vtu", "--image", tmp_path / "i.nii.gz", *files, "--json", tmp_path / "q.json"]
+    words = [
+        "quality",
+        tmp_path / "a.vtu",
+        "--image",
+        tmp_path / "i.nii.gz",
+        *files,
+        "--json",
+        tmp_path / "q.json",
+    ]
     assert exit_code(*words) == 0
     again = numbers_in(tmp_path / "q.json")
     assert {row["label"]: row["voxels"] for row in again["labels"]} == counts
-    flat = ["mesh", tmp_path / "i.nii.gz", "--labels", tmp_path / "l.nii.gz", "--slice", "k=6", "--crop", "2:10,:,:"]
+    flat = [
+        "mesh",
+        tmp_path / "i.nii.gz",
+        "--labels",
+        tmp_path / "l.nii.gz",
+        "--slice",
+        "k=6",
+        "--crop",
+        "2:10,:,:",
+    ]
     assert exit_code(
-        *flat, "-o", tmp_path / "s.vtu", "--nodes", "200", "--iterations", "0", "--json", tmp_path / "s.json"
+        *flat,
+        "-o",
+        tmp_path / "s.vtu",
+        "--nodes",
+        "200",
+        "--iterations",
+        "0",
+        "--json",
+        tmp_path / "s.json",
     ) in (0, 1)
     counted = {row["label"]: row["voxels"] for row in numbers_in(tmp_path / "s.json")["labels"]}
     plane = labels[4:20, :, 13]  # the nearest above the middle of two
@@ -519,7 +747,10 @@ def test_labels_of_a_segmentation_are_the_mask(tmp_path, monkeypatch, capfd):
         "a.json",
         "--force",
     ]
-    for words, chosen in ((["5"], [5]), (["liver,2", "--label-names", "names.csv", "--labels", "l.nii.gz"], [2, 5])):
+    for words, chosen in (
+        (["5"], [5]),
+        (["liver,2", "--label-names", "names.csv", "--labels", "l.nii.gz"], [2, 5]),
+    ):
         assert exit_code(*mesh, "-o", "a.vtu", "--mask-label", *words) in (0, 1)
         numbers = numbers_in(tmp_path / "a.json")
         assert numbers["mask"]["voxels"] == np.isin(labels, chosen).sum()
@@ -539,6 +770,18 @@ def test_labels_of_a_segmentation_are_the_mask(tmp_path, monkeypatch, capfd):
     assert exit_code(*measured, "--force") == 0
     assert numbers_in(tmp_path / "q.json")["mask"]["voxels"] == np.count_nonzero(labels)
     capfd.readouterr()
-    assert_refused(capfd, [*mesh, "-o", "b.vtu", "--mask-label", "7"], 'no voxel with label "7"; it has 0, 2, 5$')
-    assert_refused(capfd, [*mesh, "-o", "b.vtu"], "got 3 values from 0 to 5 .*; choose labels with --mask-label")
-    assert_refused(capfd, ["mesh", "l.nii.gz", "-o", "b.vtu", "--mask-label", "5"], "--mask-label: needs --mask$")
+    assert_refused(
+        capfd,
+        [*mesh, "-o", "b.vtu", "--mask-label", "7"],
+        'no voxel with label "7"; it has 0, 2, 5$',
+    )
+    assert_refused(
+        capfd,
+        [*mesh, "-o", "b.vtu"],
+        "got 3 values from 0 to 5 .*; choose labels with --mask-label",
+    )
+    assert_refused(
+        capfd,
+        ["mesh", "l.nii.gz", "-o", "b.vtu", "--mask-label", "5"],
+        "--mask-label: needs --mask$",
+    )

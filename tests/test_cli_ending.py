@@ -1,4 +1,6 @@
-"""How the command ends when a signal comes, when its streams are closed, full or gone, and when memory is short."""
+"""How the command ends when a signal comes, when its streams are closed, full or gone, and when
+memory is short.
+"""
 
 import os
 import re
@@ -24,7 +26,9 @@ from tetopt.engine.meshing import Attempt, MeshSearch
 
 pytestmark = pytest.mark.deep
 NEEDS_SIGNALS = pytest.mark.skipif(os.name == "nt", reason="Windows has no such signals")
-NEEDS_FULL = pytest.mark.skipif(not os.path.exists("/dev/full"), reason="the system has no device that is always full")
+NEEDS_FULL = pytest.mark.skipif(
+    not os.path.exists("/dev/full"), reason="the system has no device that is always full"
+)
 LATE_SIGNALS = [signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)]
 QUICK = ["--spacing", "8", "--iterations", "2"]
 
@@ -64,7 +68,9 @@ def signals_not_ignored():
 
 @NEEDS_SIGNALS
 @pytest.mark.parametrize("number", LATE_SIGNALS)
-def test_a_signal_leaves_the_mesh_reached(image, folder, monkeypatch, capsys, signals_not_ignored, number):
+def test_a_signal_leaves_the_mesh_reached(
+    image, folder, monkeypatch, capsys, signals_not_ignored, number
+):
     @contextmanager
     def told(*_):
         yield lambda row: signal.raise_signal(number) if row.iteration == 1 else None
@@ -101,7 +107,9 @@ def test_other_commands_end_at_once(folder, monkeypatch, capsys, signals_not_ign
         signal.raise_signal(number)
 
     monkeypatch.setattr(tetopt.cli.phantom, "save_image", interrupted)
-    assert exit_code("phantom", "disc_2d", "-o", folder / "a.nii", "--voxel-mm", "8") == 128 + number
+    assert (
+        exit_code("phantom", "disc_2d", "-o", folder / "a.nii", "--voxel-mm", "8") == 128 + number
+    )
     assert names_in(folder) == []
     name = "Ctrl-C" if number == signal.SIGINT else number.name
     assert capsys.readouterr().err == f"ended by {name}; written: nothing\n"
@@ -126,7 +134,9 @@ def test_an_ignored_signal_stays_ignored():
 
 @contextmanager
 def full_device():
-    """A stream to what is always full; what is left in its buffer must not fail when it is closed."""
+    """A stream to what is always full; what is left in its buffer must not fail when it is
+    closed.
+    """
     with open("/dev/full", "w", encoding="utf-8") as stream:
         yield stream
 
@@ -143,7 +153,8 @@ def test_full_streams_lose_no_file(image, folder, monkeypatch, capsys, names, co
     if names == ["stdout"]:
         said = capsys.readouterr().err
         assert said.endswith(
-            "standard output cannot be written (No space left on device); the printed output is incomplete\n"
+            "standard output cannot be written (No space left on device); the printed output is "
+            "incomplete\n"
         )
 
 
@@ -163,13 +174,16 @@ def test_closed_descriptors_are_not_taken_by_files(tmp_path):
     """Else what libraries print on standard error would go into the file that was opened next."""
     program = (
         "import os, sys; from tetopt.cli.console import open_streams; open_streams(); "
-        f"f = open({str(tmp_path / 'a')!r}, 'w'); os.write(2, b'noise'); os.write(1, b'noise'); f.write('mine')"
+        f"f = open({str(tmp_path / 'a')!r}, 'w'); os.write(2, b'noise'); os.write(1, b'noise'); "
+        "f.write('mine')"
     )
     child = os.fork()
     if child == 0:
         os.closerange(0, 3)
         os.execve(
-            sys.executable, [sys.executable, "-c", program], os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+            sys.executable,
+            [sys.executable, "-c", program],
+            os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
         )
     assert os.waitpid(child, 0)[1] == 0
     assert (tmp_path / "a").read_text() == "mine"
@@ -180,7 +194,9 @@ def test_closed_descriptors_are_not_taken_by_files(tmp_path):
 def test_names_that_are_not_utf_8(image, folder, suffix, capsys):
     name = os.fsdecode(b"caf\xe9\x1b[31m\n")
     os.rename(image, image.with_name(f"{name}.nii.gz"))
-    command = mesh_words(image.with_name(f"{name}.nii.gz"), folder, *QUICK, "--iterations", "0", "--force")
+    command = mesh_words(
+        image.with_name(f"{name}.nii.gz"), folder, *QUICK, "--iterations", "0", "--force"
+    )
     command[command.index("-o") + 1] = folder / f"{name}.{suffix}"
     assert exit_code(*command, "--young", "3") == 0
     assert numbers_in(folder / "a.json")["image"] == "caf\\udce9\x1b[31m\n.nii.gz"
@@ -197,7 +213,9 @@ def test_names_that_are_not_utf_8(image, folder, suffix, capsys):
 
 
 # numpy's own, which was elsewhere before numpy 2.
-ARRAY_MEMORY_ERROR = (np.core if np.__version__.startswith("1.") else np._core)._exceptions._ArrayMemoryError
+ARRAY_MEMORY_ERROR = (
+    np.core if np.__version__.startswith("1.") else np._core
+)._exceptions._ArrayMemoryError
 
 
 @pytest.mark.parametrize(
@@ -220,7 +238,8 @@ def test_short_memory_is_a_line(folder, monkeypatch, capsys, error, words):
 
 
 @pytest.mark.parametrize(
-    "error", [OSError(28, "No space left on device", "a.inp"), MemoryError("to lay out"), KeyError(7)]
+    "error",
+    [OSError(28, "No space left on device", "a.inp"), MemoryError("to lay out"), KeyError(7)],
 )
 def test_a_mesh_whose_file_fails_is_kept(image, folder, monkeypatch, capsys, error):
     def failing(*_):
@@ -233,11 +252,16 @@ def test_a_mesh_whose_file_fails_is_kept(image, folder, monkeypatch, capsys, err
             exit_code(*command)
     else:
         assert exit_code(*command) == 2
-    assert f"the optimised mesh is in {folder / 'a.vtu'}: continue from there" in capsys.readouterr().err
+    assert (
+        f"the optimised mesh is in {folder / 'a.vtu'}: continue from there"
+        in capsys.readouterr().err
+    )
     assert tetopt.load_mesh(folder / "a.vtu").cell_data["mean"].max() > 0.0
 
 
-def test_a_mesh_whose_folder_has_gone_is_kept_elsewhere(image, folder, tmp_path, monkeypatch, capsys):
+def test_a_mesh_whose_folder_has_gone_is_kept_elsewhere(
+    image, folder, tmp_path, monkeypatch, capsys
+):
     """Whatever else fails: the model of the mesh, then the mesh beside its name."""
     save = tetopt.job.write.save_for_solver
 
@@ -252,7 +276,8 @@ def test_a_mesh_whose_folder_has_gone_is_kept_elsewhere(image, folder, tmp_path,
     (kept,) = (tmp_path / "tmp").rglob("*.vtu")
     said = capsys.readouterr().err.splitlines()
     assert (
-        f"{folder / 'a.vtu'}: cannot be written: No such file or directory; the optimised mesh is in {kept}" in said[-1]
+        f"{folder / 'a.vtu'}: cannot be written: No such file or directory; the optimised mesh "
+        f"is in {kept}" in said[-1]
     )
     assert kept.parent.stat().st_mode & 0o077 == 0
     assert tetopt.load_mesh(kept).cell_data["mean"].max() > 0.0
@@ -266,15 +291,21 @@ def test_what_was_written_before_an_error_is_said(image, folder, monkeypatch, ca
     assert exit_code(*mesh_words(image, folder, *QUICK)) == 2
     said = capsys.readouterr().err.splitlines()
     assert said[-2:] == [
-        f"tetopt: {folder / 'a.json'}: No space left on device", f"written before the error: {folder / 'a.vtu'}"
-    ]  # fmt: skip
+        f"tetopt: {folder / 'a.json'}: No space left on device",
+        f"written before the error: {folder / 'a.vtu'}",
+    ]
 
 
-def test_a_mesh_that_the_disk_cannot_take_is_refused_before_the_run(image, folder, monkeypatch, capsys):
+def test_a_mesh_that_the_disk_cannot_take_is_refused_before_the_run(
+    image, folder, monkeypatch, capsys
+):
     monkeypatch.setattr("shutil.disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9, 5000))
     monkeypatch.setattr(tetopt.job.meshing, "watched", None)
     assert exit_code("mesh", image, "-o", folder / "a.vtu", *QUICK) == 2
-    assert "a.vtu: needs at least 8640 bytes, but only 5000 are free; free some space first" in capsys.readouterr().err
+    assert (
+        "a.vtu: needs at least 8640 bytes, but only 5000 are free; free some space first"
+        in capsys.readouterr().err
+    )
 
 
 def test_numbers_that_fail_lose_no_mesh(image, folder, monkeypatch):
@@ -296,7 +327,11 @@ def failing(error):
     return fail
 
 
-ERRORS = [MemoryError(), IndexError("index 7 is out of bounds"), tetopt.InputError("mesh: too flat")]
+ERRORS = [
+    MemoryError(),
+    IndexError("index 7 is out of bounds"),
+    tetopt.InputError("mesh: too flat"),
+]
 MEASURES = {  # where each is called, and its keys in run.json
     "quality": (tetopt.job.run, {"quality_initial", "quality"}),
     "edge_ratios": (tetopt.job.write, {"edges_over_target"}),
@@ -314,12 +349,23 @@ MEASURES = {  # where each is called, and its keys in run.json
 
 @pytest.fixture(scope="module")
 def measured_run(tmp_path_factory):
-    """Words of a run of which everything is measured, and the numbers; the optimisation is done once."""
+    """Words of a run of which everything is measured, and the numbers; the optimisation is done
+    once.
+    """
     folder = tmp_path_factory.mktemp("measured")
     image = sample_image(3)
     for name, values in (("a", image.data), ("l", image.data > 30), ("m", np.ones(image.shape))):
         tetopt.save_image(folder / f"{name}.nii", tetopt.Image(1.0 * values, image.affine))
-    words = ["mesh", folder / "a.nii", "--labels", folder / "l.nii", "--mask", folder / "m.nii", "--edge-size", "9"]
+    words = [
+        "mesh",
+        folder / "a.nii",
+        "--labels",
+        folder / "l.nii",
+        "--mask",
+        folder / "m.nii",
+        "--edge-size",
+        "9",
+    ]
     words += ["--nodes", "60", "--iterations", "3"]
     once = []
 
@@ -340,7 +386,9 @@ def measured_run(tmp_path_factory):
         yield words, numbers
 
 
-@pytest.mark.parametrize(("name", "error"), list(zip(MEASURES, 4 * ERRORS, strict=False)), ids=MEASURES)
+@pytest.mark.parametrize(
+    ("name", "error"), list(zip(MEASURES, 4 * ERRORS, strict=False)), ids=MEASURES
+)
 def test_a_measure_that_fails_is_a_line(measured_run, folder, monkeypatch, capsys, name, error):
     """All other numbers are written, and the mesh as it is without the failure."""
     words, whole = measured_run
@@ -362,7 +410,11 @@ def test_a_measure_that_fails_is_a_line(measured_run, folder, monkeypatch, capsy
     assert set(numbers["failed"]) == ({"fields"} if name == "fields" else keys)
     for key, words_of_key in numbers["failed"].items():
         assert reason in words_of_key
-        lines = [line for line in said.splitlines() if line.startswith(f"tetopt: {key} could not be measured")]
+        lines = [
+            line
+            for line in said.splitlines()
+            if line.startswith(f"tetopt: {key} could not be measured")
+        ]
         assert len(lines) == 1
         assert reason in lines[0]
     loaded = tetopt.load_mesh(folder / "a.vtu")
@@ -384,7 +436,9 @@ main(sys.argv[1:])
 def test_a_process_that_is_killed_while_it_measures_leaves_the_mesh(image, folder):
     """As the system does where memory is short, or a fault of compiled code."""
     words = ["mesh", image, "-o", folder / "a.vtu", *QUICK]
-    done = subprocess.run([sys.executable, "-c", KILLED, *map(str, words)], capture_output=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", KILLED, *map(str, words)], capture_output=True, check=False
+    )
     assert done.returncode == -signal.SIGKILL
     assert names_in(folder) == ["a_optimised_1.vtu"]
     assert len(tetopt.load_mesh(folder / "a_optimised_1.vtu").mesh.cells) > 100

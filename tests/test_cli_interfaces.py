@@ -1,4 +1,6 @@
-"""`tetopt quality --check` and `tetopt surface` of meshes with labels, made by hand, as a user types them."""
+"""`tetopt quality --check` and `tetopt surface` of meshes with labels, made by hand, as a user
+types them.
+"""
 
 import numpy as np
 import pytest
@@ -13,7 +15,9 @@ pytestmark = pytest.mark.full
 
 
 def block_mesh(labels):
-    """An image of labels, a mesh with a block of cells in each voxel, and the label of each cell."""
+    """An image of labels, a mesh with a block of cells in each voxel, and the label of each
+    cell.
+    """
     image = tetopt.Image(labels)
     mesh = tetopt.lattice_mesh(image, "five-tet", blocks=image.shape)
     return image, mesh, cell_labels(image, mesh)
@@ -21,7 +25,9 @@ def block_mesh(labels):
 
 @pytest.fixture
 def touching(tmp_path):
-    """Two voxels of label 1 that share an edge, among 0: labels, their mesh, and the mesh of label 1 alone."""
+    """Two voxels of label 1 that share an edge, among 0: labels, their mesh, and the mesh of
+    label 1 alone.
+    """
     labels = np.zeros((4, 4, 4))
     labels[1, 1, 1] = labels[2, 2, 1] = 1
     image, mesh, of_cell = block_mesh(labels)
@@ -33,11 +39,15 @@ def touching(tmp_path):
 
 
 def test_a_boundary_that_is_no_manifold(touching, capsys):
-    """It is a fault, also where the mask's voxels touch like that; of an interface that no run smoothed it is said."""
+    """It is a fault, also where the mask's voxels touch like that; of an interface that no run
+    smoothed it is said.
+    """
     check = ["--check", "--json", touching / "q.json", "--force"]
     assert exit_code("quality", touching / "ones.vtu", *check) == 1
     problems = numbers_in(touching / "q.json")["problems"]
-    assert problems[-1].startswith("edges where the boundary has more than two facets; nodes: 1, the first")
+    assert problems[-1].startswith(
+        "edges where the boundary has more than two facets; nodes: 1, the first"
+    )
     assert problems[-1] in capsys.readouterr().err
 
     beside = ["--image", touching / "labels.nii.gz", "--mask", touching / "labels.nii.gz"]
@@ -45,7 +55,10 @@ def test_a_boundary_that_is_no_manifold(touching, capsys):
     assert numbers_in(touching / "q.json")["problems"] == problems[-1:]
     assert capsys.readouterr().err.count("more than two facets") == 1
 
-    assert exit_code("quality", touching / "all.vtu", *check, "--image", touching / "labels.nii.gz") == 0
+    assert (
+        exit_code("quality", touching / "all.vtu", *check, "--image", touching / "labels.nii.gz")
+        == 0
+    )
     numbers = numbers_in(touching / "q.json")
     assert numbers["problems"] == []
     (remark,) = numbers["remarks"]
@@ -62,10 +75,14 @@ def test_a_boundary_that_is_no_manifold(touching, capsys):
 
 @pytest.fixture
 def slabs(tmp_path):
-    """Slabs of labels 1, 2, 4 and 1 again, each 4 x 3 voxels wide and one or two thick, 2 mm a voxel."""
+    """Slabs of labels 1, 2, 4 and 1 again, each 4 x 3 voxels wide and one or two thick, 2 mm a
+    voxel.
+    """
     labels = np.zeros((4, 3, 6))
     labels[:] = [1, 1, 2, 4, 4, 1]
-    mesh = tetopt.lattice_mesh(tetopt.Image(labels, np.diag([2.0, 2.0, 2.0, 1.0])), "five-tet", blocks=(4, 3, 6))
+    mesh = tetopt.lattice_mesh(
+        tetopt.Image(labels, np.diag([2.0, 2.0, 2.0, 1.0])), "five-tet", blocks=(4, 3, 6)
+    )
     of_cell = cell_labels(tetopt.Image(labels, np.diag([2.0, 2.0, 2.0, 1.0])), mesh)
     tetopt.save_mesh(tmp_path / "slabs.vtu", mesh, {"label": of_cell})
     (tmp_path / "names.csv").write_text("label,name\n2,bone\n4,left lung\n")
@@ -76,12 +93,18 @@ SLAB = 4 * 3 * 4.0  # mm2
 
 
 def labels_in(path):
-    """Places of the corners, labels inside and outside of each triangle, by readers that share no code with ours."""
+    """Places of the corners, labels inside and outside of each triangle, by readers that share
+    no code with ours.
+    """
     if path.suffix == ".ply":
         read = trimesh.load_mesh(path, process=False)
         corners = read.vertices[read.faces]
-        sides = [read.metadata["_ply_raw"]["face"]["data"][f"label_{side}"] for side in ("inside", "outside")]
-        assert pyvista.read(path).n_cells == len(corners)  # by the class of VTK that 3D Slicer takes
+        sides = [
+            read.metadata["_ply_raw"]["face"]["data"][f"label_{side}"]
+            for side in ("inside", "outside")
+        ]
+        # by the class of VTK that 3D Slicer takes
+        assert pyvista.read(path).n_cells == len(corners)
     else:
         read = pyvista.read(path)
         corners = np.asarray(read.points)[read.regular_faces]
@@ -92,9 +115,20 @@ def labels_in(path):
 @pytest.mark.parametrize("suffix", [".ply", ".vtp", ".vtk"])
 @pytest.mark.parametrize("has_boundary", [False, True])
 def test_all_interfaces_with_the_labels_of_both_sides(slabs, suffix, has_boundary, capsys):
-    """Each lies in its plane, in its area, and faces out of its smaller label; so does the boundary."""
+    """Each lies in its plane, in its area, and faces out of its smaller label; so does the
+    boundary.
+    """
     out, more = slabs / f"all{suffix}", ["--boundary"] * has_boundary
-    command = ["surface", slabs / "slabs.vtu", "--interfaces", *more, "-o", out, "--json", slabs / "a.json"]
+    command = [
+        "surface",
+        slabs / "slabs.vtu",
+        "--interfaces",
+        *more,
+        "-o",
+        out,
+        "--json",
+        slabs / "a.json",
+    ]
     assert exit_code(*command, "--label-names", slabs / "names.csv") == 0
     corners, sides = labels_in(out)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2.0
@@ -112,9 +146,14 @@ def test_all_interfaces_with_the_labels_of_both_sides(slabs, suffix, has_boundar
     assert (sides[:, 0] != sides[:, 1]).all()
 
     numbers = numbers_in(slabs / "a.json")
-    rows = {(row["label_inside"], row["label_outside"]): row["area_mm2"] for row in numbers["interfaces"]}
+    rows = {
+        (row["label_inside"], row["label_outside"]): row["area_mm2"]
+        for row in numbers["interfaces"]
+    }
     assert rows[1, 2] == rows[2, 4] == rows[1, 4] == pytest.approx(SLAB)
-    assert set(rows) == {(1, 2), (1, 4), (2, 4)} | ({(1, -1), (2, -1), (4, -1)} if has_boundary else set())
+    assert set(rows) == {(1, 2), (1, 4), (2, 4)} | (
+        {(1, -1), (2, -1), (4, -1)} if has_boundary else set()
+    )
     assert numbers["n_triangles"] == len(corners)
     # Around each interface its rim: 14 edges of voxels, to which the boundary adds two triangles.
     edges = (0, 3 * 14) if has_boundary else (3 * 14, 0)

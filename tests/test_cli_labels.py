@@ -59,9 +59,23 @@ def test_a_mesh_s_file_keeps_the_table(folder):
 @pytest.mark.deep
 def test_a_label_has_one_colour_in_pictures_page_and_file(folder, tmp_path):
     """Without a table of colours, and with one."""
-    words = ["mesh", folder / "a.nii.gz", "--labels", folder / "l.nii.gz", "--spacing", "8", "--iterations", "0"]
+    words = [
+        "mesh",
+        folder / "a.nii.gz",
+        "--labels",
+        folder / "l.nii.gz",
+        "--spacing",
+        "8",
+        "--iterations",
+        "0",
+    ]
     for more, colour in (([], LABEL_PALETTE[0]), (["--label-names", folder / "t.csv"], "#ff8000")):
-        assert exit_code(*words, *more, "-o", tmp_path / "a.vtu", "--figures", tmp_path / "r", "--force") == 0
+        assert (
+            exit_code(
+                *words, *more, "-o", tmp_path / "a.vtu", "--figures", tmp_path / "r", "--force"
+            )
+            == 0
+        )
         assert exit_code("convert", tmp_path / "a.vtu", tmp_path / "b.vtu", "--force") == 0
         for name in ("a.vtu", "b.vtu"):
             assert tetopt.load_mesh(tmp_path / name).label_table.colours[1] == hex_colour(colour)
@@ -77,7 +91,10 @@ def test_the_table_prints_names(folder, capsys):
     for mesh, more in (("named.vtu", []), ("plain.vtu", ["--label-names", folder / "t.csv"])):
         assert exit_code("quality", folder / mesh, *words, *more, "--json", folder / "q.json") == 0
         assert "1 bright/ball [é]" in capsys.readouterr().out
-        assert numbers_in(folder / "q.json")["label_names"] == {"0": "soft tissue", "1": "bright/ball [é]"}
+        assert numbers_in(folder / "q.json")["label_names"] == {
+            "0": "soft tissue",
+            "1": "bright/ball [é]",
+        }
         (folder / "q.json").unlink()
     assert exit_code("quality", folder / "plain.vtu", *words) == 0
     assert "bright" not in capsys.readouterr().out
@@ -88,9 +105,31 @@ def test_a_label_without_cells_is_named(folder, tmp_path, capsys):
     data = labels.data.copy()
     data[1, 1, 1] = 9.0
     tetopt.save_image(tmp_path / "l.nii.gz", tetopt.Image(data, labels.affine))
-    words = ["mesh", folder / "a.nii.gz", "--labels", tmp_path / "l.nii.gz", "--label-names", folder / "t.csv"]
-    assert exit_code(*words, "--spacing", "8", "--iterations", "0", "--free-volumes", "-o", tmp_path / "a.vtu") == 0
-    assert "no cell has label 9 (spleen), of fewer than 200 voxels in the mesh" in capsys.readouterr().err
+    words = [
+        "mesh",
+        folder / "a.nii.gz",
+        "--labels",
+        tmp_path / "l.nii.gz",
+        "--label-names",
+        folder / "t.csv",
+    ]
+    assert (
+        exit_code(
+            *words,
+            "--spacing",
+            "8",
+            "--iterations",
+            "0",
+            "--free-volumes",
+            "-o",
+            tmp_path / "a.vtu",
+        )
+        == 0
+    )
+    assert (
+        "no cell has label 9 (spleen), of fewer than 200 voxels in the mesh"
+        in capsys.readouterr().err
+    )
 
 
 @pytest.mark.parametrize("mesh", ["named.vtu", "plain.vtu"])
@@ -107,12 +146,18 @@ def test_mappings_and_loads_by_name(folder, tmp_path, mesh, capsys):
     np.testing.assert_array_equal(loaded.cell_data["nu"], np.where(is_bright, 0.3, 0.4))
     assert set(loaded.sets.facets) == {*FACES, INTERFACE}
     assert set(loaded.sets.cells) == {"soft_tissue", "bright_ball_e"}
-    assert exit_code("convert", tmp_path / "a.vtu", tmp_path / "b.inp") == 0  # by what the file keeps
+    # by what the file keeps
+    assert exit_code("convert", tmp_path / "a.vtu", tmp_path / "b.inp") == 0
     text = (tmp_path / "b.inp").read_text()
     assert f"*NSET, NSET={INTERFACE}\n" in text
     assert "ELSET=bright_ball_e\n" in text
     assert "label_1" not in text
-    assert exit_code("fem", tmp_path / "a.vtu", "-o", tmp_path / "s.vtu", "--json", tmp_path / "s.json") == 0
+    assert (
+        exit_code(
+            "fem", tmp_path / "a.vtu", "-o", tmp_path / "s.vtu", "--json", tmp_path / "s.json"
+        )
+        == 0
+    )
     assert INTERFACE in numbers_in(tmp_path / "s.json")["steps"][0]["reactions"]
     assert tetopt.load_mesh(tmp_path / "s.vtu").label_table.names[9] == "spleen"
 
@@ -129,7 +174,10 @@ def test_an_improved_mesh_keeps_the_names(folder, tmp_path, capsys):
 def test_another_table_renames(folder, tmp_path):
     (tmp_path / "other.csv").write_text("label,name\n1,ball\n")
     out = tmp_path / "a.vtu"
-    assert exit_code("convert", folder / "named.vtu", out, "--label-names", tmp_path / "other.csv") == 0
+    assert (
+        exit_code("convert", folder / "named.vtu", out, "--label-names", tmp_path / "other.csv")
+        == 0
+    )
     loaded = tetopt.load_mesh(out)
     assert set(loaded.sets.cells) == {"label_0", "ball"}
     assert set(loaded.sets.facets) == {*FACES, "interface_0_ball"}
@@ -148,7 +196,12 @@ def test_loads_of_a_file_keep_the_set_that_they_name(folder, tmp_path):
 
 def test_surface_and_view_by_name(folder, tmp_path):
     for number, words in enumerate((["1"], ["bright/ball [é]"], ["bright_ball_e"])):
-        assert exit_code("surface", folder / "named.vtu", "-o", tmp_path / f"{number}.stl", "--label", *words) == 0
+        assert (
+            exit_code(
+                "surface", folder / "named.vtu", "-o", tmp_path / f"{number}.stl", "--label", *words
+            )
+            == 0
+        )
     first, *others = ((tmp_path / f"{number}.stl").read_bytes()[80:] for number in range(3))
     assert others == [first, first]
     assert exit_code("view", folder / "named.vtu", "--html", tmp_path / "v.html") == 0
@@ -165,25 +218,41 @@ def test_what_is_refused(folder, tmp_path, capsys):
     assert "labels have no names; give a table of names (--label-names)" in said
     said = refused(capsys, "surface", mesh, "-o", tmp_path / "a.stl", "--label", "spleen")
     assert "no cell has label 9 (spleen); the mesh has 0 (soft tissue), 1 (bright/ball [é])" in said
-    said = refused(capsys, "convert", mesh, out, "--young", "5", "--load", "hold:interface_soft_tissue_bright_ball")
+    said = refused(
+        capsys,
+        "convert",
+        mesh,
+        out,
+        "--young",
+        "5",
+        "--load",
+        "hold:interface_soft_tissue_bright_ball",
+    )
     assert f"did you mean {INTERFACE}?" in said
     other = "hold:interface_bright_ball_e_soft_tissue"
-    assert exit_code("convert", mesh, out, "--young", "5", "--load", other) == 0  # the same nodes from the other side
+    # the same nodes from the other side
+    assert exit_code("convert", mesh, out, "--young", "5", "--load", other) == 0
     assert json.loads(tetopt.load_mesh(out).text("loads")) == [f"hold:{INTERFACE}"]
     out.unlink()
     image, labels = folder / "a.nii.gz", ["--labels", folder / "l.nii.gz"]
     plan = ["mesh", image, "-o", out, "--spacing", "8", "--iterations", "0"]
     assert "--label-names: needs --labels" in refused(capsys, *plan, *names)
-    assert "did you mean spleen" in refused(capsys, *plan, *labels, *names, "--young", "splen=5,*=20")
+    assert "did you mean spleen" in refused(
+        capsys, *plan, *labels, *names, "--young", "splen=5,*=20"
+    )
     assert "--label-names: needs --labels" in refused(capsys, "quality", mesh, *names)
-    assert "--label-names: needs --labels" in refused(capsys, "compare", image, "-o", tmp_path / "c", *names)
+    assert "--label-names: needs --labels" in refused(
+        capsys, "compare", image, "-o", tmp_path / "c", *names
+    )
     (tmp_path / "bad.csv").write_text("label,name\n1,a\n1,b\n")
     for words in (
         ["convert", mesh, out],
         ["fem", mesh, "--young", "1", "--load", "compress:1%"],
         ["view", mesh, "--html", tmp_path / "a.html"],
     ):
-        assert "bad.csv, line 3: label 1" in refused(capsys, *words, "--label-names", tmp_path / "bad.csv")
+        assert "bad.csv, line 3: label 1" in refused(
+            capsys, *words, "--label-names", tmp_path / "bad.csv"
+        )
     assert [path.name for path in tmp_path.iterdir()] == ["bad.csv"]
 
 
@@ -200,11 +269,21 @@ def test_what_is_refused(folder, tmp_path, capsys):
         (["--sets", "interfaces, boundary"], {*FACES, "interface_0_1"}, set()),
         (["--sets", "none", "--set", "dark=below:20"], {"dark_surface"}, {"dark"}),
         (
-            ["--sets", "none", "--young", "5", "--load", "hold:interface_0_1", "--load", "pressure:left:1"],
-            {"interface_0_1", "left"}, set(),
+            [
+                "--sets",
+                "none",
+                "--young",
+                "5",
+                "--load",
+                "hold:interface_0_1",
+                "--load",
+                "pressure:left:1",
+            ],
+            {"interface_0_1", "left"},
+            set(),
         ),
     ],
-)  # fmt: skip
+)
 def test_chosen_sets(folder, tmp_path, capsys, words, facets, cells):
     out, numbers = tmp_path / "a.vtu", tmp_path / "a.json"
     assert exit_code("convert", folder / "plain.vtu", out, *words, "--json", numbers) == 0
@@ -216,7 +295,16 @@ def test_chosen_sets(folder, tmp_path, capsys, words, facets, cells):
         f"on_{each}" for each in facets
     }
     assert "not written as sets" not in capsys.readouterr().err
-    mesh = ["mesh", folder / "a.nii.gz", "--labels", folder / "l.nii.gz", "--spacing", "8", "--iterations", "0"]
+    mesh = [
+        "mesh",
+        folder / "a.nii.gz",
+        "--labels",
+        folder / "l.nii.gz",
+        "--spacing",
+        "8",
+        "--iterations",
+        "0",
+    ]
     assert exit_code(*mesh, "-o", out, "--force", *words) == 0
     assert set(tetopt.load_mesh(out).sets.facets) == facets
     if "--load" in words:
@@ -228,7 +316,10 @@ def test_chosen_sets(folder, tmp_path, capsys, words, facets, cells):
 def test_sets_that_are_none(folder, tmp_path, capsys):
     mesh = folder / "plain.vtu"
     said = refused(capsys, "convert", mesh, tmp_path / "a.vtu", "--sets", "labels,faces")
-    assert '--sets: expected some of labels, interfaces, boundary, or all, or none, got "faces"' in said
+    assert (
+        '--sets: expected some of labels, interfaces, boundary, or all, or none, got "faces"'
+        in said
+    )
     assert "leave out --young, --bins, --set, --sets" in refused(
         capsys, "convert", mesh, tmp_path / "a.stl", "--sets", "all"
     )
@@ -249,7 +340,8 @@ def test_many_interfaces_are_not_written_into_vtu(folder, tmp_path, capsys):
     assert exit_code("convert", tmp_path / "many.vtu", tmp_path / "all.vtu", "--sets", "all") == 0
     every = tetopt.load_mesh(tmp_path / "all.vtu").sets.facets
     assert len(every) > MANY_INTERFACES + 7
-    assert exit_code("convert", tmp_path / "a.vtu", tmp_path / "b.inp", "--young", "1") == 0  # they are there anyway
+    # they are there anyway
+    assert exit_code("convert", tmp_path / "a.vtu", tmp_path / "b.inp", "--young", "1") == 0
     name = list(every)[-1]
     assert f"NSET={name}\n" in (tmp_path / "b.inp").read_text()
     words = ["--young", "1", "--load", f"hold:{name}", "--force"]
@@ -259,20 +351,38 @@ def test_many_interfaces_are_not_written_into_vtu(folder, tmp_path, capsys):
     capsys.readouterr()
     assert exit_code("convert", tmp_path / "a.vtu", tmp_path / "c.inp", *named) == 0
     assert (
-        "\n  2 kPa, nu 0.45: 0, 2, 3, 4, 5, 6, 7, 8 and 51 more\n  5 kPa, nu 0.45: liver\n" in capsys.readouterr().out
+        "\n  2 kPa, nu 0.45: 0, 2, 3, 4, 5, 6, 7, 8 and 51 more\n  5 kPa, nu 0.45: liver\n"
+        in capsys.readouterr().out
     )
     assert exit_code("convert", folder / "named.vtu", tmp_path / "d.inp", "--young", "1+0.1*h") == 0
     assert ", nu 0.45: " not in capsys.readouterr().out  # a label is of many materials
-    assert [each for each in tetopt.load_mesh(tmp_path / "a2.vtu").sets.facets if "interface" in each] == [name]
+    assert [
+        each for each in tetopt.load_mesh(tmp_path / "a2.vtu").sets.facets if "interface" in each
+    ] == [name]
 
 
-def test_one_label_that_is_image_and_labels_is_reported_once_and_without_empty_tables(tmp_path, capsys):
+def test_one_label_that_is_image_and_labels_is_reported_once_and_without_empty_tables(
+    tmp_path, capsys
+):
     path, mesh = tmp_path / "ball.nii", tmp_path / "a.vtu"
     ball = (np.linalg.norm(np.indices((16, 16, 16)) - 7.5, axis=0) < 5.0).astype(np.uint8)
     image = nibabel.Nifti1Image(ball, np.eye(4))
     image.header["xyzt_units"] = 5
     nibabel.save(image, path)
-    words = ["mesh", path, "--labels", path, "--background", "0", "--nodes", "400", "--iterations", "2", "-o", mesh]
+    words = [
+        "mesh",
+        path,
+        "--labels",
+        path,
+        "--background",
+        "0",
+        "--nodes",
+        "400",
+        "--iterations",
+        "2",
+        "-o",
+        mesh,
+    ]
     assert exit_code(*words) == 0
     out, err = capsys.readouterr()
     assert err.count("its unit of length has the unknown code 5") == 1
@@ -284,7 +394,11 @@ def test_one_label_that_is_image_and_labels_is_reported_once_and_without_empty_t
         assert "the foreground's surface" in text
         assert "the mask's surface" not in text
     counts = [
-        [line.split()[-1] for line in text.splitlines() if line.startswith("cells without a voxel centre")]
+        [
+            line.split()[-1]
+            for line in text.splitlines()
+            if line.startswith("cells without a voxel centre")
+        ]
         for text in (out, again)
     ]
     assert counts[0] == counts[1] != []

@@ -1,4 +1,6 @@
-"""A mesh built within a mask: no voxel outside counts, in any command and in Python, whatever is passed with it."""
+"""A mesh built within a mask: no voxel outside counts, in any command and in Python, whatever is
+passed with it.
+"""
 
 import re
 
@@ -20,12 +22,25 @@ def organ(tmp_path_factory):
     folder = tmp_path_factory.mktemp("organ")
     place = np.indices((20, 18, 16)) - np.array([9.5, 8.5, 7.5])[:, None, None, None]
     inside = (place**2).sum(axis=0) <= 36.0
-    image = tetopt.Image(np.where(inside, 700.0 + 100.0 * place[0], -500.0), np.diag([1.0, 1.0, 1.5, 1.0]))
+    image = tetopt.Image(
+        np.where(inside, 700.0 + 100.0 * place[0], -500.0), np.diag([1.0, 1.0, 1.5, 1.0])
+    )
     tetopt.save_image(folder / "ct.nii.gz", image)
     tetopt.save_image(folder / "m.nii.gz", tetopt.Image(1.0 * inside, image.affine))
     tetopt.save_image(folder / "l.nii.gz", tetopt.Image(1.0 + inside, image.affine))
     tetopt.save_image(folder / "t2.nii.gz", tetopt.Image(2.0 * image.data, image.affine))
-    mesh = ["mesh", folder / "ct.nii.gz", "--nodes", "90", "--iterations", "1", "--young", LAW, "--average", "mean"]
+    mesh = [
+        "mesh",
+        folder / "ct.nii.gz",
+        "--nodes",
+        "90",
+        "--iterations",
+        "1",
+        "--young",
+        LAW,
+        "--average",
+        "mean",
+    ]
     for name, region in (("a", ["--mask", folder / "m.nii.gz"]), ("b", ["--background", "-400"])):
         words = [*mesh, *region, "-o", folder / f"{name}.vtu", "--json", folder / f"{name}.json"]
         assert exit_code(*words, "--figures", folder / name) in (0, 1)
@@ -39,7 +54,9 @@ def moduli(path):
 
 @pytest.mark.parametrize("name", ["a", "b"])
 def test_no_voxel_outside_the_mask_counts(organ, tmp_path, name):
-    """Moduli are the run's to the last bit, also after formats that keep the mask, and of results."""
+    """Moduli are the run's to the last bit, also after formats that keep the mask, and of
+    results.
+    """
     expected = moduli(organ / f"{name}.vtu")
     law = ["--image", organ / "ct.nii.gz", "--young", LAW, "--average", "mean"]
     first = organ / f"{name}.vtu"
@@ -63,12 +80,22 @@ def test_a_content_takes_its_mask_along(organ, tmp_path):
     loaded = tetopt.load_mesh(organ / "a.vtu")
     for what in (tetopt.content(image, mask=mask), tetopt.content([image, labels], labels, mask)):
         model = tetopt.build_model(loaded.mesh, what, young=LAW, average="mean")
-        np.testing.assert_array_equal(np.sort(model.materials.young[model.materials.of_cell]), moduli(organ / "a.vtu"))
+        np.testing.assert_array_equal(
+            np.sort(model.materials.young[model.materials.of_cell]), moduli(organ / "a.vtu")
+        )
         assert model.sets.facets.keys() == loaded.sets.facets.keys()
         fields = tetopt.cell_fields(loaded.mesh, what)
         np.testing.assert_array_equal(fields["mean"], loaded.cell_data["mean"])
     tetopt.save_model(tmp_path / "m.vtu", model)  # knows it, too
-    words = ["convert", tmp_path / "m.vtu", tmp_path / "n.vtu", "--image", organ / "ct.nii.gz", "--young", LAW]
+    words = [
+        "convert",
+        tmp_path / "m.vtu",
+        tmp_path / "n.vtu",
+        "--image",
+        organ / "ct.nii.gz",
+        "--young",
+        LAW,
+    ]
     assert exit_code(*words, "--average", "mean") == 0
     np.testing.assert_array_equal(moduli(tmp_path / "n.vtu"), moduli(organ / "a.vtu"))
     classes = tetopt.segment(what, loaded.mesh, 2)
@@ -76,20 +103,37 @@ def test_a_content_takes_its_mask_along(organ, tmp_path):
 
 
 def test_other_masks_labels_and_images(organ, tmp_path, capsys):
-    """Another mask is warned of; labels count within the mask; a mesh without it needs it, if it knows that."""
+    """Another mask is warned of; labels count within the mask; a mesh without it needs it, if it
+    knows that.
+    """
     image = tetopt.load_image(organ / "ct.nii.gz")
-    tetopt.save_image(tmp_path / "other.nii.gz", tetopt.Image(1.0 * (image.data > 800.0), image.affine))
+    tetopt.save_image(
+        tmp_path / "other.nii.gz", tetopt.Image(1.0 * (image.data > 800.0), image.affine)
+    )
     convert = ["convert", organ / "a.vtu", tmp_path / "a.vtu", "--force", "--young", LAW]
     assert exit_code(*convert, "--image", organ / "ct.nii.gz", "--mask", organ / "m.nii.gz") == 0
     assert "differs" not in capsys.readouterr().err
-    assert exit_code(*convert, "--image", organ / "ct.nii.gz", "--mask", tmp_path / "other.nii.gz") == 0
+    assert (
+        exit_code(*convert, "--image", organ / "ct.nii.gz", "--mask", tmp_path / "other.nii.gz")
+        == 0
+    )
     assert "other.nii.gz: differs in " in capsys.readouterr().err
     assert exit_code(*convert, "--image", organ / "t2.nii.gz") == 0
     again = tetopt.load_mesh(tmp_path / "a.vtu")
-    np.testing.assert_array_equal(again.cell_data["mean"], 2.0 * tetopt.load_mesh(organ / "a.vtu").cell_data["mean"])
+    np.testing.assert_array_equal(
+        again.cell_data["mean"], 2.0 * tetopt.load_mesh(organ / "a.vtu").cell_data["mean"]
+    )
     assert again.text("image") == "t2.nii.gz"
     assert MASK_TEXT in again.field_data
-    labels = ["convert", organ / "a.vtu", tmp_path / "l.vtu", "--labels", organ / "l.nii.gz", "--young", "1=1,2=9"]
+    labels = [
+        "convert",
+        organ / "a.vtu",
+        tmp_path / "l.vtu",
+        "--labels",
+        organ / "l.nii.gz",
+        "--young",
+        "1=1,2=9",
+    ]
     assert exit_code(*labels) == 0
     assert set(tetopt.load_mesh(tmp_path / "l.vtu").cell_data["label"].tolist()) == {2}
     what = tetopt.content(image, mask=tetopt.load_image(tmp_path / "other.nii.gz"))
@@ -105,22 +149,40 @@ def test_other_masks_labels_and_images(organ, tmp_path, capsys):
     capsys.readouterr()
     with_image = ["--image", organ / "ct.nii.gz"]
     for words in (
-        ["convert", tmp_path / "lost.vtu", tmp_path / "no.vtu"], ["quality", tmp_path / "lost.vtu"],
-        ["fem", tmp_path / "lost.vtu"], ["view", tmp_path / "lost.vtu", "--html", tmp_path / "no.html"],
+        ["convert", tmp_path / "lost.vtu", tmp_path / "no.vtu"],
+        ["quality", tmp_path / "lost.vtu"],
+        ["fem", tmp_path / "lost.vtu"],
+        ["view", tmp_path / "lost.vtu", "--html", tmp_path / "no.html"],
         ["segment", tmp_path / "lost.vtu", "-o", tmp_path / "no.nii"],
         ["mesh", organ / "ct.nii.gz", "--start", tmp_path / "lost.vtu", "-o", tmp_path / "no.vtu"],
-    ):  # fmt: skip
+    ):
         assert exit_code(*words, *([] if words[0] == "mesh" else with_image)) == 2
-        assert "the mesh was built within the mask m.nii.gz, which its file does not contain" in capsys.readouterr().err
+        assert (
+            "the mesh was built within the mask m.nii.gz, which its file does not contain"
+            in capsys.readouterr().err
+        )
     with pytest.raises(tetopt.InputError, match="pass `mask`"):
         tetopt.build_model(tetopt.load_mesh(tmp_path / "lost.vtu"), image, young=LAW)
-    words = ["fem", tmp_path / "lost.vtu", *with_image, "--mask", organ / "m.nii.gz", "--young", LAW]
-    assert exit_code(*words, "--average", "mean", "--load", "compress:1%", "-o", tmp_path / "s.vtu") == 0
+    words = [
+        "fem",
+        tmp_path / "lost.vtu",
+        *with_image,
+        "--mask",
+        organ / "m.nii.gz",
+        "--young",
+        LAW,
+    ]
+    assert (
+        exit_code(*words, "--average", "mean", "--load", "compress:1%", "-o", tmp_path / "s.vtu")
+        == 0
+    )
     np.testing.assert_array_equal(moduli(tmp_path / "s.vtu"), moduli(organ / "a.vtu"))
 
 
 def test_an_image_in_another_place(organ, tmp_path, capsys):
-    """Commands that take voxels of it refuse; an improved mesh is warned of, since it may be registered."""
+    """Commands that take voxels of it refuse; an improved mesh is warned of, since it may be
+    registered.
+    """
     image = tetopt.load_image(organ / "ct.nii.gz")
     affine = image.affine.copy()
     affine[0, 3] += 3.0 * image.spacing[0]
@@ -130,13 +192,17 @@ def test_an_image_in_another_place(organ, tmp_path, capsys):
     far = tmp_path / "far.nii.gz"
     tetopt.save_image(far, tetopt.Image(image.data, affine))
     for words in (
-        ["quality", mesh], ["segment", mesh, "-o", tmp_path / "s.nii"], ["view", mesh, "--html", tmp_path / "v.html"],
-        ["convert", mesh, tmp_path / "c.vtu"], ["fem", mesh],
-    ):  # fmt: skip
+        ["quality", mesh],
+        ["segment", mesh, "-o", tmp_path / "s.nii"],
+        ["view", mesh, "--html", tmp_path / "v.html"],
+        ["convert", mesh, tmp_path / "c.vtu"],
+        ["fem", mesh],
+    ):
         assert exit_code(*words, "--image", moved) == 2
         assert "moved.nii.gz: expected the box of" in capsys.readouterr().err
         if words[0] != "quality":
-            assert exit_code(*words, "--image", far, "--mask", organ / "m.nii.gz") == 2  # before it reads the mask
+            # before it reads the mask
+            assert exit_code(*words, "--image", far, "--mask", organ / "m.nii.gz") == 2
             assert "far.nii.gz: expected the box of" in capsys.readouterr().err
     assert exit_code("quality", mesh, "--image", moved, "--registered") == 0
     assert "was built from a different image, not" in capsys.readouterr().err
@@ -146,7 +212,9 @@ def test_an_image_in_another_place(organ, tmp_path, capsys):
 
 
 def test_a_mask_for_a_mesh_of_the_whole_box(organ, tmp_path, capsys):
-    """Its cells are not those of the mask: told, with the Dice of the whole mesh, by commands and in Python."""
+    """Its cells are not those of the mask: told, with the Dice of the whole mesh, by commands
+    and in Python.
+    """
     image, whole = tetopt.load_image(organ / "ct.nii.gz"), tmp_path / "w.vtu"
     tetopt.save_mesh(whole, tetopt.lattice_mesh(image, nodes=150))
     corner = np.indices(image.shape).sum(axis=0) < 8
@@ -157,16 +225,31 @@ def test_a_mask_for_a_mesh_of_the_whole_box(organ, tmp_path, capsys):
     said = " ".join(capsys.readouterr().err.split())
     assert re.search("overlap with a Dice of only 0.0[0-9]+, .* built within another mask", said)
     for more in (words, words[2:]):  # on the voxels of image and labels, or of labels alone
-        assert exit_code("convert", whole, tmp_path / "d.vtu", *more, "--labels", organ / "l.nii.gz", "--force") == 0
+        assert (
+            exit_code(
+                "convert",
+                whole,
+                tmp_path / "d.vtu",
+                *more,
+                "--labels",
+                organ / "l.nii.gz",
+                "--force",
+            )
+            == 0
+        )
         assert capsys.readouterr().err.count("overlap with a Dice") == 1
     assert exit_code("quality", whole, *words, "--check", "--json", tmp_path / "q.json") == 1
     numbers = numbers_in(tmp_path / "q.json")
     assert set(numbers["violated"]) == {"mask"}  # and not "box", which is the image's
     assert f"Dice of only {numbers['mask']['dice']:.3f}" in numbers["violated"]["mask"]
     assert numbers["fit"]["n_voxels"] == image.data.size
-    tetopt.save_mesh(tmp_path / "side.vtu", tetopt.lattice_mesh(image.box((17, 0, 0), image.shape), nodes=50))
+    tetopt.save_mesh(
+        tmp_path / "side.vtu", tetopt.lattice_mesh(image.box((17, 0, 0), image.shape), nodes=50)
+    )
     assert exit_code("quality", tmp_path / "side.vtu", *words) == 2
-    assert "side.vtu: the mesh lies outside the mask and its surroundings" in capsys.readouterr().err
+    assert (
+        "side.vtu: the mesh lies outside the mask and its surroundings" in capsys.readouterr().err
+    )
     what = tetopt.content(image, mask=tetopt.Image(1.0 * corner, image.affine))
     with pytest.warns(UserWarning, match="within none"):
         tetopt.build_model(tetopt.load_mesh(whole), what, young=LAW)
@@ -188,7 +271,16 @@ def test_python_knows_the_place_of_a_mesh_file_s_image(organ):
 
 def test_a_check_without_the_image_judges_angles(tmp_path, capsys):
     tetopt.save_image(tmp_path / "a.nii.gz", tetopt.load_phantom("sphere").image(voxel_mm=8))
-    words = ["mesh", tmp_path / "a.nii.gz", "-o", tmp_path / "a.vtu", "--nodes", 60, "--iterations", 0]
+    words = [
+        "mesh",
+        tmp_path / "a.nii.gz",
+        "-o",
+        tmp_path / "a.vtu",
+        "--nodes",
+        60,
+        "--iterations",
+        0,
+    ]
     assert exit_code(*words, "--min-dihedral", 60) == 1
     assert exit_code("quality", tmp_path / "a.vtu", "--check") == 1
     assert "requirements not met: min_dihedral" in capsys.readouterr().out
@@ -199,15 +291,37 @@ def test_a_check_without_the_image_judges_angles(tmp_path, capsys):
 
 @pytest.mark.parametrize("command", ["quality", "view"])
 def test_options_of_an_image_need_one(organ, tmp_path, capsys, command):
-    words = [command, organ / "a.vtu", *(["--html", tmp_path / "v.html"] if command == "view" else [])]
+    words = [
+        command,
+        organ / "a.vtu",
+        *(["--html", tmp_path / "v.html"] if command == "view" else []),
+    ]
     for options in (["--mask", organ / "m.nii.gz"], ["--registered"], ["--crop", "1:,:,:"]):
         assert exit_code(*words, *options) == 2
         assert f"{options[0]}: needs --image" in capsys.readouterr().err
 
 
 def test_a_mesh_within_a_mask_is_improved_within_it(organ, tmp_path):
-    words = ["mesh", organ / "ct.nii.gz", "--start", organ / "a.vtu", "--iterations", "0", "--young", LAW]
-    out = ["--average", "mean", "-o", tmp_path / "a.vtu", "--json", tmp_path / "a.json", "--figures", tmp_path]
+    words = [
+        "mesh",
+        organ / "ct.nii.gz",
+        "--start",
+        organ / "a.vtu",
+        "--iterations",
+        "0",
+        "--young",
+        LAW,
+    ]
+    out = [
+        "--average",
+        "mean",
+        "-o",
+        tmp_path / "a.vtu",
+        "--json",
+        tmp_path / "a.json",
+        "--figures",
+        tmp_path,
+    ]
     assert exit_code(*words, *out) == 0
     np.testing.assert_array_equal(moduli(tmp_path / "a.vtu"), moduli(organ / "a.vtu"))
     one, other = (numbers_in(folder / "a.json")["mask"] for folder in (tmp_path, organ))
@@ -217,14 +331,23 @@ def test_a_mesh_within_a_mask_is_improved_within_it(organ, tmp_path):
 
 
 def test_numbers_are_of_the_voxels_that_are_meshed(organ, tmp_path):
-    """One unexplained variance, of the voxels in cells, and an image's properties without what is outside."""
+    """One unexplained variance, of the voxels in cells, and an image's properties without what
+    is outside.
+    """
     numbers, fields = numbers_in(organ / "a.json"), tetopt.load_mesh(organ / "a.vtu").cell_data
-    h = np.float64(tetopt.load_image(organ / "ct.nii.gz").data)[tetopt.load_image(organ / "m.nii.gz").data > 0.0]
+    h = np.float64(tetopt.load_image(organ / "ct.nii.gz").data)[
+        tetopt.load_image(organ / "m.nii.gz").data > 0.0
+    ]
     expected = {
-        "mean": h.mean(), "min": h.min(), "max": h.max(), "volume_mm": 1.5 * h.size,
+        "mean": h.mean(),
+        "min": h.min(),
+        "max": h.max(),
+        "volume_mm": 1.5 * h.size,
         "total_variation": 1.5 * h.size * h.var(),
-    }  # fmt: skip
-    assert {name: numbers["image_properties"][name] for name in expected} == pytest.approx(expected, rel=1e-6)
+    }
+    assert {name: numbers["image_properties"][name] for name in expected} == pytest.approx(
+        expected, rel=1e-6
+    )
     assert numbers["image_properties"]["shape"] == [20, 18, 16]
 
     def fraction(fields):
@@ -232,7 +355,9 @@ def test_numbers_are_of_the_voxels_that_are_meshed(organ, tmp_path):
         within = (n * variance).sum()
         return within / (within + (n * (mean - np.average(mean, weights=n)) ** 2).sum())
 
-    assert numbers["energies"]["E_D_fraction_of_variance"] == pytest.approx(fraction(fields), rel=1e-6)
+    assert numbers["energies"]["E_D_fraction_of_variance"] == pytest.approx(
+        fraction(fields), rel=1e-6
+    )
     words = ["--image", organ / "ct.nii.gz", "--json", tmp_path / "q.json", "--force"]
     for mask in ([], ["--mask", organ / "m.nii.gz"]):
         assert exit_code("quality", organ / "a.vtu", *words, *mask) in (0, 1)
@@ -266,9 +391,12 @@ def test_pictures_have_the_grey_window_of_the_voxels_in_the_mask(organ):
 def test_the_image_before_the_mesh_or_as_an_option(organ, tmp_path, command, capsys):
     image, mesh = organ / "ct.nii.gz", organ / "a.vtu"
     more = {
-        "fem": ["--load", "compress:1%"], "segment": ["-o", tmp_path / "a.nii", "--force"],
-        "view": ["--html", tmp_path / "a.html", "--force"], "convert": [tmp_path / "a.vtu", "--force"], "quality": [],
-    }[command]  # fmt: skip
+        "fem": ["--load", "compress:1%"],
+        "segment": ["-o", tmp_path / "a.nii", "--force"],
+        "view": ["--html", tmp_path / "a.html", "--force"],
+        "convert": [tmp_path / "a.vtu", "--force"],
+        "quality": [],
+    }[command]
     printed = []
     for words in ([image, mesh, *more], [mesh, *more, "--image", image]):
         assert exit_code(command, *words) in (0, 1)
@@ -277,4 +405,7 @@ def test_the_image_before_the_mesh_or_as_an_option(organ, tmp_path, command, cap
     assert exit_code(command, image, mesh, *more, "--image", image) == 2
     assert "expected MESH and one image (--image), got 3 files" in capsys.readouterr().err
     assert exit_code(command, mesh, mesh, *more) == 2
-    assert f"{mesh}: expected an image beside {mesh}, got a mesh; give one mesh at a time" in capsys.readouterr().err
+    assert (
+        f"{mesh}: expected an image beside {mesh}, got a mesh; give one mesh at a time"
+        in capsys.readouterr().err
+    )

@@ -1,4 +1,6 @@
-"""Labels merged into tissues, as a user types it: in a run, its files, a cohort and the measures of a mesh."""
+"""Labels merged into tissues, as a user types it: in a run, its files, a cohort and the measures
+of a mesh.
+"""
 
 import json
 
@@ -24,7 +26,17 @@ def folder(tmp_path):
 
 def words(folder, *more, image="a.nii.gz"):
     """`tetopt mesh` of the labels as a lattice."""
-    lattice = ["--spacing", "4", "--iterations", "0", "-o", folder / "m.vtu", "--json", folder / "m.json", "--force"]
+    lattice = [
+        "--spacing",
+        "4",
+        "--iterations",
+        "0",
+        "-o",
+        folder / "m.vtu",
+        "--json",
+        folder / "m.json",
+        "--force",
+    ]
     return ["mesh", folder / image, "--labels", folder / "l.nii.gz", *lattice, *more]
 
 
@@ -40,7 +52,10 @@ def test_groups_reach_every_file(folder, capsys):
     merge = "white=2,41,16,85; grey=3,42; fluid=24; 7:rest=*"
     assert exit_code(*words(folder, "--merge", merge)) == 0
     told = " ".join(capsys.readouterr().err.split())
-    assert "merged: 1 label into 0, 4 labels into 1 (white), 2 labels into 2 (grey), 1 label into 3 (fluid)" in told
+    assert (
+        "merged: 1 label into 0, 4 labels into 1 (white), 2 labels into 2 (grey), 1 label into 3 "
+        "(fluid)" in told
+    )
     assert "3 labels into 7 (rest)" in told
     loaded = tetopt.load_mesh(folder / "m.vtu")
     assert set(loaded.cell_data["label"]) == {0, 1, 2, 3, 7}
@@ -62,7 +77,15 @@ def test_quality_merges_the_same_labels_and_takes_merged_ones(folder, capsys):
     merged = tetopt.merge_labels(tetopt.load_image(folder / "l.nii.gz"), "synthseg").labels
     tetopt.save_image(folder / "five.nii.gz", merged)
     for labels in ("l.nii.gz", "five.nii.gz"):
-        given = ["--image", folder / "a.nii.gz", "--labels", folder / labels, "--json", folder / "q.json", "--force"]
+        given = [
+            "--image",
+            folder / "a.nii.gz",
+            "--labels",
+            folder / labels,
+            "--json",
+            folder / "q.json",
+            "--force",
+        ]
         assert exit_code("quality", folder / "m.vtu", *given) == 0
         assert "1 white" in capsys.readouterr().out
         numbers = numbers_in(folder / "q.json")
@@ -71,7 +94,12 @@ def test_quality_merges_the_same_labels_and_takes_merged_ones(folder, capsys):
 
 
 def test_an_image_may_be_its_own_labels(folder, capsys):
-    assert exit_code(*words(folder, "--merge", "synthseg", "--figures", folder / "figs", image="l.nii.gz")) == 0
+    assert (
+        exit_code(
+            *words(folder, "--merge", "synthseg", "--figures", folder / "figs", image="l.nii.gz")
+        )
+        == 0
+    )
     assert "the image is also the label image" in capsys.readouterr().err
     loaded = tetopt.load_mesh(folder / "m.vtu")
     assert loaded.cell_data["mean"].max() <= 5.0  # of tissues, not of the file's numbers
@@ -79,10 +107,15 @@ def test_an_image_may_be_its_own_labels(folder, capsys):
 
 
 def test_labels_that_share_a_name(folder, capsys):
-    (folder / "t.csv").write_text("label,name\n2,white\n41,white\n16,white\n3,grey\n42,grey\n24,csf\n")
+    (folder / "t.csv").write_text(
+        "label,name\n2,white\n41,white\n16,white\n3,grey\n42,grey\n24,csf\n"
+    )
     assert exit_code(*words(folder, "--label-names", folder / "t.csv")) == 0
     said = capsys.readouterr().err
-    assert "merged labels with the same name: 16 into 2 (white), 41 into 2 (white), 42 into 3 (grey)\n" in said
+    assert (
+        "merged labels with the same name: 16 into 2 (white), 41 into 2 (white), 42 into 3 (grey)\n"
+        in said
+    )
     loaded = tetopt.load_mesh(folder / "m.vtu")
     assert set(loaded.cell_data["label"]) == {0, 2, 3, 24, 85, 502, 515, 516}
     assert loaded.label_table.names == {2: "white", 3: "grey", 24: "csf"}
@@ -91,10 +124,21 @@ def test_labels_that_share_a_name(folder, capsys):
 
 def test_groups_may_list_names_of_the_table(folder):
     (folder / "t.csv").write_text("label,name\n2,L white\n41,R white\n3,grey\n42,grey\n24,csf\n")
-    given = ["--merge", "white=L white, r white; grey=grey; rest=*", "--label-names", folder / "t.csv"]
+    given = [
+        "--merge",
+        "white=L white, r white; grey=grey; rest=*",
+        "--label-names",
+        folder / "t.csv",
+    ]
     assert exit_code(*words(folder, *given)) == 0
     merged = numbers_in(folder / "m.json")["inputs"]["merged"]
-    assert {old: merged[old] for old in ("2", "41", "3", "42", "24")} == {"2": 1, "41": 1, "3": 2, "42": 2, "24": 3}
+    assert {old: merged[old] for old in ("2", "41", "3", "42", "24")} == {
+        "2": 1,
+        "41": 1,
+        "3": 2,
+        "42": 2,
+        "24": 3,
+    }
 
 
 def test_a_group_without_a_label_is_told_but_not_of_a_table(folder, capsys):
@@ -102,7 +146,9 @@ def test_a_group_without_a_label_is_told_but_not_of_a_table(folder, capsys):
     assert "warning: --merge:" in (said := capsys.readouterr().err)
     assert "has no label for blood" in said
     labels = tetopt.load_image(folder / "l.nii.gz")
-    tetopt.save_image(folder / "l.nii.gz", tetopt.Image(np.where(labels.data > 500, 511, labels.data)))
+    tetopt.save_image(
+        folder / "l.nii.gz", tetopt.Image(np.where(labels.data > 500, 511, labels.data))
+    )
     assert exit_code(*words(folder, "--merge", "synthseg")) == 0
     assert "1 label into 5 (soft)" in (said := capsys.readouterr().err)
     assert "has no label for" not in said
@@ -110,15 +156,18 @@ def test_a_group_without_a_label_is_told_but_not_of_a_table(folder, capsys):
 
 def test_labels_beyond_the_image_are_told_unless_left_out_on_purpose(folder, capsys):
     image = tetopt.load_image(folder / "a.nii.gz")
-    labels = np.pad(tetopt.load_image(folder / "l.nii.gz").data, ((0, 2), (0, 0), (0, 0)), constant_values=99)
+    labels = np.pad(
+        tetopt.load_image(folder / "l.nii.gz").data, ((0, 2), (0, 0), (0, 0)), constant_values=99
+    )
     tetopt.save_image(folder / "l.nii.gz", tetopt.Image(labels, image.affine))
     tetopt.save_image(folder / "whole.nii.gz", tetopt.Image(labels, image.affine))
     said = f"l.nii.gz: labels without a voxel in the image: 99 ({2 * labels[0].size} voxels)"
     crop = f":{len(labels) - 2},:,:"
     for more, name, is_told in (
-        ([], "a.nii.gz", True), (["--merge", "white=99; rest=*"], "a.nii.gz", False),
+        ([], "a.nii.gz", True),
+        (["--merge", "white=99; rest=*"], "a.nii.gz", False),
         (["--crop", crop], "whole.nii.gz", False),
-    ):  # fmt: skip
+    ):
         assert exit_code(*words(folder, *more, image=name)) == 0
         assert (said in capsys.readouterr().err.replace("\n  ", " ")) == is_told
     assert exit_code(*words(folder)) == 0
@@ -132,8 +181,12 @@ def test_what_cannot_be_merged(folder, capsys):
     assert "--merge: needs --labels" in refused(
         capsys, "mesh", folder / "a.nii.gz", "-o", folder / "x.vtu", "--merge", "aseg"
     )
-    assert "l.nii.gz: --merge: expected each label" in refused(capsys, *words(folder, "--merge", "white=2,41"))
-    assert "got no group for 502, 515, 516" in refused(capsys, *words(folder, "--merge", "a=2,3,16,24,41,42,85"))
+    assert "l.nii.gz: --merge: expected each label" in refused(
+        capsys, *words(folder, "--merge", "white=2,41")
+    )
+    assert "got no group for 502, 515, 516" in refused(
+        capsys, *words(folder, "--merge", "a=2,3,16,24,41,42,85")
+    )
     assert 'got "asge"' in refused(capsys, *words(folder, "--merge", "asge"))
     assert "gone.toml" in refused(capsys, *words(folder, "--merge", folder / "gone.toml"))
     assert not (folder / "x.vtu").exists()
@@ -145,8 +198,14 @@ def test_a_cohort_merges_by_an_option_and_by_a_column(folder, scheduler):
         "subject\timage\tlabels\tmerge\n1\ta.nii.gz\tl.nii.gz\tn/a\n2\ta.nii.gz\tl.nii.gz\tg.toml\n"
     )
     lattice = ["--spacing", "4", "--iterations", "0", "--scheduler", scheduler]
-    assert exit_code("cohort", folder / "s.tsv", "-o", folder / "out", "--merge", "synthseg", *lattice) == 0
-    runs = {path.parent.name: json.loads(path.read_text()) for path in sorted((folder / "out").rglob("*_mesh.json"))}
+    assert (
+        exit_code("cohort", folder / "s.tsv", "-o", folder / "out", "--merge", "synthseg", *lattice)
+        == 0
+    )
+    runs = {
+        path.parent.name: json.loads(path.read_text())
+        for path in sorted((folder / "out").rglob("*_mesh.json"))
+    }
     names = [run["label_names"] for run in runs.values()]
     assert names[0]["4"] == "bone"
     assert names[1] == {"1": "white", "2": "rest"}

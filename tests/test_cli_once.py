@@ -18,4 +18,6 @@ def test_help_and_refusals(capsys):
     assert exit_code("mesh", "--help") == 0
     assert "--nodes" in capsys.readouterr().out
     assert exit_code("mesh", "no.nii", "-o", "a.vtu", "--nodes", "many") == 2
-    assert capsys.readouterr().err.startswith("tetopt: --nodes: expected a whole number, got 'many'")
+    assert capsys.readouterr().err.startswith(
+        "tetopt: --nodes: expected a whole number, got 'many'"
+    )

@@ -26,7 +26,9 @@ def folder(tmp_path):
         tetopt.save_image(tmp_path / f"{name}.nii.gz", tetopt.Image(row))
     nibabel.save(nibabel.Nifti1Image(np.moveaxis(ROWS, 0, 3), np.eye(4)), tmp_path / "both.nii.gz")
     bytes_ = np.rint(255.0 * ROWS).astype(np.uint8)
-    nibabel.save(nibabel.Nifti1Image(np.moveaxis(bytes_, 0, 3), np.eye(4)), tmp_path / "bytes.nii.gz")
+    nibabel.save(
+        nibabel.Nifti1Image(np.moveaxis(bytes_, 0, 3), np.eye(4)), tmp_path / "bytes.nii.gz"
+    )
     labels = np.concatenate([1.0 - ROWS.sum(axis=0, keepdims=True), ROWS]).argmax(axis=0)
     tetopt.save_image(tmp_path / "l.nii.gz", tetopt.Image(1.0 * labels))
     return tmp_path
@@ -55,15 +57,29 @@ def test_files_name_the_labels_and_quality_takes_their_largest(folder, capsys):
     assert {"grey", "white"} <= set(loaded.sets.cells)
     assert numbers["inputs"]["tissues"] == ["grey.nii.gz", "white.nii.gz"]
     assert set(numbers["inputs"]["sha256"]) == {"grey.nii.gz", "white.nii.gz"}
-    assert [name for name, _ in numbers["request"]["files"]["tissues"]] == ["grey.nii.gz", "white.nii.gz"]
-    given = ["--image", folder / "a.nii.gz", "--labels", folder / "l.nii.gz", "--json", folder / "q.json", "--check"]
+    assert [name for name, _ in numbers["request"]["files"]["tissues"]] == [
+        "grey.nii.gz",
+        "white.nii.gz",
+    ]
+    given = [
+        "--image",
+        folder / "a.nii.gz",
+        "--labels",
+        folder / "l.nii.gz",
+        "--json",
+        folder / "q.json",
+        "--check",
+    ]
     assert exit_code("quality", folder / "m.vtu", *given) == 0
     assert numbers_in(folder / "q.json")["labels"] == numbers["labels"]
 
 
 def test_files_volumes_of_one_and_their_labels_are_the_same_mesh(folder):
-    given = {"m": ["--tissues", both(folder)], "n": ["--tissues", folder / "both.nii.gz"],
-             "o": ["--labels", folder / "l.nii.gz"]}  # fmt: skip
+    given = {
+        "m": ["--tissues", both(folder)],
+        "n": ["--tissues", folder / "both.nii.gz"],
+        "o": ["--labels", folder / "l.nii.gz"],
+    }
     for name, more in given.items():
         assert exit_code(*words(folder, *more, name=name, size=FEW)) == 0
     first, second, third = (tetopt.load_mesh(folder / f"{name}.vtu") for name in given)
@@ -84,7 +100,10 @@ def test_volumes_and_names_as_they_are_given(folder):
 
 
 def test_bytes_and_other_grids_are_told(folder, capsys):
-    assert exit_code(*words(folder, "--tissues", folder / "bytes.nii.gz", "--crop", "0:16,0:16,1:16")) == 0
+    assert (
+        exit_code(*words(folder, "--tissues", folder / "bytes.nii.gz", "--crop", "0:16,0:16,1:16"))
+        == 0
+    )
     assert capsys.readouterr().err.count("read as probabilities times 255") == 2
     fine = tetopt.Image(ROWS[0], np.diag([1.0, 1.0, 1.1, 1.0]))
     tetopt.save_image(folder / "grey.nii.gz", fine)
@@ -96,7 +115,10 @@ def test_bytes_and_other_grids_are_told(folder, capsys):
 
 def test_the_image_may_be_one_of_them(folder, capsys):
     assert exit_code(*words(folder, "--tissues", both(folder), image="white.nii.gz")) == 0
-    assert "the image is also one of the tissues: only the tissues are used\n" in capsys.readouterr().err
+    assert (
+        "the image is also one of the tissues: only the tissues are used\n"
+        in capsys.readouterr().err
+    )
     assert numbers_in(folder / "m.json")["inputs"]["weights"] == [0.0]
 
 
@@ -104,10 +126,20 @@ def test_what_cannot_be(folder, capfd):
     def refused(match, *more):
         assert_refused(capfd, words(folder, *more), match)
 
-    refused("--labels and --tissues: give only one", "--labels", folder / "l.nii.gz", "--tissues", both(folder))
+    refused(
+        "--labels and --tissues: give only one",
+        "--labels",
+        folder / "l.nii.gz",
+        "--tissues",
+        both(folder),
+    )
     refused("--merge: needs --labels", "--tissues", both(folder), "--merge", "aseg")
     refused("--label-weight: needs --labels", "--label-weight", "2")
-    refused("--tissues: expected different files", "--tissues", f"{folder / 'grey.nii.gz'},{folder / 'grey.nii.gz'}")
+    refused(
+        "--tissues: expected different files",
+        "--tissues",
+        f"{folder / 'grey.nii.gz'},{folder / 'grey.nii.gz'}",
+    )
     refused("--tissues: expected different files", "--tissues", f"{folder / 'grey.nii.gz'},")
     refused("gone.nii.gz", "--tissues", folder / "gone.nii.gz")
     parts = words(folder, "--tissues", both(folder), "--parts", "2", size=FEW)
@@ -116,14 +148,23 @@ def test_what_cannot_be(folder, capfd):
         (100.0 * ROWS[0], "grey.nii.gz: expected probabilities from 0 to 1, got .* to 84"),
         (ROWS[0] - 0.5, "grey.nii.gz: expected probabilities from 0 to 1, got -0.5"),
         (ROWS[0, 0], "grey.nii.gz: expected 3 axes like the image's"),
-        (np.where(R < 3.0, np.nan, ROWS[0]), "grey.nii.gz: .*NaN|grey.nii.gz: .*not finite|grey.nii.gz"),
+        (
+            np.where(R < 3.0, np.nan, ROWS[0]),
+            "grey.nii.gz: .*NaN|grey.nii.gz: .*not finite|grey.nii.gz",
+        ),
     ):
-        nibabel.save(nibabel.Nifti1Image(values.astype(np.float32), np.eye(4)), folder / "grey.nii.gz")
+        nibabel.save(
+            nibabel.Nifti1Image(values.astype(np.float32), np.eye(4)), folder / "grey.nii.gz"
+        )
         refused(match, "--tissues", both(folder))
     far = np.diag([1.0, 1.0, 1.0, 1.0])
     far[:3, 3] = 500.0
     tetopt.save_image(folder / "grey.nii.gz", tetopt.Image(ROWS[0], far))
-    refused("grey.nii.gz: expected it to cover at least half of the image's voxels", "--tissues", both(folder))
+    refused(
+        "grey.nii.gz: expected it to cover at least half of the image's voxels",
+        "--tissues",
+        both(folder),
+    )
 
 
 def test_a_job_takes_a_list(folder):
@@ -135,7 +176,8 @@ def test_a_job_takes_a_list(folder):
 
 def test_a_cohort_finds_those_of_each_subject(folder, scheduler):
     (folder / "s.tsv").write_text(
-        "subject\timage\ttissues\n1\ta.nii.gz\tgrey.nii.gz, white.nii.gz\n2\ta.nii.gz\tn/a\n3\ta.nii.gz\tgrey.nii.gz\n"
+        "subject\timage\ttissues\n1\ta.nii.gz\tgrey.nii.gz, "
+        "white.nii.gz\n2\ta.nii.gz\tn/a\n3\ta.nii.gz\tgrey.nii.gz\n"
     )
     for name in ("grey", "white"):
         (folder / f"sub-2_{name}.nii.gz").write_bytes((folder / f"{name}.nii.gz").read_bytes())
@@ -144,8 +186,10 @@ def test_a_cohort_finds_those_of_each_subject(folder, scheduler):
     assert exit_code("cohort", folder / "s.tsv", "-o", folder / "out", *few) == 0
     runs = [json.loads(path.read_text()) for path in sorted((folder / "out").rglob("*_mesh.json"))]
     assert [run["label_names"] for run in runs] == [
-        {"1": "grey", "2": "white"}, {"1": "sub-2_grey", "2": "sub-2_white"}, {"1": "grey"}
-    ]  # fmt: skip
+        {"1": "grey", "2": "white"},
+        {"1": "sub-2_grey", "2": "sub-2_white"},
+        {"1": "grey"},
+    ]
 
 
 def test_a_missing_tissue_of_a_cohort_is_named_before_it_runs(folder, capfd):

@@ -1,4 +1,6 @@
-"""Lines as users see them: none wider than 100 columns, in a pipe or a wide terminal; long tables end in a count."""
+"""Lines as users see them: none wider than 100 columns, in a pipe or a wide terminal; long
+tables end in a count.
+"""
 
 import numpy as np
 import pytest
@@ -24,13 +26,36 @@ def labels():
     thick = Thickness(101.25, 1234.5, 12345.6, 12345.6)
     rows = [
         LabelFidelity(
-            100000 + k, 12345678, 1234567.89, 1234567.89, 123456, 0, 1.0 - 0.001 * k, 0.9, 123.456, 123.456, 12, 11,
-            False, 123.4, 0.5, 0.8, 12345678, (), thick, thick, 12.34, 1.234,
+            100000 + k,
+            12345678,
+            1234567.89,
+            1234567.89,
+            123456,
+            0,
+            1.0 - 0.001 * k,
+            0.9,
+            123.456,
+            123.456,
+            12,
+            11,
+            False,
+            123.4,
+            0.5,
+            0.8,
+            12345678,
+            (),
+            thick,
+            thick,
+            12.34,
+            1.234,
         )
         for k in range(N_LABELS)
-    ]  # fmt: skip
+    ]
     names = {row.label: f"left superior temporal gyrus, part {row.label}" for row in rows}
-    number = {name: 1.0 if name.endswith("o") or name == "folded" else 7 for name in LabelInterface._fields}
+    number = {
+        name: 1.0 if name.endswith("o") or name == "folded" else 7
+        for name in LabelInterface._fields
+    }
     interfaces = [LabelInterface(**{**number, "label": row.label}) for row in rows]
     return {"labels": rows, "interfaces": interfaces, "label_names": names}
 
@@ -40,7 +65,9 @@ def test_tables_of_hundreds_of_labels(labels, capsys, every):
     console.print_fidelity(labels, 3, every=every)
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 100
-    table = lines[: next(k for k, line in enumerate(lines) if "area" in line or "thickness of" in line)]
+    table = lines[
+        : next(k for k, line in enumerate(lines) if "area" in line or "thickness of" in line)
+    ]
     shown = [line for line in table if " left superior" in line]
     assert all("12345678" in line for line in shown)  # numbers are whole
     if every:
@@ -52,7 +79,9 @@ def test_tables_of_hundreds_of_labels(labels, capsys, every):
 
 
 def test_a_label_of_another_volume_is_among_the_worst(labels):
-    """Its Dice by voxels may be 1: its one voxel lies in its one cell, of a tenth of the voxel's volume."""
+    """Its Dice by voxels may be 1: its one voxel lies in its one cell, of a tenth of the voxel's
+    volume.
+    """
     rows = labels["labels"]
     rows[3] = rows[3]._replace(mesh_volume=0.1 * rows[3].volume)
     assert 3 in worst_labels(rows)
@@ -68,10 +97,17 @@ def mesh(tmp_path_factory):
 
 def test_a_run_prints_ten_rows_and_quality_all_of_them(mesh, monkeypatch, capsys):
     monkeypatch.chdir(mesh)
-    assert exit_code("mesh", "a.nii.gz", "-o", "a.vtu", "--spacing", "6", "--iterations", "0", "--force") == 0
+    assert (
+        exit_code(
+            "mesh", "a.nii.gz", "-o", "a.vtu", "--spacing", "6", "--iterations", "0", "--force"
+        )
+        == 0
+    )
     said = capsys.readouterr()
     lines = said.out.splitlines()
-    table = lines[1 : next(k for k, line in enumerate(lines) if line.startswith("all requirements"))]
+    table = lines[
+        1 : next(k for k, line in enumerate(lines) if line.startswith("all requirements"))
+    ]
     assert 8 <= len(table) <= 10
     assert not [line for line in table if "error (" in line or "bad cells" in line]
     assert max(map(len, [*lines, *said.err.splitlines()])) <= 100

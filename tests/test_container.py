@@ -1,4 +1,6 @@
-"""The Dockerfile: what it copies is there; its steps run as a script, and what comes of them, as another user."""
+"""The Dockerfile: what it copies is there; its steps run as a script, and what comes of them, as
+another user.
+"""
 
 import json
 import os
@@ -32,7 +34,9 @@ def copied():
 def test_what_is_copied_is_there_and_not_ignored():
     ignored = (ROOT / ".dockerignore").read_text().splitlines()
     assert "*" in ignored
-    assert copied() == [path for path in copied() if (ROOT / path).exists() and f"!{path}" in ignored]
+    assert copied() == [
+        path for path in copied() if (ROOT / path).exists() and f"!{path}" in ignored
+    ]
     project = (ROOT / "pyproject.toml").read_text()
     for needed in ("README.md", "LICENSE", "phantoms", "tetopt"):
         assert f'"{needed}"' in project
@@ -49,9 +53,13 @@ def test_the_entry_point_is_the_app():
 def base():
     """A folder that every user may enter, and a Python that every user may run."""
     python = shutil.which("python3", path="/usr/local/bin:/usr/bin") or sys.executable
-    is_new = subprocess.run([python, "-c", "import sys, ensurepip; sys.exit(sys.version_info < (3, 11))"], check=False)
+    is_new = subprocess.run(
+        [python, "-c", "import sys, ensurepip; sys.exit(sys.version_info < (3, 11))"], check=False
+    )
     if os.geteuid() != 0 or is_new.returncode:
-        pytest.skip("needs root, to become another user, and a Python >= 3.11 of the system's with venv")
+        pytest.skip(
+            "needs root, to become another user, and a Python >= 3.11 of the system's with venv"
+        )
     folder = Path(tempfile.mkdtemp(prefix="tetopt-container-"))
     folder.chmod(0o755)
     yield folder, python
@@ -60,10 +68,16 @@ def base():
 
 @pytest.mark.slow
 def test_its_steps_make_an_app_that_any_user_runs_and_that_only_reads(base):
-    """Without apt-get's step; in a fresh venv, whose files are then read only; without HOME, as by --cleanenv."""
+    """Without apt-get's step; in a fresh venv, whose files are then read only; without HOME, as
+    by --cleanenv.
+    """
     folder, python = base
     subprocess.run([python, "-m", "venv", folder / "venv"], check=True)
-    pip_settings = {name: value for name, value in os.environ.items() if name.startswith(("PIP_", "SSL_", "REQUESTS_"))}
+    pip_settings = {
+        name: value
+        for name, value in os.environ.items()
+        if name.startswith(("PIP_", "SSL_", "REQUESTS_"))
+    }
     environment = {"PATH": f"{folder / 'venv' / 'bin'}:/usr/bin:/bin"}
     place = folder
     for word, rest in instructions():
@@ -76,11 +90,19 @@ def test_its_steps_make_an_app_that_any_user_runs_and_that_only_reads(base):
             for path in rest.split()[:-1]:
                 target = place / rest.split()[-1]
                 if (ROOT / path).is_dir():
-                    shutil.copytree(ROOT / path, target, ignore=shutil.ignore_patterns("__pycache__"))
+                    shutil.copytree(
+                        ROOT / path, target, ignore=shutil.ignore_patterns("__pycache__")
+                    )
                 else:
                     shutil.copy(ROOT / path, target / path)
         elif word == "RUN" and not rest.startswith("apt-get"):
-            subprocess.run(["bash", "-ec", rest], cwd=place, env=environment | pip_settings, check=True, umask=0o022)
+            subprocess.run(
+                ["bash", "-ec", rest],
+                cwd=place,
+                env=environment | pip_settings,
+                check=True,
+                umask=0o022,
+            )
         elif word == "ENTRYPOINT":
             entry = json.loads(rest)
     subprocess.run(["chmod", "-R", "a-w", folder / "venv", folder / "opt"], check=True)
@@ -94,10 +116,21 @@ def test_its_steps_make_an_app_that_any_user_runs_and_that_only_reads(base):
 
     def run(*words):
         ended = subprocess.run(
-            [*entry, raw, out, *words], cwd="/", env=environment, user=NOBODY, group=NOBODY, extra_groups=[],
-            capture_output=True, text=True, check=False,
-        )  # fmt: skip
-        log = (out / "logs" / "sub-01.log").read_text() if (out / "logs" / "sub-01.log").exists() else ""
+            [*entry, raw, out, *words],
+            cwd="/",
+            env=environment,
+            user=NOBODY,
+            group=NOBODY,
+            extra_groups=[],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        log = (
+            (out / "logs" / "sub-01.log").read_text()
+            if (out / "logs" / "sub-01.log").exists()
+            else ""
+        )
         assert ended.returncode == 0, ended.stderr + log
         return ended.stderr + log
 

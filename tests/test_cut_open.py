@@ -11,7 +11,9 @@ from tetopt.report.colours import label_colours
 
 pytestmark = [pytest.mark.full, pytest.mark.drawn]
 
-TILTED = np.array([[1.8, -0.5, 0.0, 7.0], [0.5, 1.8, 0.0, -20.0], [0.0, 0.0, 2.5, 3.0], [0.0, 0.0, 0.0, 1.0]])
+TILTED = np.array(
+    [[1.8, -0.5, 0.0, 7.0], [0.5, 1.8, 0.0, -20.0], [0.0, 0.0, 2.5, 3.0], [0.0, 0.0, 0.0, 1.0]]
+)
 cut_open = script("cut_open")
 
 
@@ -63,23 +65,38 @@ def test_a_cutaway_is_without_background_and_its_octant(monkeypatch, tmp_path):
     is_kept = (of_cell > 0) & ~(mesh.points[mesh.cells].mean(axis=1) > centre).all(axis=1)
     expected = {facet: cells for facet, cells in cells_of.items() if is_kept[cells].sum() == 1}
     assert 0 < is_kept.sum() < (of_cell > 0).sum() < len(of_cell)
-    drawn = [tuple(sorted(node[tuple(points[p])] for p in triangle)) for triangle in coloured.regular_faces]
+    drawn = [
+        tuple(sorted(node[tuple(points[p])] for p in triangle))
+        for triangle in coloured.regular_faces
+    ]
     assert sorted(drawn) == sorted(expected)
-    for facet, colour, grey_value in zip(drawn, coloured.cell_data["colour"], grey.cell_data["h"], strict=True):
+    for facet, colour, grey_value in zip(
+        drawn, coloured.cell_data["colour"], grey.cell_data["h"], strict=True
+    ):
         (owner,) = (cell for cell in expected[facet] if is_kept[cell])
         np.testing.assert_array_equal(colour, colours[of_cell[owner]])
         assert grey_value == means[owner]
-    assert [axes.get_title() for axes in figure.axes] == ["mean of the image in each cell", "label of each cell"]
+    assert [axes.get_title() for axes in figure.axes] == [
+        "mean of the image in each cell",
+        "label of each cell",
+    ]
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["1", "2"]
     table = tetopt.LabelTable({2: "right half"}, {2: (0.25, 0.5, 0.75)})
-    (_, coloured), figure = photographed(monkeypatch, tmp_path / "a.png", labels, mesh, labels, table)
+    (_, coloured), figure = photographed(
+        monkeypatch, tmp_path / "a.png", labels, mesh, labels, table
+    )
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["1", "2 right half"]
-    assert np.unique(coloured.cell_data["colour"], axis=0).tolist() == [colours[1].tolist(), [64, 128, 191]]
+    assert np.unique(coloured.cell_data["colour"], axis=0).tolist() == [
+        colours[1].tolist(),
+        [64, 128, 191],
+    ]
 
 
 def test_a_cutaway_is_photographed_without_margins(tmp_path, opengl):
     labels = halves()
-    cut_open.save_cutaway(tmp_path / "a.png", labels, tetopt.lattice_mesh(labels, nodes=2000), labels)
+    cut_open.save_cutaway(
+        tmp_path / "a.png", labels, tetopt.lattice_mesh(labels, nodes=2000), labels
+    )
     with PIL.Image.open(tmp_path / "a.png") as picture:
         assert picture.format == "PNG"
         pixels = np.asarray(picture.convert("RGB")).astype(float)
@@ -97,7 +114,9 @@ def test_nothing_but_background_is_refused(tmp_path):
     labels = halves()
     mesh = tetopt.lattice_mesh(labels, nodes=200)
     with pytest.raises(tetopt.InputError, match="background alone"):
-        cut_open.save_cutaway(tmp_path / "a.png", labels, mesh, tetopt.Image(np.zeros(labels.shape), TILTED))
+        cut_open.save_cutaway(
+            tmp_path / "a.png", labels, mesh, tetopt.Image(np.zeros(labels.shape), TILTED)
+        )
     flat = tetopt.Image(np.zeros((6, 7)))
     with pytest.raises(tetopt.InputError, match="tetrahedra"):
         cut_open.save_cutaway(tmp_path / "a.png", flat, tetopt.lattice_mesh(flat, nodes=20))
@@ -108,11 +127,17 @@ def test_names_are_those_in_the_mesh_s_file(monkeypatch, tmp_path):
     labels, tables = halves(), []
     tetopt.save_image(tmp_path / "a.nii.gz", labels)
     mesh = tetopt.lattice_mesh(labels, nodes=200)
-    model = tetopt.build_model(mesh, labels, about={"label_table": tetopt.LabelTable({1: "left half"}, {})})
+    model = tetopt.build_model(
+        mesh, labels, about={"label_table": tetopt.LabelTable({1: "left half"}, {})}
+    )
     tetopt.save_model(tmp_path / "a.vtu", model)
     (tmp_path / "names.csv").write_text("label,name\n1,other half\n")
-    monkeypatch.setattr(cut_open, "save_cutaway", lambda *arguments: tables.append(arguments[-1].names))
-    image, mesh, picture, names = (str(tmp_path / name) for name in ("a.nii.gz", "a.vtu", "a.png", "names.csv"))
+    monkeypatch.setattr(
+        cut_open, "save_cutaway", lambda *arguments: tables.append(arguments[-1].names)
+    )
+    image, mesh, picture, names = (
+        str(tmp_path / name) for name in ("a.nii.gz", "a.vtu", "a.png", "names.csv")
+    )
     command = [mesh, "--image", image, "--labels", image, "-o", picture]
     assert cut_open.main(command) == cut_open.main([*command, "--label-names", names]) == 0
     assert tables == [{1: "left half"}, {1: "other half"}]

@@ -1,4 +1,6 @@
-"""Every public name is documented, in numpydoc's form, with an example; and all examples of the package run."""
+"""Every public name is documented, in numpydoc's form, with an example; and all examples of the
+package run.
+"""
 
 import doctest
 import importlib
@@ -18,10 +20,27 @@ from tetopt.io import formats
 
 ROOT = Path(__file__).resolve().parents[1]
 NAMES = [name for name in tetopt.__all__ if name != "__version__"]
-MODULES = sorted(path for path in (ROOT / "tetopt").rglob("*.py") if ">>> " in path.read_text(encoding="utf-8"))
-# Of numpydoc's: a summary is missing or not one line, or without its full stop; parameters that are not documented, or
-# not there, in another order, or without type or words; no Returns; no words there; no Examples; sections out of order.
-FAULTS = {"GL07", "GL08", "SS01", "SS03", "SS06", "PR01", "PR02", "PR03", "PR04", "PR07", "RT01", "RT03", "EX01"}
+MODULES = sorted(
+    path for path in (ROOT / "tetopt").rglob("*.py") if ">>> " in path.read_text(encoding="utf-8")
+)
+# Of numpydoc's: a summary is missing or not one line, or without its full stop; parameters that are
+# not documented, or not there, in another order, or without type or words; no Returns; no words
+# there; no Examples; sections out of order.
+FAULTS = {
+    "GL07",
+    "GL08",
+    "SS01",
+    "SS03",
+    "SS06",
+    "PR01",
+    "PR02",
+    "PR03",
+    "PR04",
+    "PR07",
+    "RT01",
+    "RT03",
+    "EX01",
+}
 
 
 def dotted(path):
@@ -33,17 +52,26 @@ def methods(name):
     """The public methods of a public class that are the package's own, without properties."""
     for each, member in inspect.getmembers(getattr(tetopt, name)):
         function = getattr(member, "__func__", member)
-        if inspect.isfunction(function) and not each.startswith("_") and function.__module__.startswith("tetopt."):
+        if (
+            inspect.isfunction(function)
+            and not each.startswith("_")
+            and function.__module__.startswith("tetopt.")
+        ):
             yield f"{name}.{each}"
 
 
-DOCUMENTED = [*NAMES, *(each for name in NAMES if inspect.isclass(getattr(tetopt, name)) for each in methods(name))]
+DOCUMENTED = [
+    *NAMES,
+    *(each for name in NAMES if inspect.isclass(getattr(tetopt, name)) for each in methods(name)),
+]
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", DOCUMENTED)
 def test_public_names_are_documented(name):
-    """Summary, parameters in order, what comes back, an example; of functions what they refuse, too."""
+    """Summary, parameters in order, what comes back, an example; of functions what they refuse,
+    too.
+    """
     faults = {code: text for code, text in validate(f"tetopt.{name}")["errors"] if code in FAULTS}
     assert faults == {}
     value = getattr(tetopt, name.split(".")[0])
@@ -62,7 +90,9 @@ def test_public_names_are_on_the_site():
 
 def fields_of(record):
     """The fields of a NamedTuple that its docstring lists, in its order; none of another class."""
-    names = [each.name for each in ClassDoc(record)["Parameters"]] if hasattr(record, "_fields") else []
+    names = (
+        [each.name for each in ClassDoc(record)["Parameters"]] if hasattr(record, "_fields") else []
+    )
     return [name for group in names for name in group.split(", ")]
 
 
@@ -84,4 +114,6 @@ def test_examples_run(path, tmp_path, monkeypatch):
     if output:
         pytest.fail("".join(output), pytrace=False)
     # Each example that the file has is in a docstring that was run.
-    assert sum(len(each.examples) for each in examples) == len(re.findall(r"^ *>>> ", path.read_text("utf-8"), re.M))
+    assert sum(len(each.examples) for each in examples) == len(
+        re.findall(r"^ *>>> ", path.read_text("utf-8"), re.M)
+    )

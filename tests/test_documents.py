@@ -1,4 +1,6 @@
-"""What the documents tell a reader to type is what tetopt takes: Start is run, all the rest is parsed to the end."""
+"""What the documents tell a reader to type is what tetopt takes: Start is run, all the rest is
+parsed to the end.
+"""
 
 import ast
 import re
@@ -15,20 +17,32 @@ from tetopt.cli.app import COMMANDS, loaded_command
 pytestmark = pytest.mark.deep
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
-PAGES = sorted(page for page in DOCS.rglob("*.md") if "_build" not in page.parts and "gallery" not in page.parts)
+PAGES = sorted(
+    page
+    for page in DOCS.rglob("*.md")
+    if "_build" not in page.parts and "gallery" not in page.parts
+)
 LESSON = [DOCS / "start" / f"{name}.md" for name in ("install", "first_mesh", "what_came_out")]
 FENCE = re.compile(r"^(`{3,}|~{3,})(bash|python)$\n(.*?)^\1$", re.DOTALL | re.MULTILINE)
 
 
 def blocks(page, language):
     """The text of each block of code of this language on a page."""
-    return [text for _, name, text in FENCE.findall(page.read_text(encoding="utf-8")) if name == language]
+    return [
+        text
+        for _, name, text in FENCE.findall(page.read_text(encoding="utf-8"))
+        if name == language
+    ]
 
 
 def commands_in(text):
     """The words after `tetopt` of each command; a line that ends in a backslash goes on."""
     lines = text.replace("\\\n", " ").splitlines()
-    return [words[1:] for words in (shlex.split(line, comments=True) for line in lines) if words[:1] == ["tetopt"]]
+    return [
+        words[1:]
+        for words in (shlex.split(line, comments=True) for line in lines)
+        if words[:1] == ["tetopt"]
+    ]
 
 
 def commands(page):
@@ -37,9 +51,15 @@ def commands(page):
 
 
 def names_of_tetopt(tree):
-    """What a program takes from tetopt, as dotted names: `tetopt.x` and `from tetopt.y import x`."""
+    """What a program takes from tetopt, as dotted names: `tetopt.x` and `from tetopt.y import
+    x`.
+    """
     for node in ast.walk(tree):
-        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "tetopt":
+        if (
+            isinstance(node, ast.Attribute)
+            and isinstance(node.value, ast.Name)
+            and node.value.id == "tetopt"
+        ):
             yield node.attr
 
 
@@ -58,9 +78,13 @@ def parsers():
     return parser
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if commands(page)], ids=lambda page: page.stem)
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if commands(page)], ids=lambda page: page.stem
+)
 def test_commands_are_parsed(page, parsers):
-    """An option that is gone, a value of another kind, an argument too many: all refused by the parser."""
+    """An option that is gone, a value of another kind, an argument too many: all refused by the
+    parser.
+    """
     for name, *words in commands(page):
         if name != "--version":
             assert name in COMMANDS, name
@@ -73,7 +97,9 @@ def test_a_command_that_is_wrong_is_refused(parsers):
             parsers("mesh").make_context("mesh", ["a.nii", "-o", "a.vtu", *wrong])
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.stem)
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.stem
+)
 def test_programs_are_compiled_and_their_names_exist(page):
     for program in blocks(page, "python"):
         for name in names_of_tetopt(ast.parse(program, page.name)):
@@ -81,11 +107,15 @@ def test_programs_are_compiled_and_their_names_exist(page):
 
 
 def test_the_lesson_runs(tmp_path, monkeypatch, capsys):
-    """Start, from its first command to its last program, on a phantom in the place of the T1, with fewer nodes."""
+    """Start, from its first command to its last program, on a phantom in the place of the T1,
+    with fewer nodes.
+    """
     monkeypatch.chdir(tmp_path)
     assert main(["phantom", "sphere", "-o", "T1.nii.gz", "--voxel-mm", "4"]) == 0
     for page in LESSON:
-        for language, text in [(name, text) for _, name, text in FENCE.findall(page.read_text(encoding="utf-8"))]:
+        for language, text in [
+            (name, text) for _, name, text in FENCE.findall(page.read_text(encoding="utf-8"))
+        ]:
             text = text.replace("5000", "150")
             if language == "bash":
                 for words in commands_in(text):
@@ -99,4 +129,7 @@ def test_the_lesson_runs(tmp_path, monkeypatch, capsys):
     assert "unexplained variance: 0." in printed
     written = {path.name for path in tmp_path.iterdir()} - {"T1.nii.gz"}
     pictures = {"slice.png", "rho.png", "energies.png", "thumbnail.png"}
-    assert written == {"brain.vtu", "brain_too.vtu", "brain_job.inp", "run.json", "look.html"} | pictures
+    assert (
+        written
+        == {"brain.vtu", "brain_too.vtu", "brain_job.inp", "run.json", "look.html"} | pictures
+    )

@@ -8,7 +8,9 @@ import pytest
 
 pytestmark = pytest.mark.full
 
-PYPROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
+PYPROJECT = tomllib.loads(
+    (Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8")
+)
 EXTRAS = {
     name: [each for each in requirements if not each.startswith("tetopt[")]
     for name, requirements in PYPROJECT["project"]["optional-dependencies"].items()

@@ -12,7 +12,9 @@ from tetopt.image import transformed
 seeds = st.integers(0, 2**32 - 1)
 dimensions = st.sampled_from([2, 3])
 
-OBLIQUE = np.array([[0.0, -2.0, 0.0, 10.0], [3.0, 0.0, 0.0, -20.0], [0.0, 0.0, -5.0, 30.0], [0, 0, 0, 1]])
+OBLIQUE = np.array(
+    [[0.0, -2.0, 0.0, 10.0], [3.0, 0.0, 0.0, -20.0], [0.0, 0.0, -5.0, 30.0], [0, 0, 0, 1]]
+)
 
 
 def test_sizes_of_a_flipped_and_turned_image():
@@ -57,7 +59,9 @@ def test_to_index_inverts_to_world(seed, n):
 
 @given(seeds, dimensions)
 def test_transformed_is_a_matrix_product_row_by_row(seed, n):
-    """To rounding; and a vector's result has the same bits alone and among others, which BLAS does not promise."""
+    """To rounding; and a vector's result has the same bits alone and among others, which BLAS
+    does not promise.
+    """
     rng = np.random.default_rng(seed)
     matrix, vectors = rng.normal(size=(n, n)), rng.normal(size=(37, n))
     product = transformed(vectors, matrix)
@@ -142,7 +146,9 @@ def test_data_that_is_no_image_is_refused(data, message):
 def test_the_first_voxel_that_is_not_finite_is_named(value):
     data = np.zeros((3, 4))
     data[1, 2] = data[2, 3] = value
-    with pytest.raises(InputError, match=r"2 voxels are NaN or infinite, the first at index \(1, 2\)"):
+    with pytest.raises(
+        InputError, match=r"2 voxels are NaN or infinite, the first at index \(1, 2\)"
+    ):
         Image(data)
 
 
@@ -168,7 +174,9 @@ def test_an_affine_that_places_nothing_is_refused(affine, message):
 
 def test_tiny_voxels_are_not_singular():
     """Micrometres in metres: 1e-6 along every axis."""
-    assert Image(np.zeros((2, 2, 2)), np.diag([1e-6, 1e-6, 1e-6, 1.0])).voxel_volume == pytest.approx(1e-18)
+    assert Image(
+        np.zeros((2, 2, 2)), np.diag([1e-6, 1e-6, 1e-6, 1.0])
+    ).voxel_volume == pytest.approx(1e-18)
 
 
 @pytest.mark.parametrize("factor", [1e-151, 1e147])
@@ -176,26 +184,41 @@ def test_intensities_whose_squares_can_be_summed(factor):
     assert Image(np.array([[0.0, 1.0]]) * factor).data.max() == factor
 
 
-@pytest.mark.parametrize("values", [(0.0, 1e-300), (0.0, 1e300), (-1e200, 0.0), (5e-324, 0.0), (1e300, 1e300)])
+@pytest.mark.parametrize(
+    "values", [(0.0, 1e-300), (0.0, 1e300), (-1e200, 0.0), (5e-324, 0.0), (1e300, 1e300)]
+)
 def test_intensities_whose_squares_cannot_be_summed(values):
-    with pytest.raises(InputError, match=r"intensities up to 1e\+148 that differ by at least 1e-152, .*rescale"):
+    with pytest.raises(
+        InputError, match=r"intensities up to 1e\+148 that differ by at least 1e-152, .*rescale"
+    ):
         Image(np.array([values]))
 
 
-SHEARED = np.array([[1.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1e-4, 0.0], [0.0, 0.0, 0.0, 1.0]])
+SHEARED = np.array(
+    [[1.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1e-4, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
 
 
 @pytest.mark.parametrize(
     ("affine", "message"),
     [
-        (np.diag([1.0, 1.0, 1e6, 1.0]), r"at most 1000 times as long as thick, got 1e\+06 mm by 1 mm"),
-        (np.diag([1.0, 1.0, 1e-6, 1.0]), "at most 1000 times as long as thick, got 1 mm by 1e-06 mm"),
+        (
+            np.diag([1.0, 1.0, 1e6, 1.0]),
+            r"at most 1000 times as long as thick, got 1e\+06 mm by 1 mm",
+        ),
+        (
+            np.diag([1.0, 1.0, 1e-6, 1.0]),
+            "at most 1000 times as long as thick, got 1 mm by 1e-06 mm",
+        ),
         (np.diag([1.0, 1.0, 1e20, 1.0]), r"voxels of up to 1e\+09 mm"),
         (np.diag([1.0, 1.0, 1e300, 1.0]), r"voxels of up to 1e\+09 mm"),
         (np.diag([1e-30, 1e-30, 1e-30, 1.0]), "expected voxels of 1e-09 to"),
         (np.diag([5e-324, 1.0, 1.0, 1.0]), "expected voxels of 1e-09 to|singular"),
         (SHEARED, "at most 1000 times as long as thick, got 1.414 mm by 7.071e-05 mm"),
-        (np.array([[1.0, 0, 0, 1e12], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), "within 1e.09 voxels of the world"),
+        (
+            np.array([[1.0, 0, 0, 1e12], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]),
+            "within 1e.09 voxels of the world",
+        ),
     ],
 )
 def test_voxels_that_cannot_be_computed_with(affine, message):
@@ -206,4 +229,8 @@ def test_voxels_that_cannot_be_computed_with(affine, message):
 
 def test_real_extremes_of_voxels():
     """Slices of 10 mm with pixels of 0.1 mm, and a tilted gantry."""
-    assert Image(np.zeros((2, 2, 2)), np.diag([0.1, 0.1, 10.0, 1.0])).spacing.tolist() == [0.1, 0.1, 10.0]
+    assert Image(np.zeros((2, 2, 2)), np.diag([0.1, 0.1, 10.0, 1.0])).spacing.tolist() == [
+        0.1,
+        0.1,
+        10.0,
+    ]

@@ -1,4 +1,6 @@
-"""Processes that the command starts: none of them runs modules of the folder that it is called in."""
+"""Processes that the command starts: none of them runs modules of the folder that it is called
+in.
+"""
 
 import shutil
 import subprocess
@@ -15,12 +17,18 @@ from tetopt.system.interpreter import others_environment
 
 pytestmark = pytest.mark.deep
 
-MODULES = sorted(name for name in sys.stdlib_module_names | packages_distributions().keys() if name.isidentifier())
+MODULES = sorted(
+    name
+    for name in sys.stdlib_module_names | packages_distributions().keys()
+    if name.isidentifier()
+)
 PLANTED = "import os\nopen({path!r}, 'a').write(__name__ + ' ')\n"
 COMMANDS = {  # and the kernels' compilers: tests/test_kernels.py
     "a file read by a compiled library": "mesh a.nrrd -o {out}/a.vtu --nodes 60 --iterations 0",
-    "a pipeline": "compare a.nii -o {out}/compared --nodes 60 --pipelines mine --pipeline mine={program}",
-    "workers whose tasks are processes": "cohort subjects.tsv -o {out}/cohort --nodes 60 --iterations 0 --workers 1",
+    "a pipeline": "compare a.nii -o {out}/compared --nodes 60 --pipelines mine --pipeline "
+    "mine={program}",
+    "workers whose tasks are processes": "cohort subjects.tsv -o {out}/cohort --nodes 60 "
+    "--iterations 0 --workers 1",
 }
 NRRD = """NRRD0004
 type: float
@@ -53,10 +61,16 @@ def test_modules_of_the_current_folder_are_not_run(untrusted, tmp_path, name):
     (tmp_path / "beside.py").write_text(f"open({str(tmp_path / 'imported')!r}, 'w')")
     command = shutil.which("tetopt", path=Path(sys.executable).parent)
     words = [
-        word.format(out=tmp_path, program=f"{sys.executable} {tmp_path / 'program.py'} {{image}} {{output}}")
+        word.format(
+            out=tmp_path, program=f"{sys.executable} {tmp_path / 'program.py'} {{image}} {{output}}"
+        )
         for word in COMMANDS[name].split()
     ]
-    done = subprocess.run([command, *words], cwd=untrusted, env=others_environment(), capture_output=True, text=True)
+    done = subprocess.run(
+        [command, *words], cwd=untrusted, env=others_environment(), capture_output=True, text=True
+    )
     executed = untrusted / "executed"
     assert not executed.exists(), executed.read_text()
-    assert (tmp_path / "imported").exists() if name == "a pipeline" else done.returncode in (0, 1), done.stderr
+    assert (
+        (tmp_path / "imported").exists() if name == "a pipeline" else done.returncode in (0, 1)
+    ), done.stderr

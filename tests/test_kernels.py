@@ -1,4 +1,6 @@
-"""How kernels are compiled: records by address, units through symbols, several processes, the cache."""
+"""How kernels are compiled: records by address, units through symbols, several processes, the
+cache.
+"""
 
 from __future__ import annotations
 
@@ -15,10 +17,26 @@ import pytest
 
 from tetopt.system import cache, kernel_cache, kernels
 from tetopt.system.kernel_types import by_value
-from tetopt.system.kernels import Bools1, Floats1, Floats2, Floats3, Ints1, entry, helper, own, packed, run, unit
+from tetopt.system.kernels import (
+    Bools1,
+    Floats1,
+    Floats2,
+    Floats3,
+    Ints1,
+    entry,
+    helper,
+    own,
+    packed,
+    run,
+    unit,
+)
 
-compiled_only = pytest.mark.skipif(numba.config.DISABLE_JIT, reason="NUMBA_DISABLE_JIT is set: nothing is compiled")
-linked_only = pytest.mark.skipif(kernel_cache.IS_PLAIN, reason="kernels are plain functions of numba's")
+compiled_only = pytest.mark.skipif(
+    numba.config.DISABLE_JIT, reason="NUMBA_DISABLE_JIT is set: nothing is compiled"
+)
+linked_only = pytest.mark.skipif(
+    kernel_cache.IS_PLAIN, reason="kernels are plain functions of numba's"
+)
 
 
 class Part(NamedTuple):
@@ -70,7 +88,9 @@ def all_sums(whole: Whole, n: int) -> float:
 
 def part(seed, n=7):
     rng = np.random.default_rng(seed)
-    return Part(rng.normal(size=(n, 3)), rng.random(n) < 0.5, int(seed), float(rng.random()), bool(seed % 2))
+    return Part(
+        rng.normal(size=(n, 3)), rng.random(n) < 0.5, int(seed), float(rng.random()), bool(seed % 2)
+    )
 
 
 def whole():
@@ -87,7 +107,10 @@ def expected_sum(part, i):
 def test_kernels_read_records():
     work = whole()
     sums = np.array(
-        [[expected_sum(work.part, i) + 10.0 * expected_sum(other, i) for i in range(7)] for other in work.others]
+        [
+            [expected_sum(work.part, i) + 10.0 * expected_sum(other, i) for i in range(7)]
+            for other in work.others
+        ]
     )
     assert all_sums(work, 7) == pytest.approx(sums[0].sum(), rel=1e-14)
     for i in range(7):
@@ -99,7 +122,9 @@ def test_kernels_read_records():
 
 @compiled_only
 @pytest.mark.parametrize(
-    "values", [np.zeros((3, 7)).T, np.zeros(7), np.zeros((7, 3), dtype=np.float32)], ids=["turned", "flat", "single"]
+    "values",
+    [np.zeros((3, 7)).T, np.zeros(7), np.zeros((7, 3), dtype=np.float32)],
+    ids=["turned", "flat", "single"],
 )
 def test_a_record_of_other_arrays_is_refused(values):
     with pytest.raises(TypeError, match=r"Part\.values: expected array\(float64, 2d, C\), got"):
@@ -179,11 +204,19 @@ print(k.step_7(k.Row(np.ones(3)), 2), len(started), [f.was_cached for f in (k.st
 
 
 def ran(folder, program, cache=None, **names):
-    """A program in a process of its own that imports from a folder, in whose `cache` kernels are kept."""
+    """A program in a process of its own that imports from a folder, in whose `cache` kernels are
+    kept.
+    """
     paths = os.pathsep.join([str(folder), *filter(None, sys.path)])
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(cache or folder / "cache"), "PYTHONPATH": paths} | names
+    environment = (
+        os.environ
+        | {"NUMBA_CACHE_DIR": str(cache or folder / "cache"), "PYTHONPATH": paths}
+        | names
+    )
     command = [sys.executable, "-c", program]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=True, cwd=folder)
+    return subprocess.run(
+        command, env=environment, capture_output=True, text=True, check=True, cwd=folder
+    )
 
 
 WAITING = "import tetopt.workers, numba; numba.set_num_threads(1); print(numba.threading_layer())"
@@ -191,20 +224,25 @@ WAITING = "import tetopt.workers, numba; numba.set_num_threads(1); print(numba.t
 
 @pytest.mark.parametrize("chosen", [{}, {"OMP_WAIT_POLICY": "active"}])
 def test_threads_wait_without_spinning(tmp_path, monkeypatch, chosen):
-    """Unless the user wants them to: on a busy machine, spinning threads take the time of those that compute."""
+    """Unless the user wants them to: on a busy machine, spinning threads take the time of those
+    that compute.
+    """
     monkeypatch.delenv("OMP_WAIT_POLICY")  # of this process, which imported tetopt
     kept = ran(tmp_path, "import os, tetopt; print(os.environ['OMP_WAIT_POLICY'])", **chosen).stdout
     assert kept == f"{chosen.get('OMP_WAIT_POLICY', 'passive')}\n"
     shown = ran(tmp_path, WAITING, OMP_DISPLAY_ENV="verbose", **chosen)
     if shown.stdout != "omp\n" or "GOMP" not in shown.stderr:
         pytest.skip("threads of another library than GNU's OpenMP")
-    assert ("GOMP_SPINCOUNT = '0'" in shown.stderr) == (not chosen)  # in the library, whoever loaded it
+    # in the library, whoever loaded it
+    assert ("GOMP_SPINCOUNT = '0'" in shown.stderr) == (not chosen)
 
 
 @pytest.mark.deep
 @linked_only
 def test_processes_share_what_is_to_be_compiled(tmp_path):
-    """The first kernel that the cache lacks is compiled here, the others by two processes; a second run loads them."""
+    """The first kernel that the cache lacks is compiled here, the others by two processes; a
+    second run loads them.
+    """
     units = [UNIT.format(n, f"step_{n - 1}(row, i)" if n else "0.0") for n in range(8)]
     (tmp_path / "some_kernels.py").write_text(MODULE + "".join(units))
     said = [ran(tmp_path, PROGRAM).stdout.strip() for _ in range(2)]
@@ -214,7 +252,10 @@ def test_processes_share_what_is_to_be_compiled(tmp_path):
 @compiled_only
 def test_the_cache_knows_all_sources(monkeypatch):
     """numba's own key is the code of one function; here what it closes over is of all kernels."""
-    before, symbol = kernels._versioned(row_sum.function).__closure__[0].cell_contents, row_sum.symbol
+    before, symbol = (
+        kernels._versioned(row_sum.function).__closure__[0].cell_contents,
+        row_sum.symbol,
+    )
     monkeypatch.setattr(kernels, "checksum", lambda: "other")
     assert before != "other" == kernels._versioned(row_sum.function).__closure__[0].cell_contents
     assert symbol.endswith(before)
@@ -239,13 +280,16 @@ def test_a_cache_that_can_be_written_is_left_alone(place, monkeypatch, tmp_path)
 
 @pytest.mark.parametrize("is_chosen", [False, True])
 def test_without_a_folder_kernels_are_kept_for_one_run(place, monkeypatch, tmp_path, is_chosen):
-    """The package and the home, or the chosen folder, cannot be written, whatever the rights of their folders say."""
+    """The package and the home, or the chosen folder, cannot be written, whatever the rights of
+    their folders say.
+    """
     (tmp_path / "file").touch()
     chosen = str(tmp_path / "file" / "kernels")  # cannot be made, not even by root
     if is_chosen:
         monkeypatch.setenv("NUMBA_CACHE_DIR", chosen)
     else:
-        monkeypatch.setenv("NUMBA_CACHE_DIR", "")  # not `delenv`: what is set meanwhile has to go again
+        # not `delenv`: what is set meanwhile has to go again
+        monkeypatch.setenv("NUMBA_CACHE_DIR", "")
         monkeypatch.setattr(cache, "BESIDE", tmp_path / "file" / "__pycache__")
         monkeypatch.setattr(cache, "_user_cache", lambda: tmp_path / "file")
     folder, notice = place()
@@ -334,7 +378,9 @@ def plain(x):
 
 @pytest.fixture
 def use(tmp_path):
-    """A function that uses four kernels in a process of its own, after some statements; what that said."""
+    """A function that uses four kernels in a process of its own, after some statements; what
+    that said.
+    """
     units = [UNIT.format(n, f"step_{n - 1}(row, i)" if n else "0.0") for n in range(3)]
     (tmp_path / "some_kernels.py").write_text(MODULE + "".join(units) + PLAIN)
 
@@ -360,7 +406,9 @@ DAMAGES = {
 @pytest.mark.deep
 @linked_only
 def test_damaged_files_of_the_cache_are_compiled_anew(use):
-    """An index or code, of a unit or of a function of numba's own: said once, mended, and the numbers are right."""
+    """An index or code, of a unit or of a function of numba's own: said once, mended, and the
+    numbers are right.
+    """
     assert use() == [COMPILED]
     assert use() == [LOADED]
     for first, suffix in enumerate(("nbi", "nbc")):
@@ -411,16 +459,22 @@ def link(path):
 
 
 UNTRUSTED = {
-    "is writable by users other than its owner": lambda path: path.chmod(path.stat().st_mode | 0o020),
+    "is writable by users other than its owner": lambda path: path.chmod(
+        path.stat().st_mode | 0o020
+    ),
     "is a link": link,
     "belongs to user 12345": lambda path: os.chown(path, 12345, -1),
 }
 
 
 @pytest.mark.skipif(os.name != "posix", reason="rights of files")
-@pytest.mark.parametrize("words", [words for words in UNTRUSTED if os.geteuid() == 0 or "belongs" not in words])
+@pytest.mark.parametrize(
+    "words", [words for words in UNTRUSTED if os.geteuid() == 0 or "belongs" not in words]
+)
 def test_what_others_can_have_written_is_not_loaded(place, monkeypatch, tmp_path, words):
-    """It is code. Nobody else enters a folder that only its owner may read, whatever the rights of its files."""
+    """It is code. Nobody else enters a folder that only its owner may read, whatever the rights
+    of its files.
+    """
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     folder = cache.own_folder("kernels")
     assert folder.stat().st_mode & 0o777 == 0o700
@@ -520,7 +574,9 @@ def test_an_index_beyond_its_array_is_caught_where_each_is_checked(tmp_path):
     """Also after kernels without checks were kept in the same cache; these are not run then."""
     (tmp_path / "beyond.py").write_text(BEYOND)
     program = "import beyond; beyond.main()"
-    said = [ran(tmp_path, program, NUMBA_BOUNDSCHECK=is_checked).stdout.strip() for is_checked in "011"]
+    said = [
+        ran(tmp_path, program, NUMBA_BOUNDSCHECK=is_checked).stdout.strip() for is_checked in "011"
+    ]
     survived, checked = str([[False] * 4, [False] * 4]), str([[False] * 4, [True] * 4])
     assert said == [survived, checked, checked]
 
@@ -600,9 +656,15 @@ CHANGES = (
     ("", None),
     ("import os; os.environ['TETOPT_PLAIN_NUMBA'] = '1'", None),
     ("del numba.extending.NativeValue", "ImportError: cannot import name 'NativeValue'"),
-    (UNKNOWN_SYMBOLS.format("tetopt"), "RuntimeError: the linker has no symbol tetopt.system.kernels._multiply"),
+    (
+        UNKNOWN_SYMBOLS.format("tetopt"),
+        "RuntimeError: the linker has no symbol tetopt.system.kernels._multiply",
+    ),
     # That of a later unit, when others have been linked and have run.
-    (UNKNOWN_SYMBOLS.format("doubled"), "RuntimeError: the linker has no symbol large_unit.doubled"),
+    (
+        UNKNOWN_SYMBOLS.format("doubled"),
+        "RuntimeError: the linker has no symbol large_unit.doubled",
+    ),
     ("del numba.core.caching.FunctionCache", " load_overload, "),
 )
 
@@ -610,19 +672,30 @@ CHANGES = (
 @pytest.mark.deep
 @compiled_only
 def test_kernels_hold_where_numba_has_changed(tmp_path):
-    """They are plain functions of numba's then, as on request: the same numbers; one line if nobody asked for it.
+    """They are plain functions of numba's then, as on request: the same numbers; one line if nobody
+    asked for it.
 
     All share one folder for their caches.
     """
     (tmp_path / "large_unit.py").write_text(LARGE_UNIT)
     for before, reason in CHANGES:
-        said = ran(tmp_path, FENCE.format(before=before), cache=tmp_path, TETOPT_PLAIN_NUMBA="").stdout
-        *notices, failure, numbers = sorted(said.splitlines(), key=lambda line: not line.startswith("warned"))
+        said = ran(
+            tmp_path, FENCE.format(before=before), cache=tmp_path, TETOPT_PLAIN_NUMBA=""
+        ).stdout
+        *notices, failure, numbers = sorted(
+            said.splitlines(), key=lambda line: not line.startswith("warned")
+        )
         assert failure == "large: 4 of 4 calls could not allocate their arrays"
         assert numbers == f"1.0 [1. 1. 1. 1.] 2.0 1.0 {before != ''}"
         assert len(notices) == (reason is not None)
-        assert all(line.startswith("warned: kernels take longer to compile") and reason in line for line in notices)
-    assert {path.parts[-3].partition("-")[0] for path in tmp_path.rglob("*.nbi")} == {"linked", "plain"}
+        assert all(
+            line.startswith("warned: kernels take longer to compile") and reason in line
+            for line in notices
+        )
+    assert {path.parts[-3].partition("-")[0] for path in tmp_path.rglob("*.nbi")} == {
+        "linked",
+        "plain",
+    }
 
 
 SMALL_RUN = """
@@ -644,11 +717,14 @@ def test_a_mesh_has_the_same_bits_without_the_inside_of_numba():
     """On two threads, of an image and of labels. All kernels are compiled plain first: minutes."""
     linked, plain = (
         subprocess.run(
-            [sys.executable, "-c", SMALL_RUN], env=os.environ | {"TETOPT_PLAIN_NUMBA": value, "NUMBA_NUM_THREADS": "2"},
-            capture_output=True, text=True, check=True,
+            [sys.executable, "-c", SMALL_RUN],
+            env=os.environ | {"TETOPT_PLAIN_NUMBA": value, "NUMBA_NUM_THREADS": "2"},
+            capture_output=True,
+            text=True,
+            check=True,
         ).stdout.split()
         for value in "01"
-    )  # fmt: skip
+    )
     assert len(set(linked)) == 3
     assert (linked[:2], linked[2], plain[2]) == (plain[:2], "False", "True")
 
@@ -679,7 +755,8 @@ print(failed, all(seen))
 
 @pytest.mark.deep
 @compiled_only
-@pytest.mark.parametrize("layer", ["default", "workqueue"])  # the latter ends a process that loops in two threads
+# the latter ends a process that loops in two threads
+@pytest.mark.parametrize("layer", ["default", "workqueue"])
 def test_each_thread_of_python_gets_its_own_errors(tmp_path, layer):
     (tmp_path / "large_unit.py").write_text(LARGE_UNIT)
     done = ran(tmp_path, THREADS, cache=tmp_path, NUMBA_THREADING_LAYER=layer)

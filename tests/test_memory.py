@@ -1,4 +1,6 @@
-"""Memory is asked for before it is taken: what there is, what things need, and one line where that is too much."""
+"""Memory is asked for before it is taken: what there is, what things need, and one line where
+that is too much.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,14 @@ from tetopt.fem.elasticity import stiffness
 from tetopt.fem.reference import reference
 from tetopt.job.events import listened, progress, started
 from tetopt.job.meshing import left_words, watched
-from tetopt.start.memory import BOUND_MARGIN, CHANNEL_BYTES, MESHED_CELL_BYTES, bytes_of, meshing_bytes, next_bytes
+from tetopt.start.memory import (
+    BOUND_MARGIN,
+    CHANNEL_BYTES,
+    MESHED_CELL_BYTES,
+    bytes_of,
+    meshing_bytes,
+    next_bytes,
+)
 from tetopt.start.octree import _block_limits, _blocks_by_depth
 from tetopt.start.sums import channels_of
 from tetopt.system import budget
@@ -48,7 +57,9 @@ def system(monkeypatch, tmp_path):
 
 
 def test_the_machine_and_its_groups_limit_memory(system):
-    """The least of all is what there is: of the machine, of version 2 and 1, of a group and those above it."""
+    """The least of all is what there is: of the machine, of version 2 and 1, of a group and
+    those above it.
+    """
     assert budget.available_bytes() == 8 * GIB
     system("proc/self/cgroup", "0::/job/step\n")
     assert budget.available_bytes() == 8 * GIB
@@ -85,29 +96,43 @@ def test_a_limit_counts_what_there_is(monkeypatch):
     monkeypatch.setattr(budget, "available_bytes", lambda: 1000)
     monkeypatch.setattr(budget, "resident_bytes", lambda: 400)
     budget.check_memory(1000, "a", "b")
-    with pytest.raises(tetopt.InputError, match=r"^a: needs about 0\.001 MB of memory, but only 0\.001 MB is free; b$"):
+    with pytest.raises(
+        tetopt.InputError,
+        match=r"^a: needs about 0\.001 MB of memory, but only 0\.001 MB is free; b$",
+    ):
         budget.check_memory(1001, "a", "b")
     budget.check_memory(600, "a", "b", limit=1000)
     with pytest.raises(
-        tetopt.InputError, match=r"^a: needs about 0\.001 MB of memory in total, but only 0\.001 MB is allowed; b$"
+        tetopt.InputError,
+        match=r"^a: needs about 0\.001 MB of memory in total, but only 0\.001 MB is allowed; b$",
     ):
         budget.check_memory(601, "a", "b", limit=1000)
     assert not budget.MemoryLimit(1000, 600).is_reached()
     assert budget.MemoryLimit(1000, 601).is_reached()
 
 
-IMAGE = tetopt.Image(np.random.default_rng(0).integers(1, 4, (9, 8, 7)).astype(float), np.diag([1.0, 1.0, 3.0, 1.0]))
+IMAGE = tetopt.Image(
+    np.random.default_rng(0).integers(1, 4, (9, 8, 7)).astype(float), np.diag([1.0, 1.0, 3.0, 1.0])
+)
 LATTICE = tetopt.lattice_mesh(IMAGE, blocks=(2, 2, 2))
 LIMITS, CHANNELS = _block_limits(plain(IMAGE), 100, None), channels_of(plain(IMAGE))
 TASKS = {
-    r"lattice: .* nodes: needs.*use at most \d+ nodes$": lambda: tetopt.lattice_mesh(IMAGE, spacing=0.1),
+    r"lattice: .* nodes: needs.*use at most \d+ nodes$": lambda: tetopt.lattice_mesh(
+        IMAGE, spacing=0.1
+    ),
     "octree: .* blocks: needs.*allow longer edges, or crop": lambda: _blocks_by_depth(
         plain(IMAGE), CHANNELS, (4, 4, 4), LIMITS
     ),
     "phantom 'sphere': .* voxels: needs.*use larger": lambda: tetopt.load_phantom("sphere").image(),
-    "image: 2 sums of 9 x 8 x 7 voxels: needs.*crop the image": lambda: sampling_grid(IMAGE, LATTICE.points),
-    "labels: 3 labels on 1512 .*division by 1 x 1 x 3.*: needs.*smooth": lambda: memberships(IMAGE, (1, 1, 3)),
-    "elasticity: the stiffness of .* cells with 10 nodes each: needs.*coarser": lambda: stiffness(LATTICE, 1.0, 0.3, 2),
+    "image: 2 sums of 9 x 8 x 7 voxels: needs.*crop the image": lambda: sampling_grid(
+        IMAGE, LATTICE.points
+    ),
+    "labels: 3 labels on 1512 .*division by 1 x 1 x 3.*: needs.*smooth": lambda: memberships(
+        IMAGE, (1, 1, 3)
+    ),
+    "elasticity: the stiffness of .* cells with 10 nodes each: needs.*coarser": lambda: stiffness(
+        LATTICE, 1.0, 0.3, 2
+    ),
     "reference: 2160 degrees of freedom: needs.*`reference_dofs`": lambda: reference(IMAGE, 0.3),
     r"^octree: 100 nodes: needs.*use at most \d+$": lambda: tetopt.mesh_image(IMAGE, 100),
     "^an image of 9 x 8 x 7 voxels: needs.*`crop`": lambda: tetopt.mesh_image(IMAGE, start=LATTICE),
@@ -117,7 +142,10 @@ TASKS = {
 @pytest.mark.parametrize("words", TASKS)
 def test_what_needs_more_than_there_is_does_not_begin(monkeypatch, words):
     monkeypatch.setattr(budget, "available_bytes", lambda: 1000)
-    with pytest.raises(tetopt.InputError, match=words.replace("needs", "needs about .* but only 0.001 MB is free; ")):
+    with pytest.raises(
+        tetopt.InputError,
+        match=words.replace("needs", "needs about .* but only 0.001 MB is free; "),
+    ):
         TASKS[words]()
 
 
@@ -127,14 +155,19 @@ def test_what_is_kept_of_voxels_counts():
     kinds = [plain(IMAGE), content(IMAGE, mask=tetopt.Image(np.ones(IMAGE.shape), IMAGE.affine))]
     first, masked = (bytes_of(kind, 0) for kind in kinds)
     assert masked - first == pytest.approx(BOUND_MARGIN * CHANNEL_BYTES * IMAGE.data.size)
-    assert bytes_of(plain(ones), 50) - bytes_of(plain(ones), 0) == pytest.approx(300 * BOUND_MARGIN * MESHED_CELL_BYTES)
+    assert bytes_of(plain(ones), 50) - bytes_of(plain(ones), 0) == pytest.approx(
+        300 * BOUND_MARGIN * MESHED_CELL_BYTES
+    )
     assert next_bytes(0) == 0.0
     assert 0.0 < next_bytes(1000) < meshing_bytes(0, 0, 1000)
 
 
 def test_a_whole_process_holds_what_it_reads():
     """Besides meshing: the image's voxels, and those of a mask and of labels' levels."""
-    mask, labels = tetopt.Image(np.ones(IMAGE.shape), IMAGE.affine), tetopt.Image(np.rint(IMAGE.data), IMAGE.affine)
+    mask, labels = (
+        tetopt.Image(np.ones(IMAGE.shape), IMAGE.affine),
+        tetopt.Image(np.rint(IMAGE.data), IMAGE.affine),
+    )
     bare, masked, labelled = (content(IMAGE), content(IMAGE, mask=mask), content(IMAGE, labels))
     beside = [(process_bytes(each, 50) - bytes_of(each, 50)) for each in (bare, masked, labelled)]
     assert beside[0] < beside[1] < beside[2]
@@ -143,9 +176,13 @@ def test_a_whole_process_holds_what_it_reads():
 
 @pytest.mark.full
 def test_a_run_ends_before_the_limit_with_the_mesh_reached(tmp_path, monkeypatch, capsys):
-    """`--max-gb`: the image alone is refused at once, else what is reached is written, and said why."""
+    """`--max-gb`: the image alone is refused at once, else what is reached is written, and said
+    why.
+    """
     tetopt.save_image(tmp_path / "a.nii.gz", sample_image(3))
-    words = mesh_words(tmp_path / "a.nii.gz", tmp_path, "--nodes", "60", "--iterations", "2", "--force")
+    words = mesh_words(
+        tmp_path / "a.nii.gz", tmp_path, "--nodes", "60", "--iterations", "2", "--force"
+    )
     assert exit_code(*words, "--max-gb", "0.001") == 2
     assert (
         "GB of memory in total, but only 1 MB is allowed; mesh a part of it (--crop)"
@@ -192,7 +229,9 @@ def test_lines_are_rare_and_the_first_is_said_at_once(monkeypatch):
 
 
 def test_compiling_and_long_iterations_are_told(monkeypatch):
-    """Before anything is compiled there is a line; and iterations, E, seconds and memory are told as they go."""
+    """Before anything is compiled there is a line; and iterations, E, seconds and memory are
+    told as they go.
+    """
     lines, clock = [], [0.0]
     monkeypatch.setattr(cli_run.log, "print", lines.append)
     monkeypatch.setattr(cli_run.time, "perf_counter", lambda: clock[0])
@@ -201,7 +240,10 @@ def test_compiling_and_long_iterations_are_told(monkeypatch):
         say("compiling the kernels, 1 of 57")
         assert lines == ["compiling the kernels, 1 of 57 (first run only), 0 s"]
 
-    rows = [IterationRecord(number, 1.0 - 0.1 * number, 2.0, 1.0, 0.1, False, 48, 504, 3.0) for number in (0, 1)]
+    rows = [
+        IterationRecord(number, 1.0 - 0.1 * number, 2.0, 1.0, 0.1, False, 48, 504, 3.0)
+        for number in (0, 1)
+    ]
 
     def optimized(max_seconds, callback, stop):
         callback(rows[0])
@@ -226,11 +268,15 @@ def test_compiling_and_long_iterations_are_told(monkeypatch):
 
 def records(*seconds):
     """Records of iterations that ended at these times."""
-    return [IterationRecord(n, 1.0, 1.0, 1.0, 0.1, False, 48, 504, at) for n, at in enumerate(seconds)]
+    return [
+        IterationRecord(n, 1.0, 1.0, 1.0, 0.1, False, 48, 504, at) for n, at in enumerate(seconds)
+    ]
 
 
 def test_the_time_left_is_told_from_the_third_iteration_on():
-    """At the pace of the last two iterations, within the time that is allowed; after the last there is none."""
+    """At the pace of the last two iterations, within the time that is allowed; after the last
+    there is none.
+    """
     assert left_words(records(1.0, 9.0, 15.0), 10, None) == ""
     history = records(1.0, 9.0, 15.0, 19.0)
     assert left_words(history, 10, None) == ", about 35 s left"

@@ -51,7 +51,9 @@ def test_arrays_are_copied_contiguous_and_read_only():
         mesh.points = points
 
 
-@pytest.mark.parametrize("again", [copy.copy, copy.deepcopy, lambda noun: pickle.loads(pickle.dumps(noun))])
+@pytest.mark.parametrize(
+    "again", [copy.copy, copy.deepcopy, lambda noun: pickle.loads(pickle.dumps(noun))]
+)
 def test_copies_of_nouns_are_locked_and_equal(again):
     middles = 0.5 * (np.array(TRIANGLE)[[0, 0, 1]] + np.array(TRIANGLE)[[1, 2, 2]])
     phantom = tetopt.load_phantom("sphere")
@@ -88,7 +90,9 @@ def test_masked_values_are_refused():
     with pytest.raises(InputError, match=r"^mesh cells: got 1 masked values"):
         Mesh(TRIANGLE, np.ma.masked_equal([[0, 1, 2]], 1))
     with pytest.raises(InputError, match=r"^quality: points: got 2 masked values"):
-        tetopt.quality(np.ma.masked_equal(np.array(TRIANGLE, dtype=float), 1.0), np.array([[0, 1, 2]]))
+        tetopt.quality(
+            np.ma.masked_equal(np.array(TRIANGLE, dtype=float), 1.0), np.array([[0, 1, 2]])
+        )
     assert Image(np.ma.masked_equal(np.zeros((2, 3)), 1.0)).data.shape == (2, 3)
 
 
@@ -114,7 +118,11 @@ def test_unused_nodes_are_allowed():
         (TRIANGLE, [[0, 1, 2], [0, 2, 1]], r"1 of 2 are flat or inverted, such as \[1\]"),
         (TRIANGLE, [[0, 1, 1]], "1 of 1 are flat or inverted"),
         ([[0, 0], [1, 1], [2, 2]], [[0, 1, 2]], "1 of 1 are flat or inverted"),
-        (REGULAR_TET[0], [[1, 0, 2, 3]] * 7, r"7 of 7 are flat or inverted, such as \[0, 1, 2, 3, 4\]"),
+        (
+            REGULAR_TET[0],
+            [[1, 0, 2, 3]] * 7,
+            r"7 of 7 are flat or inverted, such as \[0, 1, 2, 3, 4\]",
+        ),
     ],
 )
 def test_what_is_no_mesh_is_refused(points, cells, message):

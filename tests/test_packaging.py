@@ -1,4 +1,6 @@
-"""What a release says of itself: one version, an archive of sources with what it needs, what is run on which system."""
+"""What a release says of itself: one version, an archive of sources with what it needs, what is
+run on which system.
+"""
 
 import itertools
 import re
@@ -26,7 +28,9 @@ def test_there_is_one_version():
     assert PROJECT["project"]["dynamic"] == ["version"]
     assert PROJECT["tool"]["hatch"]["version"]["path"] == "tetopt/__init__.py"
     assert CITATION["version"] == tetopt.__version__
-    first = re.search(r"^## (\S+), (\S+)$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.M)
+    first = re.search(
+        r"^## (\S+), (\S+)$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.M
+    )
     assert first[1] == tetopt.__version__
     # A release has its day in both; what is not released has none.
     assert (first[2] == "unreleased") == ("date-released" not in CITATION)
@@ -36,11 +40,15 @@ def test_there_is_one_version():
 def test_what_is_said_twice_is_said_alike():
     assert CITATION["title"] == PROJECT["project"]["name"] == "tetopt"
     assert CITATION["license"] == PROJECT["project"]["license"]
-    assert [each["name"] for each in CITATION["authors"]] == [each["name"] for each in PROJECT["project"]["authors"]]
+    assert [each["name"] for each in CITATION["authors"]] == [
+        each["name"] for each in PROJECT["project"]["authors"]
+    ]
 
 
 def test_each_bound_of_a_package_is_one():
-    """A package that several extras name has one lower bound, so that a mesh's reader needs what was tested."""
+    """A package that several extras name has one lower bound, so that a mesh's reader needs what
+    was tested.
+    """
     bounds = {}
     extras = PROJECT["project"]["optional-dependencies"].values()
     for line in itertools.chain(PROJECT["project"]["dependencies"], *extras):
@@ -68,17 +76,25 @@ def test_the_recipe_for_conda_says_what_the_project_says():
 
 
 def test_the_archive_of_sources_has_what_git_has():
-    """Each file of the repository is in one of the archive's folders, or is there without being named."""
+    """Each file of the repository is in one of the archive's folders, or is there without being
+    named.
+    """
     if shutil.which("git") is None or not (ROOT / ".git").exists():
         pytest.skip("no git repository here")
-    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, encoding="utf-8", check=True).stdout
-    included = {each.strip("/") for each in PROJECT["tool"]["hatch"]["build"]["targets"]["sdist"]["include"]}
+    listed = subprocess.run(
+        ["git", "ls-files"], cwd=ROOT, capture_output=True, encoding="utf-8", check=True
+    ).stdout
+    included = {
+        each.strip("/") for each in PROJECT["tool"]["hatch"]["build"]["targets"]["sdist"]["include"]
+    }
     unnamed = {"README.md", "LICENSE", "pyproject.toml", ".gitignore"}  # hatch's own
     assert {each.split("/")[0] for each in listed.splitlines()} == included | unnamed
 
 
 def test_the_workflow_runs_what_there_is():
-    """Linux as `.ci/run` does; the steps elsewhere, where there is no make, run what its targets run."""
+    """Linux as `.ci/run` does; the steps elsewhere, where there is no make, run what its targets
+    run.
+    """
     jobs = WORKFLOW["jobs"]
     words = "\n".join(step.get("run", "") for job in jobs.values() for step in job["steps"])
     assert "\n.ci/run\n" in f"\n{words}\n"
@@ -88,22 +104,36 @@ def test_the_workflow_runs_what_there_is():
     for name in re.findall(r"\b(?:tests|scripts|docs)/[\w./]+", words):
         assert (ROOT / name).exists() or name.startswith("docs/_build"), name
     systems = {job["runs-on"] for job in jobs.values() if "matrix" not in str(job["runs-on"])}
-    systems |= {each for job in jobs.values() for each in job.get("strategy", {}).get("matrix", {}).get("os", [])}
+    systems |= {
+        each
+        for job in jobs.values()
+        for each in job.get("strategy", {}).get("matrix", {}).get("os", [])
+    }
     assert systems >= {"ubuntu-latest", "macos-latest", "windows-latest"}
     for job in jobs.values():  # by the major version, which its makers keep compatible
-        assert all(re.fullmatch(r"[\w/-]+@v\d+", step["uses"]) for step in job["steps"] if "uses" in step)
+        assert all(
+            re.fullmatch(r"[\w/-]+@v\d+", step["uses"]) for step in job["steps"] if "uses" in step
+        )
 
 
 def test_long_files_begin_first():
     """Each is there, and each run on several processes keeps the order."""
     assert [name for name in LONGEST_FILES if not (ROOT / "tests" / name).exists()] == []
     for path in (ROOT / "Makefile", ROOT / ".github" / "workflows" / "ci.yml"):
-        lines = [line for line in path.read_text(encoding="utf-8").splitlines() if "--dist loadfile" in line]
+        lines = [
+            line
+            for line in path.read_text(encoding="utf-8").splitlines()
+            if "--dist loadfile" in line
+        ]
         assert lines
         assert all("--no-loadscope-reorder" in line for line in lines)
 
 
 @pytest.mark.slow
 def test_wheel_and_sources_install_and_run(tmp_path):
-    """As `make dist`: built, checked, installed into fresh environments, and run there. Needs an index of packages."""
-    subprocess.run([sys.executable, ROOT / ".ci" / "dist.py", tmp_path / "dist"], cwd=tmp_path, check=True)
+    """As `make dist`: built, checked, installed into fresh environments, and run there. Needs an
+    index of packages.
+    """
+    subprocess.run(
+        [sys.executable, ROOT / ".ci" / "dist.py", tmp_path / "dist"], cwd=tmp_path, check=True
+    )

@@ -11,7 +11,11 @@ ROOT = Path(__file__).resolve().parents[1]
 PICTURES = sorted((ROOT / "docs" / "pictures").glob("*.png"))
 PAGES = {
     path: path.read_text(encoding="utf-8")
-    for path in [ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), *(ROOT / "docs" / "examples").glob("*.py")]
+    for path in [
+        ROOT / "README.md",
+        *(ROOT / "docs").rglob("*.md"),
+        *(ROOT / "docs" / "examples").glob("*.py"),
+    ]
     if "_build" not in path.parts
 }
 drawing = script("draw_documents")
@@ -19,12 +23,18 @@ drawing = script("draw_documents")
 
 @pytest.mark.parametrize("path", PICTURES, ids=lambda path: path.name)
 def test_a_picture_has_its_page_and_its_command(path):
-    """The page's command is a line of code with the picture's name; the script's tables have those of the rest."""
+    """The page's command is a line of code with the picture's name; the script's tables have
+    those of the rest.
+    """
     assert any(f"pictures/{path.name}" in text for text in PAGES.values()), "no page shows it"
     is_in_table = path.stem in drawing.PICTURES or path.name in drawing.COMMANDS
     line = re.compile(rf"^.*(tetopt|python|make|chromium) .*\b{re.escape(path.name)}", re.MULTILINE)
-    assert is_in_table or any(line.search(text) for text in PAGES.values()), "nothing tells how it was made"
-    assert path.stat().st_size <= drawing.LARGEST_BYTES, "it loads slowly; see --shrink of docs/draw_documents.py"
+    assert is_in_table or any(line.search(text) for text in PAGES.values()), (
+        "nothing tells how it was made"
+    )
+    assert path.stat().st_size <= drawing.LARGEST_BYTES, (
+        "it loads slowly; see --shrink of docs/draw_documents.py"
+    )
 
 
 def test_every_drawing_is_on_a_page():
@@ -37,7 +47,9 @@ def test_figures_have_captions_and_words_for_those_who_cannot_see_them():
     """Each `figure` of a page has an alt text, and a caption of a sentence at least."""
     n_figures = 0
     for path, text in PAGES.items():
-        for target, body in re.findall(r"^[`:]{3,}\{figure\} (\S+)\n(.*?)^[`:]{3,}$", text, re.MULTILINE | re.DOTALL):
+        for target, body in re.findall(
+            r"^[`:]{3,}\{figure\} (\S+)\n(.*?)^[`:]{3,}$", text, re.MULTILINE | re.DOTALL
+        ):
             n_figures += 1
             assert re.search(r"^:alt: \S+ \S+", body, re.MULTILINE), (path.name, target)
             caption = re.sub(r"^:.*$", "", body, flags=re.MULTILINE).strip()
@@ -48,7 +60,9 @@ def test_figures_have_captions_and_words_for_those_who_cannot_see_them():
 
 @pytest.mark.drawn
 def test_a_drawing_is_written_once(tmp_path, capsys):
-    """An existing picture is replaced only by --force; what is written is a picture of a few colours."""
+    """An existing picture is replaced only by --force; what is written is a picture of a few
+    colours.
+    """
     arguments = ["-o", str(tmp_path), "--only", "shapes"]
     assert drawing.main(arguments) == 0
     assert capsys.readouterr().out.startswith(f"{tmp_path / 'shapes.png'}: ")
@@ -68,7 +82,11 @@ def test_a_wide_picture_is_kept_small(tmp_path):
     noise = PIL.Image.effect_noise((1500, 150), 12.0).convert("RGB")
     noise.save(tmp_path / "noise.png")
     (tmp_path / "kept").mkdir()
-    assert drawing.main(["-o", str(tmp_path / "kept"), "--shrink", str(tmp_path / "noise.png")]) == 0
+    assert (
+        drawing.main(["-o", str(tmp_path / "kept"), "--shrink", str(tmp_path / "noise.png")]) == 0
+    )
     with PIL.Image.open(tmp_path / "kept" / "noise.png") as picture:
         assert picture.size == (drawing.LARGEST_WIDTH, 140)
-    assert (tmp_path / "kept" / "noise.png").stat().st_size < (tmp_path / "noise.png").stat().st_size / 2
+    assert (tmp_path / "kept" / "noise.png").stat().st_size < (
+        tmp_path / "noise.png"
+    ).stat().st_size / 2

@@ -36,20 +36,26 @@ def test_program(tmp_path, monkeypatch, capsys):
     fraction, shape = re.fullmatch(r"unexplained variance (\S+), mean rho (\S+)", second).groups()
     assert 0.0001 < float(fraction) < 0.01
     assert float(shape) > 0.24
-    n_materials, error = re.fullmatch(r"(\d+) materials, their moduli off by (\S+)% on average", third).groups()
+    n_materials, error = re.fullmatch(
+        r"(\d+) materials, their moduli off by (\S+)% on average", third
+    ).groups()
     assert 8 <= int(n_materials) <= 16
     assert 0.0 < float(error) < 5.0
     assert "*MATERIAL" in Path("two_spheres.inp").read_text()
     written = tetopt.load_mesh("two_spheres.vtu")
     assert len(written.mesh.cells) == len(names["result"].mesh.cells)
-    assert (written.cell_data["mean"] == tetopt.cell_moments(names["image"], written.mesh).mean).all()
+    assert (
+        written.cell_data["mean"] == tetopt.cell_moments(names["image"], written.mesh).mean
+    ).all()
 
 
 @pytest.mark.full
 def test_commands(tmp_path, monkeypatch, capsys):
     """The three `tetopt` commands, on a phantom in the place of the T1 and with fewer nodes."""
     lines = [
-        line for line in README.replace("\\\n", " ").splitlines() if line.startswith("tetopt ") and "`" not in line
+        line
+        for line in README.replace("\\\n", " ").splitlines()
+        if line.startswith("tetopt ") and "`" not in line
     ]
     commands = [line for line in lines if re.match(r"tetopt (mesh|quality|convert) \S+\.", line)]
     assert len(commands) == 3
@@ -75,7 +81,9 @@ def test_the_demo_compiles_for_all_later_commands():
 def test_paths_and_targets_named_exist():
     """Every relative link and picture of the README is there, and what it has make do."""
     for target in ("demo", "test", "docs"):
-        assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+        assert re.search(
+            rf"^{target}:", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE
+        )
         assert f"make {target}" in README
     paths = re.findall(r"\]\(([^)#:]+)\)", README)
     assert len(paths) > 10

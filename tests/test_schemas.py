@@ -40,7 +40,9 @@ def leaves(part, path=""):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_key_is_described(kind):
-    """A schema is one of draft 2020-12, each key has its words, and no object takes other keys than it names."""
+    """A schema is one of draft 2020-12, each key has its words, and no object takes other keys
+    than it names.
+    """
     jsonschema.Draft202012Validator.check_schema(schema(kind))
     for path, part in leaves(schema(kind)):
         for key, each in part.get("properties", {}).items():
@@ -62,7 +64,9 @@ def numbers(tmp_path_factory):
 
 
 def test_kinds(numbers):
-    """What the commands write is known for what it is, so that it is looked at; anything else is not."""
+    """What the commands write is known for what it is, so that it is looked at; anything else is
+    not.
+    """
     assert [kind_of(each) for each in numbers] == ["run", "quality"]
     assert kind_of({"pipelines": [], "quadratic": [], "reference": {}, "seconds": 1.0}) == "report"
     assert kind_of([1, 2]) is None
@@ -70,7 +74,9 @@ def test_kinds(numbers):
 
 
 def test_a_key_without_description_is_seen(numbers, tmp_path):
-    """Whatever is written by tests goes through the schemas: a new key, one that is gone, another type."""
+    """Whatever is written by tests goes through the schemas: a new key, one that is gone,
+    another type.
+    """
     run = numbers[0]
     assert_described(run)
     for wrong in (
@@ -102,7 +108,9 @@ def test_the_tables_have_every_key(numbers):
 
 def test_units_are_those_of_the_cohort():
     """A column of cohort.tsv that is a number of run.json has the same unit there."""
-    columns = tomllib.loads((ROOT / "tetopt" / "cohort" / "columns.toml").read_text(encoding="utf-8"))
+    columns = tomllib.loads(
+        (ROOT / "tetopt" / "cohort" / "columns.toml").read_text(encoding="utf-8")
+    )
     units = {path: part.get("unit", "") for path, part in leaves(schema("run"))}
     parts = ("quality.", "mask.", "size.", "seconds.", "energies.", "memory.")
     shared = {name: words[1] for name, words in columns.items() if name.startswith(parts)}

@@ -28,25 +28,44 @@ def script(name):
 
 
 def test_ventricles_of_a_phantom(tmp_path, capsys, opengl):
-    """The dark structure inside a bright head is found, one connected set, near its true volume; the air is not."""
+    """The dark structure inside a bright head is found, one connected set, near its true volume;
+    the air is not.
+    """
     axis = np.arange(40) - 19.5
     r = np.sqrt(axis[:, None, None] ** 2 + axis[None, :, None] ** 2 + axis[None, None, :] ** 2)
     data = np.where(r < 6.0, 30.0, np.where(r < 17.0, 150.0, 0.0))
-    nibabel.save(nibabel.Nifti1Image(data.astype(np.float32), np.diag([2.0, 2.0, 2.0, 1.0])), tmp_path / "head.nii.gz")
+    nibabel.save(
+        nibabel.Nifti1Image(data.astype(np.float32), np.diag([2.0, 2.0, 2.0, 1.0])),
+        tmp_path / "head.nii.gz",
+    )
     out = tmp_path / "out"
     code = script("mesh_brain_mr").main(
-        [str(tmp_path / "head.nii.gz"), "-o", str(out), "--nodes", "2500", "--iterations", "6", "--k-d", "0.5"]
+        [
+            str(tmp_path / "head.nii.gz"),
+            "-o",
+            str(out),
+            "--nodes",
+            "2500",
+            "--iterations",
+            "6",
+            "--k-d",
+            "0.5",
+        ]
     )
     assert code == 0
     written = tetopt.load_mesh(out / "mesh.vtu")
     inside = np.flatnonzero(written.cell_data["is_structure"])
     assert components(written.mesh.cells[inside]).max() == 0
-    assert written.cell_data["mean"][inside].max() < json.loads((out / "run.json").read_text())["options"]["below"]
+    assert (
+        written.cell_data["mean"][inside].max()
+        < json.loads((out / "run.json").read_text())["options"]["below"]
+    )
     volume = written.cell_data["volume"][inside].sum()
     assert volume == pytest.approx(4 / 3 * np.pi * 12.0**3, rel=0.25)
-    centre = (written.cell_data["volume"][inside, None] * written.mesh.points[written.mesh.cells[inside]].mean(1)).sum(
-        0
-    )
+    centre = (
+        written.cell_data["volume"][inside, None]
+        * written.mesh.points[written.mesh.cells[inside]].mean(1)
+    ).sum(0)
     np.testing.assert_allclose(centre / volume, [39.0, 39.0, 39.0], atol=1.0)
     surface = trimesh.load(out / "structure.stl")
     assert surface.volume == pytest.approx(volume, rel=1e-4)  # STL holds float32
@@ -65,7 +84,10 @@ def test_mesh_brain_mr_bad_input(tmp_path, capsys):
 def test_benchmark(tmp_path, capsys):
     """It runs, and what it prints is what it writes."""
     image = tetopt.load_phantom("sphere").image(voxel_mm=2.0)
-    tetopt.save_image(tmp_path / "b.nii.gz", tetopt.Image(image.data - image.data.min(), image.affine))  # background 0
+    # background 0
+    tetopt.save_image(
+        tmp_path / "b.nii.gz", tetopt.Image(image.data - image.data.min(), image.affine)
+    )
     words = [str(tmp_path / "b.nii.gz"), "--quick", "-o"]
     assert script("benchmark").main([*words, str(tmp_path / "b.json")]) == 0
     rows = json.loads((tmp_path / "b.json").read_text())
@@ -81,7 +103,11 @@ def test_benchmark(tmp_path, capsys):
 
 def test_fingerprints(tmp_path, monkeypatch, capsys):
     """The same run has the same checksums; another one is named, and is exit code 1."""
-    module, first, second = script("fingerprints"), tmp_path / "first.json", tmp_path / "second.json"
+    module, first, second = (
+        script("fingerprints"),
+        tmp_path / "first.json",
+        tmp_path / "second.json",
+    )
     module.RUN_WORDS["small"] = "OBLIQUE --nodes 100 --iterations 1"
     images = module.made_images(tmp_path)  # once for all calls
     monkeypatch.setattr(module, "made_images", lambda _: images)
@@ -99,10 +125,24 @@ def test_fingerprints(tmp_path, monkeypatch, capsys):
 
 
 def test_choose_sizes(tmp_path, monkeypatch, capsys):
-    """Every mesh is measured; a tighter largest edge leaves more E_D and follows the displacement better."""
+    """Every mesh is measured; a tighter largest edge leaves more E_D and follows the
+    displacement better.
+    """
     monkeypatch.syspath_prepend(str(ROOT / "tests" / "benchmarks"))
     out = tmp_path / "sizes.json"
-    words = ["-o", str(out), "--phantoms", "two_spheres", "--nodes", "300", "--dofs", "8000", "--largest", "1", "inf"]
+    words = [
+        "-o",
+        str(out),
+        "--phantoms",
+        "two_spheres",
+        "--nodes",
+        "300",
+        "--dofs",
+        "8000",
+        "--largest",
+        "1",
+        "inf",
+    ]
     assert script("choose_sizes").main(words) == 0
     rows = {row["mesh"]: row["measured"] for row in json.loads(out.read_text())["rows"]}
     assert len(rows) == 2 + 2 + 5
@@ -116,7 +156,11 @@ def test_choose_sizes(tmp_path, monkeypatch, capsys):
 
 def test_curved_cells(tmp_path, monkeypatch):
     """Curved facets are nearer to the sphere, and the volume of its label to that of the voxels."""
-    module, out, labels = script("curved_cells"), tmp_path / "curved.json", tmp_path / "labels.nii.gz"
+    module, out, labels = (
+        script("curved_cells"),
+        tmp_path / "curved.json",
+        tmp_path / "labels.nii.gz",
+    )
     monkeypatch.setattr(module, "NODES", (1_500,))
     monkeypatch.setattr(module, "NODES_OF_LABELS", 1_500)
     tetopt.save_image(labels, module.sphere())
@@ -130,18 +174,38 @@ def test_choose_average(tmp_path, monkeypatch, capsys):
     """Every average is solved on every mesh; the stiffer it is, the more energy there is."""
     monkeypatch.syspath_prepend(str(ROOT / "tests" / "benchmarks"))
     out = tmp_path / "averages.json"
-    words = ["-o", str(out), "--phantoms", "two_spheres", "--nodes", "400", "--dofs", "20000", "--modes", "uniform"]
+    words = [
+        "-o",
+        str(out),
+        "--phantoms",
+        "two_spheres",
+        "--nodes",
+        "400",
+        "--dofs",
+        "20000",
+        "--modes",
+        "uniform",
+    ]
     assert script("choose_average").main(words) == 0
     written = json.loads(out.read_text())
     assert len(written["rows"]) == 9 * 2 * 2
     for order in (1, 2):
-        rows = {row["average"]: row for row in written["rows"] if (row["order"], row["nu"]) == (order, "0.3")}
-        stiffer = [rows[each]["stiffer"] for each in ("mean", "power:0.5", "geometric", "power:-0.5", "harmonic")]
+        rows = {
+            row["average"]: row
+            for row in written["rows"]
+            if (row["order"], row["nu"]) == (order, "0.3")
+        }
+        stiffer = [
+            rows[each]["stiffer"]
+            for each in ("mean", "power:0.5", "geometric", "power:-0.5", "harmonic")
+        ]
         assert stiffer == sorted(stiffer, reverse=True)
         assert rows["harmonic"]["stiffer"] < rows["hill"]["stiffer"] < rows["mean"]["stiffer"]
         assert rows["mean"]["n_nodes"] == pytest.approx(400, rel=0.25)
         for each, row in rows.items():
-            assert abs(row["stiffer"]) == pytest.approx(row["errors"]["strain_energy"], rel=1e-9), each
+            assert abs(row["stiffer"]) == pytest.approx(row["errors"]["strain_energy"], rel=1e-9), (
+                each
+            )
     assert set(written["relative_to_mean"]["order 2, mean"].values()) == {1.0}
     assert "order 2, nodes" in written["relative_to_mean"]
     assert "all, order 1, hill: strain_energy x" in capsys.readouterr().out
@@ -153,7 +217,17 @@ def test_choose_average(tmp_path, monkeypatch, capsys):
 
 def test_benchmark_of_parts(tmp_path, capsys):
     """Its table adds up: all parts of all rounds are tasks, and the stages follow one another."""
-    arguments = ["24", "--nodes", "500", "--parts", "2", "--workers", "0", "--folder", str(tmp_path)]
+    arguments = [
+        "24",
+        "--nodes",
+        "500",
+        "--parts",
+        "2",
+        "--workers",
+        "0",
+        "--folder",
+        str(tmp_path),
+    ]
     output = tmp_path / "bench.json"
     assert script("benchmark_blocks").main([*arguments, "-o", str(output)]) == 0
     rows = json.loads(output.read_text())

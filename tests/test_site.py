@@ -12,7 +12,9 @@ _spec = importlib.util.spec_from_file_location("check_site", ROOT / "docs" / "ch
 check_site = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(check_site)
 
-PAGE = '<html><head><link rel="stylesheet" href="look.css?v=1"></head><body id="top">{}</body></html>'
+PAGE = (
+    '<html><head><link rel="stylesheet" href="look.css?v=1"></head><body id="top">{}</body></html>'
+)
 
 
 @pytest.mark.parametrize(
@@ -21,10 +23,19 @@ PAGE = '<html><head><link rel="stylesheet" href="look.css?v=1"></head><body id="
         ('<a href="other.html#there">x</a><a href="#top">x</a>', None),
         ('<a href="https://example.org">x</a><img src="a%20b.png">', None),
         ('<a href="gone.html">x</a>', "index.html: gone.html is not there"),
-        ('<a href="other.html#gone">x</a>', "index.html: other.html#gone has no such place on its page"),
+        (
+            '<a href="other.html#gone">x</a>',
+            "index.html: other.html#gone has no such place on its page",
+        ),
         ('<img src="gone.png">', "index.html: gone.png is not there"),
-        ('<script src="https://x.org/x"></script>', "index.html: loads https://x.org/x, which is not in the site"),
-        ('<script src="//x.org/x"></script>', "index.html: loads //x.org/x, which is not in the site"),
+        (
+            '<script src="https://x.org/x"></script>',
+            "index.html: loads https://x.org/x, which is not in the site",
+        ),
+        (
+            '<script src="//x.org/x"></script>',
+            "index.html: loads //x.org/x, which is not in the site",
+        ),
     ],
 )
 def test_what_leads_nowhere(tmp_path, body, fault):

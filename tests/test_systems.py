@@ -16,7 +16,9 @@ ROOT = Path(__file__).resolve().parents[1]
 
 @pytest.mark.skipif(sys.platform != "linux", reason="files in use are told by /proc")
 def test_commands_run_without_posix_and_replace_nothing_in_use(tmp_path):
-    """Every module is imported, commands read and write, a child is ended: see `windows`, which does it."""
+    """Every module is imported, commands read and write, a child is ended: see `windows`, which
+    does it.
+    """
     done = subprocess.run(
         [sys.executable, "-m", "windows", tmp_path],
         env=os.environ | {"PYTHONPATH": os.pathsep.join((str(ROOT), str(ROOT / "tests")))},
@@ -28,7 +30,9 @@ def test_commands_run_without_posix_and_replace_nothing_in_use(tmp_path):
 
 
 def test_kernels_are_compiled_beneath_a_launcher(tmp_path, monkeypatch):
-    """Windows' environments start Python by a program in between; elsewhere another parent means that ours ended."""
+    """Windows' environments start Python by a program in between; elsewhere another parent means
+    that ours ended.
+    """
     compiled = []
 
     class Kernel:

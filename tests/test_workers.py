@@ -1,4 +1,6 @@
-"""Workers of dask and their tasks: how many, whose, what a death of one costs, and what is refused."""
+"""Workers of dask and their tasks: how many, whose, what a death of one costs, and what is
+refused.
+"""
 
 import os
 import signal
@@ -34,7 +36,12 @@ from tetopt.workers import (
 GB = 1e9
 LIMIT = 0.4e9  # of a worker, which has 0.1 GB
 # Of a cluster of somebody else's, without processes of its own.
-IN_PROCESS = {"processes": False, "protocol": "tcp://", "dashboard_address": "127.0.0.1:0", "silence_logs": 50}
+IN_PROCESS = {
+    "processes": False,
+    "protocol": "tcp://",
+    "dashboard_address": "127.0.0.1:0",
+    "silence_logs": 50,
+}
 
 
 @pytest.mark.parametrize(
@@ -73,7 +80,10 @@ def run(pool, tmp_path):
     pool.client.wait_for_workers(2, timeout=60)  # one of the test before may be starting again
 
     def outcomes(function, names):
-        return {name: error or done for name, done, error in run_tasks(pool, function, names, str(tmp_path))}
+        return {
+            name: error or done
+            for name, done, error in run_tasks(pool, function, names, str(tmp_path))
+        }
 
     return outcomes
 
@@ -96,8 +106,11 @@ def test_workers_here_have_their_threads_and_memory_and_leave_nothing(tmp_path, 
         assert one.words() == "1 task at a time, each of 3 threads"
         assert one.client.scheduler.address.split("://")[1].startswith("127.0.0.1:")
         ended = list(run_tasks(one, settings, list("bca"), str(tmp_path)))
-    assert [done for _, done, _ in ended] == [(name, "3", LIMIT) for name in "bca"]  # in their order
-    assert not any("spawn_main" in " ".join(psutil.Process(pid).cmdline()) for pid in processes() - before)
+    # in their order
+    assert [done for _, done, _ in ended] == [(name, "3", LIMIT) for name in "bca"]
+    assert not any(
+        "spawn_main" in " ".join(psutil.Process(pid).cmdline()) for pid in processes() - before
+    )
     assert capfd.readouterr() == ("", "")
 
 
@@ -144,7 +157,9 @@ def test_a_task_that_ends_its_workers_or_fails_takes_no_others_with_it(run, tmp_
     assert ended == {name: name for name in "acdef"}
     assert isinstance(error, WorkerEnded)
     assert len(list(tmp_path.glob("b.*"))) == 2
-    assert str(error) == "its worker ended, 2 times, possibly because it exceeded its limit of 0.4 GB"
+    assert (
+        str(error) == "its worker ended, 2 times, possibly because it exceeded its limit of 0.4 GB"
+    )
     assert capfd.readouterr() == ("", "")
 
 
@@ -188,8 +203,14 @@ def test_nothing_is_left_of_a_client_that_is_killed(tmp_path):
 
 
 def of_session(number):
-    rows = subprocess.run(["ps", "-eo", "sess=,stat=,args="], capture_output=True, text=True, check=True).stdout
-    return [row for row in rows.splitlines() if row.split()[0] == str(number) and not row.split()[1].startswith("Z")]
+    rows = subprocess.run(
+        ["ps", "-eo", "sess=,stat=,args="], capture_output=True, text=True, check=True
+    ).stdout
+    return [
+        row
+        for row in rows.splitlines()
+        if row.split()[0] == str(number) and not row.split()[1].startswith("Z")
+    ]
 
 
 # ---- A scheduler that runs
@@ -198,7 +219,9 @@ def of_session(number):
 @pytest.fixture(scope="module")
 def others():
     """A cluster of somebody else's, within this process: 2 workers with 8 GB each."""
-    with LocalCluster(n_workers=2, threads_per_worker=1, memory_limit="8GB", **IN_PROCESS) as cluster:
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, memory_limit="8GB", **IN_PROCESS
+    ) as cluster:
         yield cluster
 
 
@@ -223,16 +246,23 @@ def test_workers_of_a_scheduler_that_runs(others, tmp_path):
 def test_workers_that_cannot_run_tasks_are_refused(others, tmp_path, monkeypatch):
     """Each at its first task, as workers come and go."""
     with workers(NOTHING, others.scheduler.address, None) as pool:
-        with pytest.raises(UnfitWorker, match=r"cannot access .*no; expected an output folder on a file system that"):
+        with pytest.raises(
+            UnfitWorker,
+            match=r"cannot access .*no; expected an output folder on a file system that",
+        ):
             list(run_tasks(pool, limit_of, "abc", str(tmp_path / "no")))
         versions = iter(["tetopt 9 and Python 3.11", "tetopt 8 and Python 3.11"])
         monkeypatch.setattr(module, "_versions", lambda: next(versions, "tetopt 8 and Python 3.11"))
-        with pytest.raises(UnfitWorker, match=r"expected tetopt 9 and Python 3.11 as here, got tetopt 8 and"):
+        with pytest.raises(
+            UnfitWorker, match=r"expected tetopt 9 and Python 3.11 as here, got tetopt 8 and"
+        ):
             list(run_tasks(pool, limit_of, "a", str(tmp_path)))
     with (
         LocalCluster(n_workers=1, threads_per_worker=2, **IN_PROCESS) as cluster,
         workers(NOTHING, cluster.scheduler.address, None) as pool,
-        pytest.raises(UnfitWorker, match=r"expected one task at a time, got 2; .* --nthreads 1 --nworkers 2"),
+        pytest.raises(
+            UnfitWorker, match=r"expected one task at a time, got 2; .* --nthreads 1 --nworkers 2"
+        ),
     ):
         list(run_tasks(pool, limit_of, "abc", str(tmp_path)))
 
@@ -274,16 +304,23 @@ def silent():
 
 
 @pytest.mark.full
-def test_a_scheduler_that_says_nothing_is_refused_before_images_are_read(silent, tmp_path, monkeypatch, capfd):
+def test_a_scheduler_that_says_nothing_is_refused_before_images_are_read(
+    silent, tmp_path, monkeypatch, capfd
+):
     monkeypatch.setattr(module, "CONNECT_SECONDS", 0.3)
     save_image(tmp_path / "large.nii", sample_image(3))
     os.truncate(tmp_path / "large.nii", 400)  # a header alone
     (tmp_path / "t.tsv").write_text("task\timage\n1\tnone.nii\n")
     for command in (["cohort", tmp_path / "t.tsv"], ["mesh", tmp_path / "large.nii", "--parts", 2]):
-        assert exit_code(*command, "-o", tmp_path / "out.vtu", "--nodes", 200, "--scheduler", silent) == 2
+        assert (
+            exit_code(*command, "-o", tmp_path / "out.vtu", "--nodes", 200, "--scheduler", silent)
+            == 2
+        )
         said = capfd.readouterr()
         assert (said.out, said.err.count("\n")) == ("", 1)
-        assert f"--scheduler: {silent} does not answer (no reply of dask's within 0.3 s)" in said.err
+        assert (
+            f"--scheduler: {silent} does not answer (no reply of dask's within 0.3 s)" in said.err
+        )
         assert not (tmp_path / "out.vtu").exists()
 
 
@@ -306,7 +343,9 @@ def test_another_service_at_the_address_is_no_scheduler(capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_what_is_missing_or_contradictory_is_said_before_anything_is_written(tmp_path, monkeypatch, capsys):
+def test_what_is_missing_or_contradictory_is_said_before_anything_is_written(
+    tmp_path, monkeypatch, capsys
+):
     save_image(tmp_path / "a.nii.gz", sample_image(3))
     (tmp_path / "t.tsv").write_text("task\timage\n1\ta.nii.gz\n")
     command = ["cohort", tmp_path / "t.tsv", "-o", tmp_path / "out", "--nodes", 60]
@@ -314,7 +353,8 @@ def test_what_is_missing_or_contradictory_is_said_before_anything_is_written(tmp
     assert "--workers: expected none with --scheduler" in capsys.readouterr().err
     monkeypatch.setattr(module, "find_spec", lambda name: None)
     assert exit_code(*command) == 2
-    assert 'distributed is not installed, but dask needs it to run tasks; pip install "distributed"' in (
-        capsys.readouterr().err
+    assert (
+        'distributed is not installed, but dask needs it to run tasks; pip install "distributed"'
+        in (capsys.readouterr().err)
     )
     assert not (tmp_path / "out").exists()

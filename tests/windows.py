@@ -1,9 +1,11 @@
-"""A Windows to try the package in, as far as that can be had elsewhere: run as ``python -m windows FOLDER``.
+"""A Windows to try the package in, as far as that can be had elsewhere: run as ``python -m windows
+FOLDER``.
 
-The package's own modules, and no others, see no POSIX: the modules, functions and signals that Windows lacks are taken
-away, and `os.name` and `sys.platform` say so. For all code the system is as strict as Windows: what is open, or mapped
-into the memory, can be neither replaced nor removed, and names hold none of the characters that are not allowed there.
-Paths keep their slashes, text its encoding.
+The package's own modules, and no others, see no POSIX: the modules, functions and signals that
+Windows lacks are taken away, and `os.name` and `sys.platform` say so. For all code the system is as
+strict as Windows: what is open, or mapped into the memory, can be neither replaced nor removed, and
+names hold none of the characters that are not allowed there. Paths keep their slashes, text its
+encoding.
 """
 
 import builtins
@@ -16,20 +18,113 @@ import time
 import types
 from pathlib import Path
 
-NO_MODULES = {"fcntl", "resource", "pwd", "grp", "termios", "tty", "pty", "crypt", "syslog", "curses"}
+NO_MODULES = {
+    "fcntl",
+    "resource",
+    "pwd",
+    "grp",
+    "termios",
+    "tty",
+    "pty",
+    "crypt",
+    "syslog",
+    "curses",
+}
 NO_NAMES = {
     "os": {
-        *("chown", "lchown", "fchown", "fchmod", "killpg", "getpgid", "getpgrp", "setpgid", "setsid", "getsid", "fork"),
-        *("forkpty", "getuid", "geteuid", "getgid", "getegid", "getgroups", "setuid", "setgid", "sysconf", "ctermid"),
-        *("sysconf_names", "getloadavg", "uname", "sched_getaffinity", "sched_setaffinity", "mkfifo", "mknod", "wait"),
-        *("statvfs", "fstatvfs", "nice", "getpriority", "wait3", "wait4", "pread", "pwrite", "openpty", "set_blocking"),
-        *("O_NONBLOCK", "O_CLOEXEC", "O_DIRECTORY", "O_NOFOLLOW", "O_SYNC", "WIFSIGNALED", "WTERMSIG", "EX_USAGE"),
-        *("posix_fallocate", "posix_fadvise", "sendfile", "memfd_create", "listxattr", "setxattr", "getxattr", "sync"),
+        *(
+            "chown",
+            "lchown",
+            "fchown",
+            "fchmod",
+            "killpg",
+            "getpgid",
+            "getpgrp",
+            "setpgid",
+            "setsid",
+            "getsid",
+            "fork",
+        ),
+        *(
+            "forkpty",
+            "getuid",
+            "geteuid",
+            "getgid",
+            "getegid",
+            "getgroups",
+            "setuid",
+            "setgid",
+            "sysconf",
+            "ctermid",
+        ),
+        *(
+            "sysconf_names",
+            "getloadavg",
+            "uname",
+            "sched_getaffinity",
+            "sched_setaffinity",
+            "mkfifo",
+            "mknod",
+            "wait",
+        ),
+        *(
+            "statvfs",
+            "fstatvfs",
+            "nice",
+            "getpriority",
+            "wait3",
+            "wait4",
+            "pread",
+            "pwrite",
+            "openpty",
+            "set_blocking",
+        ),
+        *(
+            "O_NONBLOCK",
+            "O_CLOEXEC",
+            "O_DIRECTORY",
+            "O_NOFOLLOW",
+            "O_SYNC",
+            "WIFSIGNALED",
+            "WTERMSIG",
+            "EX_USAGE",
+        ),
+        *(
+            "posix_fallocate",
+            "posix_fadvise",
+            "sendfile",
+            "memfd_create",
+            "listxattr",
+            "setxattr",
+            "getxattr",
+            "sync",
+        ),
         *("confstr", "fdatasync", "WNOHANG"),
     },
     "signal": {
-        *("SIGHUP", "SIGKILL", "SIGUSR1", "SIGUSR2", "SIGALRM", "SIGBUS", "SIGTRAP", "SIGQUIT", "SIGXCPU", "SIGPIPE"),
-        *("SIGCHLD", "SIGCONT", "SIGSTOP", "alarm", "setitimer", "pthread_kill", "pthread_sigmask", "sigwait", "pause"),
+        *(
+            "SIGHUP",
+            "SIGKILL",
+            "SIGUSR1",
+            "SIGUSR2",
+            "SIGALRM",
+            "SIGBUS",
+            "SIGTRAP",
+            "SIGQUIT",
+            "SIGXCPU",
+            "SIGPIPE",
+        ),
+        *(
+            "SIGCHLD",
+            "SIGCONT",
+            "SIGSTOP",
+            "alarm",
+            "setitimer",
+            "pthread_kill",
+            "pthread_sigmask",
+            "sigwait",
+            "pause",
+        ),
     },
     "time": {"clock_gettime", "tzset", "CLOCK_MONOTONIC"},
     "socket": {"AF_UNIX", "socketpair_unix"},
@@ -85,7 +180,9 @@ def _whole(path, folder=None):
 
 
 def _strict(function, n_paths, is_new):
-    """A function of files as Windows has it: it refuses those in use, and `is_new` names that are not allowed."""
+    """A function of files as Windows has it: it refuses those in use, and `is_new` names that
+    are not allowed.
+    """
 
     def strict(*paths, **options):
         folder = options.get("dir_fd", options.get("src_dir_fd"))
@@ -93,7 +190,9 @@ def _strict(function, n_paths, is_new):
         for path in paths[:n_paths]:
             whole = _whole(path, folder)
             if any(each == whole or each.startswith(whole + os.sep) for each in used):
-                raise PermissionError(13, "The process cannot access the file because it is in use", whole)
+                raise PermissionError(
+                    13, "The process cannot access the file because it is in use", whole
+                )
         if is_new:
             _check_name(paths[-1])
         return function(*paths, **options)
@@ -103,7 +202,11 @@ def _strict(function, n_paths, is_new):
 
 def _check_name(path):
     name = os.path.basename(os.fsdecode(os.fspath(path)))
-    if set(name) & BAD_CHARACTERS or name.endswith((" ", ".")) or any(ord(letter) < 32 for letter in name):
+    if (
+        set(name) & BAD_CHARACTERS
+        or name.endswith((" ", "."))
+        or any(ord(letter) < 32 for letter in name)
+    ):
         raise OSError(22, "The filename, directory name, or volume label syntax is incorrect", name)
 
 
@@ -120,8 +223,12 @@ def become_windows():
     """From now on this process is such a Windows."""
     builtins.__import__ = _imported
     for name, n_paths, is_new in (
-        ("replace", 2, True), ("rename", 2, True), ("unlink", 1, False), ("remove", 1, False), ("rmdir", 1, False),
-    ):  # fmt: skip
+        ("replace", 2, True),
+        ("rename", 2, True),
+        ("unlink", 1, False),
+        ("remove", 1, False),
+        ("rmdir", 1, False),
+    ):
         setattr(os, name, _strict(getattr(os, name), n_paths, is_new))
     os.link = _opened(os.link)
     os.mkdir = _opened(os.mkdir)
@@ -158,14 +265,18 @@ view a.vtu --html v.html
 
 
 def main(folder):
-    """Import everything, run the commands, end a process with a limit of time; 0 if all went well."""
+    """Import everything, run the commands, end a process with a limit of time; 0 if all went
+    well.
+    """
     become_windows()
     os.chdir(folder)
     import_all()
     import tetopt.system.budget
     from tetopt.cli import main as run
 
-    tetopt.system.budget.PROC_FOLDER = tetopt.system.budget.GROUP_FOLDER = Path("there", "is", "no", "proc")
+    tetopt.system.budget.PROC_FOLDER = tetopt.system.budget.GROUP_FOLDER = Path(
+        "there", "is", "no", "proc"
+    )
     for line in COMMANDS.splitlines():
         code = run(line.split())
         if code != 0:
@@ -189,12 +300,16 @@ def _ends_children():
     outcome = run_in_child(importlib.import_module("windows").asleep, job, max_seconds=10.0)
     pid = int(Path("started.txt").read_text(encoding="utf-8"))
     is_ended = outcome.failure is not None and outcome.failure.startswith("out of time")
-    return int(not is_ended or (psutil.pid_exists(pid) and psutil.Process(pid).status() != "zombie"))
+    return int(
+        not is_ended or (psutil.pid_exists(pid) and psutil.Process(pid).status() != "zombie")
+    )
 
 
 def asleep(_job):
     """Start a process in a session of its own, and wait."""
-    below = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], start_new_session=True)
+    below = subprocess.Popen(
+        [sys.executable, "-c", "import time; time.sleep(60)"], start_new_session=True
+    )
     Path("started.txt").write_text(str(below.pid), encoding="utf-8")
     time.sleep(60)
 

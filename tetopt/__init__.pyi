@@ -10,11 +10,18 @@ from .contents.align import (
 )
 from .contents.content import Content as Content, content as content
 from .contents.labels import LostComponent as LostComponent
-from .contents.probabilities import resample_tissue as resample_tissue, tissue_labels as tissue_labels
+from .contents.probabilities import (
+    resample_tissue as resample_tissue,
+    tissue_labels as tissue_labels,
+)
 from .contents.statistics import Statistics as Statistics
 from .energy.discretization import E_D as E_D
 from .energy.geometric import E_G as E_G
-from .energy.sampling import CellMoments as CellMoments, cell_moments as cell_moments, cell_of_voxel as cell_of_voxel
+from .energy.sampling import (
+    CellMoments as CellMoments,
+    cell_moments as cell_moments,
+    cell_of_voxel as cell_of_voxel,
+)
 from .engine.fast import optimize as optimize
 from .engine.curving import Curving as Curving
 from .engine.loop import IterationRecord as IterationRecord, MeshingResult as MeshingResult
@@ -29,7 +36,11 @@ from .fem.solution import (
 )
 from .geometry.surface import Surface as Surface, extract_surface as extract_surface
 from .image import Image as Image
-from .io.formats import register_format as register_format, save_mesh as save_mesh, save_model as save_model
+from .io.formats import (
+    register_format as register_format,
+    save_mesh as save_mesh,
+    save_model as save_model,
+)
 from .io.frd import Results as Results, read_frd as read_frd
 from .io.images import load_image as load_image, save_image as save_image
 from .io.label_tables import load_label_table as load_label_table
@@ -50,7 +61,10 @@ from .measure.fidelity import (
     label_fidelity as label_fidelity,
     mask_fidelity as mask_fidelity,
 )
-from .measure.interfaces import LabelInterface as LabelInterface, label_interfaces as label_interfaces
+from .measure.interfaces import (
+    LabelInterface as LabelInterface,
+    label_interfaces as label_interfaces,
+)
 from .measure.quality import Quality as Quality, QualityErrors as QualityErrors, quality as quality
 from .measure.segmentation import segment as segment
 from .measure.thin import (

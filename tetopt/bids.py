@@ -1,4 +1,5 @@
-"""``python -m tetopt.bids``: `tetopt cohort` with the arguments that every BIDS app takes, as in a container.
+"""``python -m tetopt.bids``: `tetopt cohort` with the arguments that every BIDS app takes, as in a
+container.
 
 K. J. Gorgolewski et al., BIDS apps, PLoS Computational Biology 13(3), e1005209 (2017).
 """
@@ -16,7 +17,10 @@ from tetopt.cli.console import open_streams, show_error
 from tetopt.errors import InputError
 
 LEVELS = ("participant", "group")
-USAGE = "python -m tetopt.bids BIDS_DIR OUT {participant,group} [--participant-label L ...] [options of tetopt cohort]"
+USAGE = (
+    "python -m tetopt.bids BIDS_DIR OUT {participant,group} [--participant-label L ...] "
+    "[options of tetopt cohort]"
+)
 ABOUT = """
 Mesh the images of a BIDS dataset. participant: mesh the given subjects, or all; several such runs, each with its own
 subjects, may write to the same OUT at the same time. group: write the table and the page of all subjects in OUT.
@@ -56,7 +60,8 @@ def cohort_words(arguments: Sequence[str]) -> list[str]:
     """
     hyphened = [_with_hyphens(word) for word in arguments]
     places = [place for place, word in enumerate(hyphened) if word in LEVELS]
-    end = next((place for place in places if place > 1), len(hyphened) - 1) + 1  # a folder may have a level's name
+    # a folder may have a level's name
+    end = next((place for place in places if place > 1), len(hyphened) - 1) + 1
     known = _parser()
     known.add_argument("bids_dir")
     known.add_argument("out")
@@ -74,14 +79,26 @@ def cohort_words(arguments: Sequence[str]) -> list[str]:
 
 def _parser() -> _Parser:
     """Parser of the options that `tetopt cohort` does not have, or spells differently."""
-    parser = _Parser(usage=USAGE, description=ABOUT, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = _Parser(
+        usage=USAGE, description=ABOUT, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.allow_abbrev = False
     parser.add_argument(
-        "--participant-label", nargs="+", default=[], metavar="L", help="subjects, with or without sub-"
+        "--participant-label",
+        nargs="+",
+        default=[],
+        metavar="L",
+        help="subjects, with or without sub-",
     )
-    parser.add_argument("--session-label", nargs="+", default=[], metavar="L", help="sessions, with or without ses-")
+    parser.add_argument(
+        "--session-label", nargs="+", default=[], metavar="L", help="sessions, with or without ses-"
+    )
     for name in ("--skip-bids-validation", "--skip-bids-validator"):
-        parser.add_argument(name, action="store_true", help="accepted for compatibility; datasets are never validated")
+        parser.add_argument(
+            name,
+            action="store_true",
+            help="accepted for compatibility; datasets are never validated",
+        )
     parser.add_argument("-v", "--version", action="version", version=f"tetopt {tetopt.__version__}")
     return parser
 

@@ -1,4 +1,6 @@
-"""The one exception for everything that the user can fix, and warnings that name the user's own line."""
+"""The one exception for everything that the user can fix, and warnings that name the user's own
+line.
+"""
 
 import inspect
 import os
@@ -8,7 +10,8 @@ import warnings
 class InputError(ValueError):
     """An invalid input that the user can fix: a file, an array or an option.
 
-    The message is one line: the name of the input, what was expected, what was found, and the remedy.
+    The message is one line: the name of the input, what was expected, what was found, and the
+    remedy.
 
     Examples
     --------
@@ -33,9 +36,14 @@ def warn(message: str, category: type[UserWarning] = UserWarning) -> None:
 
 
 def error_words(error: Exception) -> str:
-    """Describe an error in words: begins with the name of the file, or states the failed allocation."""
+    """Describe an error in words: begins with the name of the file, or states the failed
+    allocation.
+    """
     if isinstance(error, MemoryError):
-        return f"not enough memory: {error}".removesuffix(": ") + "; use fewer nodes, a part of the image or `max_gb`"
+        return (
+            f"not enough memory: {error}".removesuffix(": ")
+            + "; use fewer nodes, a part of the image or `max_gb`"
+        )
     if isinstance(error, OSError) and error.filename is not None:
         return f"{os.fsdecode(error.filename)}: {error.strerror}"
     return str(error)

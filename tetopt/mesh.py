@@ -33,18 +33,19 @@ class Mesh:
     points : (N, n) array of float64
         Node positions in world coordinates, mm (RAS+ in 3-D). Read-only.
     cells : (M, n+1) array of int64
-        Node indices of each cell, positively oriented: the vectors from the first node to the others form a
-        right-handed frame. Read-only.
+        Node indices of each cell, positively oriented: the vectors from the first node to the
+        others form a right-handed frame. Read-only.
     midpoints : (E, n) array of float64, optional
         Mid-edge nodes, mm, of quadratic cells whose edges may be curved, in the order of
-        `tetopt.geometry.quadratic.numbered_edges`, sorted by their ends. Without them edges are straight. Linear cells,
-        sampling of images and conversions use only the corners (docs/understand/order.md). Read-only.
+        `tetopt.geometry.quadratic.numbered_edges`, sorted by their ends. Without them edges are
+        straight. Linear cells, sampling of images and conversions use only the corners
+        (docs/understand/order.md). Read-only.
 
     Raises
     ------
     InputError
-        Wrong shapes, non-finite points, masked values, no cells, indices out of range, or flat or inverted cells
-        (`tetopt.geometry.simplex.oriented` turns inverted ones).
+        Wrong shapes, non-finite points, masked values, no cells, indices out of range, or flat or
+        inverted cells (`tetopt.geometry.simplex.oriented` turns inverted ones).
 
     See Also
     --------
@@ -63,24 +64,33 @@ class Mesh:
     cells: NDArray[np.int64]
     midpoints: NDArray[np.float64] | None
 
-    def __init__(self, points: ArrayLike, cells: ArrayLike, midpoints: ArrayLike | None = None) -> None:
+    def __init__(
+        self, points: ArrayLike, cells: ArrayLike, midpoints: ArrayLike | None = None
+    ) -> None:
         points, cells = checked_simplices("mesh", points, cells)
         n = points.shape[1]
         v = volumes(points, cells)
         if (v <= 0.0).any():
             bad = np.flatnonzero(v <= 0.0)
             raise InputError(
-                f"mesh cells: {len(bad)} of {len(cells)} are flat or inverted, such as {bad[:5].tolist()}; "
+                f"mesh cells: {len(bad)} of {len(cells)} are flat or inverted, such as "
+                f"{bad[:5].tolist()}; "
                 "orient them or repair the mesh"
             )
         points.setflags(write=False)
         cells.setflags(write=False)
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "cells", cells)
-        object.__setattr__(self, "midpoints", None if midpoints is None else _checked_midpoints(midpoints, cells, n))
+        object.__setattr__(
+            self,
+            "midpoints",
+            None if midpoints is None else _checked_midpoints(midpoints, cells, n),
+        )
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Check and lock the arrays of a copy, or of an unpickled mesh, again: pickle keeps neither."""
+        """Check and lock the arrays of a copy, or of an unpickled mesh, again: pickle keeps
+        neither.
+        """
         return Mesh, (self.points, self.cells, self.midpoints)
 
     @property
@@ -90,7 +100,9 @@ class Mesh:
 
     @cached_property
     def cell_volumes(self) -> NDArray[np.float64]:
-        """Volumes of the cells (areas in 2-D), (M,) float64, mm^n; exact, also with curved edges. Read-only."""
+        """Volumes of the cells (areas in 2-D), (M,) float64, mm^n; exact, also with curved
+        edges. Read-only.
+        """
         if self.midpoints is None:
             sizes = volumes(self.points, self.cells)
         else:
@@ -99,13 +111,15 @@ class Mesh:
         return sizes
 
     def straight_pieces(self) -> tuple[Mesh, int]:
-        """Split cells with curved edges into straight ones, on which surfaces and overlaps are measured.
+        """Split cells with curved edges into straight ones, on which surfaces and overlaps are
+        measured.
 
         Returns
         -------
         mesh : Mesh
-            The mesh itself if its edges are straight. Otherwise each cell becomes 8 (in 2-D 4), in its place, with the
-            midpoints as nodes after the corners; a cell that is folded becomes straight.
+            The mesh itself if its edges are straight. Otherwise each cell becomes 8 (in 2-D 4), in
+            its place, with the midpoints as nodes after the corners; a cell that is folded becomes
+            straight.
         n_pieces : int
             Number of pieces of each cell: piece ``k`` belongs to cell ``k // n_pieces``.
 
@@ -120,13 +134,18 @@ class Mesh:
 
     @cached_property
     def _pieces(self) -> tuple[Mesh, int]:
-        assert self.midpoints is not None, "a straight mesh is its own pieces: no reference to itself"
+        assert self.midpoints is not None, (
+            "a straight mesh is its own pieces: no reference to itself"
+        )
         points, cells = straight_pieces(self.points, self.cells, self.midpoints)
         return Mesh(points, cells), len(cells) // len(self.cells)
 
     def __repr__(self) -> str:
         kind = "tetrahedra" if self.ndim == 3 else "triangles"
-        return f"Mesh({len(self.points)} nodes, {len(self.cells)} {kind}, {notebook.extent_words(self.points)})"
+        return (
+            f"Mesh({len(self.points)} nodes, {len(self.cells)} {kind}, "
+            f"{notebook.extent_words(self.points)})"
+        )
 
     def _repr_html_(self) -> str:
         """Numbers and the middle section, for a notebook."""
@@ -144,7 +163,8 @@ class Mesh:
         off_screen: bool | None = None,
         **look: Any,
     ) -> Any:
-        """Show the mesh in 3-D with pyvista, with straight edges: in a window, in a notebook, or as a picture.
+        """Show the mesh in 3-D with pyvista, with straight edges: in a window, in a notebook, or as
+        a picture.
 
         Parameters
         ----------
@@ -157,16 +177,17 @@ class Mesh:
         screenshot : str or Path, optional
             Picture file to write, such as ".png"; no window opens.
         off_screen : bool, optional
-            If True, open no window and return a picture. By default pyvista's setting, and True on Linux without a
-            display.
+            If True, open no window and return a picture. By default pyvista's setting, and True on
+            Linux without a display.
         **look
-            Further options of `pyvista.Plotter.add_mesh`, such as `cmap="gray"` or `show_edges=False`.
+            Further options of `pyvista.Plotter.add_mesh`, such as `cmap="gray"` or
+            `show_edges=False`.
 
         Returns
         -------
         (height, width, 3) array of uint8, or None
-            The picture, if no window opened. A notebook shows an interactive view if trame is installed, else a
-            picture.
+            The picture, if no window opened. A notebook shows an interactive view if trame is
+            installed, else a picture.
 
         Raises
         ------
@@ -183,24 +204,30 @@ class Mesh:
         rows = len(self.cells) if values is None else (np.shape(values) or (1,))[0]
         if rows not in (len(self.cells), len(self.points)):
             raise InputError(
-                f"plot: expected a number for each of {len(self.cells)} cells or {len(self.points)} nodes, got {rows}"
+                f"plot: expected a number for each of {len(self.cells)} cells or "
+                f"{len(self.points)} nodes, got {rows}"
             )
         on_cells = rows == len(self.cells)
         grid = self.to_pyvista(colours) if on_cells else self.to_pyvista(point_data=colours)
         if cut and self.ndim == 3:
             centres = self.points[self.cells].mean(axis=1)
-            is_beyond = (centres > 0.5 * (self.points.min(axis=0) + self.points.max(axis=0))).all(axis=1)
+            is_beyond = (centres > 0.5 * (self.points.min(axis=0) + self.points.max(axis=0))).all(
+                axis=1
+            )
             grid = grid if is_beyond.all() else grid.extract_cells(np.flatnonzero(~is_beyond))
         return conversions.show_grid(grid, next(iter(colours), None), screenshot, off_screen, look)
 
-    def to_pyvista(self, cell_data: Fields | None = None, point_data: Fields | None = None) -> pyvista.UnstructuredGrid:
-        """Convert the mesh to pyvista, with straight edges and data; a 2-D mesh lies in the plane z = 0.
+    def to_pyvista(
+        self, cell_data: Fields | None = None, point_data: Fields | None = None
+    ) -> pyvista.UnstructuredGrid:
+        """Convert the mesh to pyvista, with straight edges and data; a 2-D mesh lies in the plane z
+        = 0.
 
         Parameters
         ----------
         cell_data, point_data : dict of arrays, optional
-            Numbers by name, one row per cell or per node; the first of each is active. Rows of more than one axis are
-            flattened; True and False become 1 and 0.
+            Numbers by name, one row per cell or per node; the first of each is active. Rows of more
+            than one axis are flattened; True and False become 1 and 0.
 
         Returns
         -------
@@ -219,16 +246,19 @@ class Mesh:
         >>> grid.n_points, grid.cell_data["mean"].tolist()
         (3, [3.5])
         """
-        return conversions.to_pyvista(self.points, self.cells, VTK_KINDS[self.ndim, 1], cell_data, point_data)
+        return conversions.to_pyvista(
+            self.points, self.cells, VTK_KINDS[self.ndim, 1], cell_data, point_data
+        )
 
     @classmethod
     def from_pyvista(cls, grid: pyvista.DataSet) -> Mesh:
         """Make a mesh of the tetrahedra of a pyvista or VTK grid; if it has none, of its triangles.
 
-        Cells keep their order, and inverted ones are reoriented (two of their nodes are swapped). Unused nodes,
-        vertices, lines, and triangles next to tetrahedra are dropped. Quadratic cells keep only their corners, so that
-        curved edges become straight. Data are not copied: `grid.cell_data` fits if the grid has no other cells,
-        `grid.point_data` if each of its nodes is a corner of a cell.
+        Cells keep their order, and inverted ones are reoriented (two of their nodes are swapped).
+        Unused nodes, vertices, lines, and triangles next to tetrahedra are dropped. Quadratic cells
+        keep only their corners, so that curved edges become straight. Data are not copied:
+        `grid.cell_data` fits if the grid has no other cells, `grid.point_data` if each of its nodes
+        is a corner of a cell.
 
         Parameters
         ----------
@@ -242,7 +272,8 @@ class Mesh:
         Raises
         ------
         InputError
-            Other kinds of cells, cells of both orders, no cells, flat cells, triangles off the plane z = 0.
+            Other kinds of cells, cells of both orders, no cells, flat cells, triangles off the
+            plane z = 0.
 
         Examples
         --------
@@ -253,8 +284,11 @@ class Mesh:
         picked = conversions.from_pyvista(grid)
         return cls(picked.points, picked.cells)
 
-    def to_meshio(self, cell_data: Fields | None = None, point_data: Fields | None = None) -> meshio.Mesh:
-        """Convert the mesh to meshio, with data, as one block of triangles or tetrahedra with straight edges.
+    def to_meshio(
+        self, cell_data: Fields | None = None, point_data: Fields | None = None
+    ) -> meshio.Mesh:
+        """Convert the mesh to meshio, with data, as one block of triangles or tetrahedra with
+        straight edges.
 
         Parameters
         ----------
@@ -277,11 +311,14 @@ class Mesh:
         >>> mesh.to_meshio({"mean": [3.5]}).cells_dict["triangle"].tolist()
         [[0, 1, 2]]
         """
-        return conversions.to_meshio(self.points, self.cells, MESHIO_KINDS[self.ndim, 1], cell_data, point_data)
+        return conversions.to_meshio(
+            self.points, self.cells, MESHIO_KINDS[self.ndim, 1], cell_data, point_data
+        )
 
     @classmethod
     def from_meshio(cls, mesh: meshio.Mesh) -> Mesh:
-        """Make a mesh of the tetrahedra of a meshio mesh, block by block; if it has none, of its triangles.
+        """Make a mesh of the tetrahedra of a meshio mesh, block by block; if it has none, of its
+        triangles.
 
         Cells are chosen, reoriented and dropped as in `from_pyvista`.
 
@@ -314,7 +351,8 @@ class Mesh:
         Returns
         -------
         skfem.MeshTri or skfem.MeshTet
-            A copy. Nodes and cells keep their order; scikit-fem sorts the three nodes of a triangle.
+            A copy. Nodes and cells keep their order; scikit-fem sorts the three nodes of a
+            triangle.
 
         Raises
         ------
@@ -331,7 +369,8 @@ class Mesh:
 
     @classmethod
     def from_skfem(cls, mesh: skfem.Mesh) -> Mesh:
-        """Make a mesh of a scikit-fem mesh of triangles or tetrahedra; quadratic cells keep only their corners.
+        """Make a mesh of a scikit-fem mesh of triangles or tetrahedra; quadratic cells keep only
+        their corners.
 
         Cells are reoriented and nodes dropped as in `from_pyvista`.
 
@@ -361,7 +400,8 @@ class Mesh:
     def to_trimesh(self) -> trimesh.Trimesh:
         """Convert the boundary of a 3-D mesh to trimesh, as it is in the mesh, with straight edges.
 
-        Where cells touch only in an edge or a node, it is not a manifold; `tetopt.extract_surface` parts them.
+        Where cells touch only in an edge or a node, it is not a manifold; `tetopt.extract_surface`
+        parts them.
 
         Returns
         -------
@@ -381,13 +421,17 @@ class Mesh:
         (True, 0.166667)
         """
         if self.ndim != 3:
-            raise InputError("to_trimesh: expected tetrahedra, got triangles, whose boundary consists of edges")
+            raise InputError(
+                "to_trimesh: expected tetrahedra, got triangles, whose boundary consists of edges"
+            )
         from tetopt.geometry.topology import boundary_facets
 
         return conversions.to_trimesh(self.points, boundary_facets(self.cells))
 
 
-def _checked_midpoints(midpoints: ArrayLike, cells: NDArray[np.int64], n: int) -> NDArray[np.float64]:
+def _checked_midpoints(
+    midpoints: ArrayLike, cells: NDArray[np.int64], n: int
+) -> NDArray[np.float64]:
     try:
         places = np.array(unmasked("mesh midpoints", midpoints), dtype=np.float64, order="C")
     except InputError:
@@ -397,7 +441,8 @@ def _checked_midpoints(midpoints: ArrayLike, cells: NDArray[np.int64], n: int) -
     expected = (len(numbered_edges(cells)[0]), n)
     if places.shape != expected or not np.isfinite(places).all():
         raise InputError(
-            f"mesh midpoints: expected {expected[0]} x {n} finite coordinates, one row per edge, got {places.shape}"
+            f"mesh midpoints: expected {expected[0]} x {n} finite coordinates, one row per edge, "
+            f"got {places.shape}"
         )
     places.setflags(write=False)
     return places

@@ -1,7 +1,7 @@
 """Workers of dask, on this machine or of a running scheduler, and the tasks that they run.
 
-dask distributes tasks, restarts workers that die, and ends those that exceed their memory limit. Tasks exchange names
-of files, which every worker can access.
+dask distributes tasks, restarts workers that die, and ends those that exceed their memory limit.
+Tasks exchange names of files, which every worker can access.
 """
 
 from __future__ import annotations
@@ -30,9 +30,11 @@ CONNECT_SECONDS = 10  # timeout of a scheduler that does not answer: dask's defa
 MEMORY_TOPIC = "worker-restart-memory"  # dask's topic for workers that nannies end at their limit
 LOCAL_SETTINGS = {
     "distributed.scheduler.allowed-failures": 1,  # a task whose worker dies is repeated once
-    "distributed.scheduler.worker-ttl": None,  # a process in a kernel blocks other threads, but is not dead
+    # a process in a kernel blocks other threads, but is not dead
+    "distributed.scheduler.worker-ttl": None,
     "distributed.worker.memory.pause": False,  # the only task of a worker must end
-    # A nanny restarts its worker, on a busy machine for longer than the 15 s after which dask would close both.
+    # A nanny restarts its worker, on a busy machine for longer than the 15 s after which dask would
+    # close both.
     "distributed.deploy.lost-worker-timeout": "24h",
 }
 
@@ -69,24 +71,37 @@ class Workers(NamedTuple):
 
     def words(self) -> str:
         """Describe the workers in one line."""
-        return f"{counted(self.slots(), 'task')} at a time, each of {counted(self.threads, 'thread')}"
+        return (
+            f"{counted(self.slots(), 'task')} at a time, each of {counted(self.threads, 'thread')}"
+        )
 
 
 def check_workers(count: int | None, scheduler: str | None) -> None:
-    """Raise InputError for what `workers` rejects; call it before images are read and anything is written.
+    """Raise InputError for what `workers` rejects; call it before images are read and anything is
+    written.
 
     A scheduler is contacted, for `CONNECT_SECONDS` at most.
     """
     if find_spec("distributed") is None:
-        raise InputError(f"distributed is not installed, but dask needs it to run tasks; {install_hint('distributed')}")
+        raise InputError(
+            "distributed is not installed, but dask needs it to run tasks; "
+            f"{install_hint('distributed')}"
+        )
     if scheduler is not None and count is not None:
-        raise InputError("`workers`: expected none with `scheduler`, which has its own workers; start more of those")
+        raise InputError(
+            "`workers`: expected none with `scheduler`, which has its own workers; start more of "
+            "those"
+        )
     if scheduler is not None:
         _check_scheduler(scheduler)
 
 
 def share_of(
-    n_tasks: int, worker_bytes: float, count: int | None, threads: int | None, most: float = float("inf")
+    n_tasks: int,
+    worker_bytes: float,
+    count: int | None,
+    threads: int | None,
+    most: float = float("inf"),
 ) -> Share:
     """Divide this machine, within its affinity and container limits, among at least one worker.
 
@@ -103,7 +118,9 @@ def share_of(
     from dask.system import CPU_COUNT
 
     free = available_bytes()
-    number = max(1, min(n_tasks, CPU_COUNT // (threads or 1), int(free / worker_bytes), count or n_tasks))
+    number = max(
+        1, min(n_tasks, CPU_COUNT // (threads or 1), int(free / worker_bytes), count or n_tasks)
+    )
     return Share(number, threads or max(1, CPU_COUNT // number), min(free / number, most))
 
 
@@ -111,7 +128,8 @@ def share_of(
 def workers(share: Share, scheduler: str | None, threads: int | None) -> Iterator[Workers]:
     """Provide the workers of a scheduler at an address, or local ones, which end with the block.
 
-    Each task has the `threads`, without them one thread of a scheduler's worker. Call `check_workers` before.
+    Each task has the `threads`, without them one thread of a scheduler's worker. Call
+    `check_workers` before.
     """
     import dask
     from distributed import Client, LocalCluster
@@ -131,7 +149,8 @@ def workers(share: Share, scheduler: str | None, threads: int | None) -> Iterato
             dashboard_address="127.0.0.1:0",
             env={THREADS_NAME: str(share.threads)},
             silence_logs=logging.CRITICAL,
-            security=find_spec("cryptography") is not None or None,  # keeps other users of this machine out; not False
+            # keeps other users of this machine out; not False
+            security=find_spec("cryptography") is not None or None,
         ) as cluster,
         Client(cluster) as client,
     ):
@@ -152,7 +171,8 @@ def memory_limit() -> float:
 def run_tasks(
     pool: Workers, function: Callable[[Any], Any], names: Sequence[Any], mark: str
 ) -> Iterator[tuple[Any, Any, BaseException | None]]:
-    """Run tasks; yield the name of each as it ends, its result, and its error: the function's, or `WorkerEnded`.
+    """Run tasks; yield the name of each as it ends, its result, and its error: the function's, or
+    `WorkerEnded`.
 
     As many tasks are submitted as may run: a worker that dies then takes no other tasks with it.
 
@@ -197,18 +217,27 @@ def _run(versions: str, mark: str, threads: int, function: Callable[[Any], Any],
     if _versions() != versions:
         wrong = f"expected {versions} as here, got {_versions()}; install the same versions there"
     elif not os.path.exists(mark):
-        wrong = f"cannot access {mark}; expected an output folder on a file system that all workers share"
+        wrong = (
+            f"cannot access {mark}; expected an output folder on a file system that all "
+            "workers share"
+        )
     elif (n_tasks := worker.state.nthreads) > 1:
-        wrong = f"expected one task at a time, got {n_tasks}; use dask worker --nthreads 1 --nworkers {n_tasks}"
+        wrong = (
+            f"expected one task at a time, got {n_tasks}; use dask worker --nthreads 1 "
+            f"--nworkers {n_tasks}"
+        )
     if wrong:
         raise UnfitWorker(f"worker {worker.address}: {wrong}")
-    numba.config.reload_config()  # the main program may have loaded numba before dask set the environment
+    # the main program may have loaded numba before dask set the environment
+    numba.config.reload_config()
     numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
     return function(name)
 
 
 def _versions() -> str:
-    return f"tetopt {version('tetopt')} and Python {sys.version_info.major}.{sys.version_info.minor}"
+    return (
+        f"tetopt {version('tetopt')} and Python {sys.version_info.major}.{sys.version_info.minor}"
+    )
 
 
 def _error_of(client: Any, future: Any) -> BaseException | None:
@@ -225,7 +254,11 @@ def _error_of(client: Any, future: Any) -> BaseException | None:
     last = error.last_worker
     at_limit = {event["worker"] for _, event in client.get_events(MEMORY_TOPIC)}
     reason = "because it exceeded" if last.address in at_limit else "possibly because it exceeded"
-    limit = f"its limit of {memory_words(last.memory_limit)}" if last.memory_limit else "the available memory"
+    limit = (
+        f"its limit of {memory_words(last.memory_limit)}"
+        if last.memory_limit
+        else "the available memory"
+    )
     return WorkerEnded(f"its worker ended, {error.allowed_failures + 1} times, {reason} {limit}")
 
 
@@ -237,16 +270,21 @@ def _check_scheduler(address: str) -> None:
         # MemoryError: another service's first bytes, read as the length of a message.
         reason = " ".join(str(error).split()) or f"no reply of dask's within {CONNECT_SECONDS:g} s"
         raise InputError(
-            f"`scheduler`: {address} does not answer ({reason[:200]}); expected the address of a running dask "
+            f"`scheduler`: {address} does not answer ({reason[:200]}); expected the address of a "
+            "running dask "
             "scheduler, such as tcp://host:8786"
         ) from error
 
 
 async def _reached(scheduler: str) -> None:
-    """Open and close a connection, as a client that cannot connect may remain half started and hang when collected."""
+    """Open and close a connection, as a client that cannot connect may remain half started and
+    hang when collected.
+    """
     from distributed.comm import connect
     from distributed.security import Security
 
     async with asyncio.timeout(CONNECT_SECONDS):  # dask's own timeout ends before the first reply
-        comm = await connect(scheduler, timeout=CONNECT_SECONDS, **Security().get_connection_args("client"))
+        comm = await connect(
+            scheduler, timeout=CONNECT_SECONDS, **Security().get_connection_args("client")
+        )
         await comm.close()

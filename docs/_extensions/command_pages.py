@@ -1,7 +1,9 @@
-"""Pages of commands, made of the command line itself when the site is built, so that they cannot go stale.
+"""Pages of commands, made of the command line itself when the site is built, so that they cannot go
+stale.
 
-The directive `synopsis` says what a command does and how it is called, `parameters` lists its arguments and options
-panel by panel, each with its kind and default; "bids" is ``python -m tetopt.bids``. `commands` lists all commands.
+The directive `synopsis` says what a command does and how it is called, `parameters` lists its
+arguments and options panel by panel, each with its kind and default; "bids" is ``python -m
+tetopt.bids``. `commands` lists all commands.
 """
 
 from __future__ import annotations
@@ -37,7 +39,9 @@ class Parameter(NamedTuple):
 
 def parameters(command: str) -> list[Parameter]:
     """Arguments and options of a command in the order of its help, but for `--help`."""
-    return list(_of_argparse(bids._parser()) if command == BIDS else map(_of_typer, _signature(command)))
+    return list(
+        _of_argparse(bids._parser()) if command == BIDS else map(_of_typer, _signature(command))
+    )
 
 
 def synopsis(command: str) -> str:
@@ -78,7 +82,9 @@ def _of_typer(parameter: inspect.Parameter) -> Parameter:
     info, kind, default = _info(parameter), get_args(parameter.annotation)[0], parameter.default
     is_needed = default is inspect.Parameter.empty
     if _is_argument(parameter):
-        return Parameter("Arguments", info.metavar, info.help or "", "" if is_needed else "optional")
+        return Parameter(
+            "Arguments", info.metavar, info.help or "", "" if is_needed else "optional"
+        )
     # In an annotation typer takes an option's first name for a default.
     names = [*([info.default] if isinstance(info.default, str) else []), *(info.param_decls or ())]
     spelled = [each for name in names for each in name.split("/")]
@@ -99,8 +105,16 @@ def _kind(kind: Any, choices: list[str], low: float | None) -> str:
     several = [each for each in get_args(kind) if each is not type(None)]
     if not choices and several:
         return _kind(several[0], choices, low)
-    words = {int: "an integer", float: "a number", str: "a string", Path: "a path", bool: "a switch"}
-    return (f"one of {', '.join(choices)}" if choices else words[kind]) + ("" if low is None else f", {low:g} or more")
+    words = {
+        int: "an integer",
+        float: "a number",
+        str: "a string",
+        Path: "a path",
+        bool: "a switch",
+    }
+    return (f"one of {', '.join(choices)}" if choices else words[kind]) + (
+        "" if low is None else f", {low:g} or more"
+    )
 
 
 def _each(kind: Any) -> list[Any]:
@@ -109,7 +123,9 @@ def _each(kind: Any) -> list[Any]:
 
 def _choices(kind: Any) -> list[str]:
     """The words that an option takes, if it takes a few only."""
-    return [str(word) for each in _each(kind) if get_origin(each) is Literal for word in get_args(each)]
+    return [
+        str(word) for each in _each(kind) if get_origin(each) is Literal for word in get_args(each)
+    ]
 
 
 def _shown(value: Any) -> str:
@@ -120,7 +136,8 @@ def _of_argparse(parser: argparse.ArgumentParser) -> Iterator[Parameter]:
     places = {
         "BIDS_DIR": "The folder of the dataset.",
         "OUT": "The folder of all outputs.",
-        "{participant,group}": "The level: the meshes of subjects, or the table and the page of all of them.",
+        "{participant,group}": "The level: the meshes of subjects, or the table and the page of "
+        "all of them.",
     }
     for name, text in places.items():
         yield Parameter("Arguments", name, text, "")
@@ -135,10 +152,15 @@ def _of_argparse(parser: argparse.ArgumentParser) -> Iterator[Parameter]:
 
 
 def marked(text: str) -> str:
-    """A help text as Markdown: what is quoted and what are options as code, and no other sign with a meaning."""
+    """A help text as Markdown: what is quoted and what are options as code, and no other sign
+    with a meaning.
+    """
     parts = re.split(r'("[^"]+"|`[^`]+`|(?<![\w-])--?[a-z][a-z-]*(?![\w-]))', text)
     escaped = [re.sub(r"([\\*_<>\[\]{}|~$#`])", r"\\\1", part) for part in parts[::2]]
-    code = [f"`{part.strip('`')}`" if not part.startswith('"') else f"`{part[1:-1]}`" for part in parts[1::2]]
+    code = [
+        f"`{part.strip('`')}`" if not part.startswith('"') else f"`{part[1:-1]}`"
+        for part in parts[1::2]
+    ]
     return "".join(a + b for a, b in zip(escaped, [*code, ""], strict=True))
 
 
@@ -152,7 +174,9 @@ class SynopsisDirective(SphinxDirective):
         name = self.arguments[0]
         _note_sources(self)
         words = summary(name) if name == BIDS else inspect.getdoc(loaded_command(name)) or ""
-        return self.parse_text_to_nodes("\n".join([marked(words), "", "```text", synopsis(name), "```"]))
+        return self.parse_text_to_nodes(
+            "\n".join([marked(words), "", "```text", synopsis(name), "```"])
+        )
 
 
 class ParametersDirective(SphinxDirective):
@@ -188,7 +212,11 @@ def _panels(name: str) -> list[str]:
 
 def summary(name: str) -> str:
     """Return a command as one line."""
-    return help_line(name) if name in COMMANDS else (bids.__doc__ or "").splitlines()[0].split(": ", 1)[1]
+    return (
+        help_line(name)
+        if name in COMMANDS
+        else (bids.__doc__ or "").splitlines()[0].split(": ", 1)[1]
+    )
 
 
 class CommandsDirective(SphinxDirective):

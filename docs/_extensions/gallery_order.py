@@ -1,4 +1,6 @@
-"""The order of the gallery's programs: what most users do first, then method, solvers and other libraries."""
+"""The order of the gallery's programs: what most users do first, then method, solvers and other
+libraries.
+"""
 
 ORDER = (
     "first_mesh",

@@ -1,4 +1,6 @@
-"""Formulas as MathML, which browsers draw by themselves: no script, nothing fetched, and a search finds the words."""
+"""Formulas as MathML, which browsers draw by themselves: no script, nothing fetched, and a
+search finds the words.
+"""
 
 from docutils import nodes
 from latex2mathml.converter import convert

@@ -1,7 +1,8 @@
 """Tables of the keys of a JSON file, made of its JSON Schema when the site is built.
 
-The directive `schema` has the name of a schema next to the page: tables of its keys, with their meanings, their types
-and units (the annotation "unit"); a section for each object at the top, and for each of the definitions.
+The directive `schema` has the name of a schema next to the page: tables of its keys, with their
+meanings, their types and units (the annotation "unit"); a section for each object at the top, and
+for each of the definitions.
 """
 
 from __future__ import annotations
@@ -20,12 +21,22 @@ Schema = dict[str, Any]
 
 
 def tables(schema: Schema, page: str) -> list[str]:
-    """Lines of Markdown: a table of the keys at the top, and a section for each object there and each definition."""
+    """Lines of Markdown: a table of the keys at the top, and a section for each object there and
+    each definition.
+    """
     of_objects = {key: each for key, each in schema["properties"].items() if _keys(each)}
     lines = ["## Top level", "", *_table(_top_rows(schema, page)), ""]
     for key, each in of_objects.items():
         about = each.get("description", "").rstrip(".")
-        lines += [f"({page}-{key})=", f"## {key}", "", f"{marked(about)}.", "", *_table(_rows(each, "", page)), ""]
+        lines += [
+            f"({page}-{key})=",
+            f"## {key}",
+            "",
+            f"{marked(about)}.",
+            "",
+            *_table(_rows(each, "", page)),
+            "",
+        ]
     for name, each in schema.get("$defs", {}).items():
         about = each.get("description", "").rstrip(".")
         lines += [f"({page}-def-{name})=", f"## Keys of {name}", "", f"{marked(about)}.", ""]
@@ -65,7 +76,9 @@ def _patterns(schema: Schema) -> list[tuple[str, Schema]]:
 
 
 def _inner(schema: Schema) -> tuple[Schema, str]:
-    """The object that a schema is of, itself, in a list or beside null; and what stands for being in a list."""
+    """The object that a schema is of, itself, in a list or beside null; and what stands for
+    being in a list.
+    """
     if schema.get("type") == "array" and isinstance(schema.get("items"), dict):
         inner, suffix = _inner(schema["items"])
         return inner, f"[].{suffix}"

@@ -2,8 +2,9 @@
 Export to FEniCSx
 =================
 
-``tetopt.save_model`` writes XDMF with the moduli of the elements, and the sets as tags. This program writes the file,
-shows its content, and prints the dolfinx code that reads it. It does not run dolfinx, which need not be installed.
+``tetopt.save_model`` writes XDMF with the moduli of the elements, and the sets as tags. This
+program writes the file, shows its content, and prints the dolfinx code that reads it. It does not
+run dolfinx, which need not be installed.
 """
 
 import tempfile
@@ -25,9 +26,9 @@ folder = tempfile.TemporaryDirectory()
 path = Path(folder.name) / "head.xdmf"
 tetopt.save_model(path, model)
 
-# %%
-# This dolfinx code reads the mesh, the material number of each cell, and the facet tags. A tag stands for one
-# combination of sets; the file lists the tags of each set. See :doc:`/reference/formats`.
+# %% This dolfinx code reads the mesh, the material number of each cell, and the facet tags. A tag
+# stands for one combination of sets; the file lists the tags of each set. See
+# :doc:`/reference/formats`.
 
 PROGRAM = """
 from xml.etree import ElementTree
@@ -75,7 +76,9 @@ plotter = pyvista.Plotter(window_size=(1000, 700))
 plotter.set_background("#171a21")
 bar = {"title": "Young's modulus, kPa\n", "color": "#e6e6e6", "fmt": "%.0f", "vertical": False}
 bar |= {"width": 0.5, "position_x": 0.25, "position_y": 0.03}
-plotter.add_mesh(opened, cmap="YlGnBu_r", show_edges=True, edge_color="#20242c", scalar_bar_args=bar, ambient=0.2)
+plotter.add_mesh(
+    opened, cmap="YlGnBu_r", show_edges=True, edge_color="#20242c", scalar_bar_args=bar, ambient=0.2
+)
 plotter.view_vector((-0.8, 1.1, 0.6), viewup=(0, 0, 1))
 plotter.camera.zoom(1.25)
 plotter.show()

@@ -2,8 +2,8 @@
 Mesh an organ from a mask
 =========================
 
-With a mask, cells fill only the organ, and the boundary is smooth although the mask's voxels form stairs. The organ
-here is the brain of MNI152.
+With a mask, cells fill only the organ, and the boundary is smooth although the mask's voxels form
+stairs. The organ here is the brain of MNI152.
 """
 
 import numpy as np
@@ -12,9 +12,8 @@ from nilearn.datasets import load_mni152_template
 
 import tetopt
 
-# %%
-# Use every third voxel of the T1 in nilearn's wheel, to save time. The mask is 1 in the brain and 0 outside. For a mask
-# on another grid, use ``tetopt.resample_mask``.
+# %% Use every third voxel of the T1 in nilearn's wheel, to save time. The mask is 1 in the brain
+# and 0 outside. For a mask on another grid, use ``tetopt.resample_mask``.
 
 template = load_mni152_template(resolution=1)
 image = tetopt.Image(template.get_fdata()[::3, ::3, ::3], template.affine @ np.diag([3, 3, 3, 1]))
@@ -26,9 +25,8 @@ mask = tetopt.Image(1.0 * (image.data > 0), image.affine)
 organ = tetopt.content(image, mask=mask)
 mesh = tetopt.mesh_image(organ, nodes=3000).mesh
 
-# %%
-# Dice compares the voxels inside the mesh with the mask. The distance is from the mesh boundary to the surface halfway
-# between the mask's voxels.
+# %% Dice compares the voxels inside the mesh with the mask. The distance is from the mesh boundary
+# to the surface halfway between the mask's voxels.
 
 fidelity = tetopt.mask_fidelity(mask, mesh)
 dice = fidelity.dice
@@ -45,9 +43,15 @@ opened = grid.extract_cells(np.flatnonzero(~is_cut))
 plotter = pyvista.Plotter(window_size=(1000, 700))
 plotter.set_background("#171a21")
 plotter.add_mesh(
-    opened, scalars="mean", cmap="bone", clim=(0.1, 0.95), show_edges=True, edge_color="#2a3140", line_width=1,
+    opened,
+    scalars="mean",
+    cmap="bone",
+    clim=(0.1, 0.95),
+    show_edges=True,
+    edge_color="#2a3140",
+    line_width=1,
     show_scalar_bar=False,
-)  # fmt: skip
+)
 plotter.view_vector((0.9, 1.1, 0.75), viewup=(0, 0, 1))
 plotter.camera.zoom(1.35)
 plotter.show()

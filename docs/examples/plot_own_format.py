@@ -2,9 +2,9 @@
 Write a format of your own
 ==========================
 
-To support another solver, write a function from a model to text and register it with one call. The examples are
-openCARP: the mesh with a region for each label; and SOFA: a scene with the mesh, a modulus per element, supports,
-forces and springs. Not yet verified in SOFA.
+To support another solver, write a function from a model to text and register it with one call. The
+examples are openCARP: the mesh with a region for each label; and SOFA: a scene with the mesh, a
+modulus per element, supports, forces and springs. Not yet verified in SOFA.
 """
 
 import tempfile
@@ -17,9 +17,8 @@ import pyvista
 import tetopt
 from tetopt.model.loads import facet_forces, spring_constants
 
-# %%
-# openCARP reads a mesh from two text files: the nodes, in micrometres, and the cells with a region each, here their
-# label. Each is a format of its own. Not yet verified in openCARP.
+# %% openCARP reads a mesh from two text files: the nodes, in micrometres, and the cells with a
+# region each, here their label. Each is a format of its own. Not yet verified in openCARP.
 
 
 def pts(model):
@@ -50,9 +49,9 @@ print(f"openCARP: {len(points)} nodes over {extent_mm} mm, {counts.tolist()} cel
 
 # %%
 # SOFA takes a scene of objects.
-#
-# A model has points in mm, cells, facet sets as rows (cell, node opposite), materials and loads. `repr` writes a number
-# without losing a digit. Each load becomes one SOFA object; anything that a scene cannot represent is rejected.
+#  A model has points in mm, cells, facet sets as rows (cell, node opposite), materials and loads.
+# `repr` writes a number without losing a digit. Each load becomes one SOFA object; anything that a
+# scene cannot represent is rejected.
 
 
 def listed(numbers):
@@ -71,61 +70,91 @@ def load_of(model, load):
     """The SOFA component of a load, and its values."""
     if load.kind == "spring":
         nodes, stiffness = spring_constants(model.mesh, model.sets, load)
-        return "RestShapeSpringsForceField", {"points": listed(nodes), "stiffness": listed(stiffness)}
+        return "RestShapeSpringsForceField", {
+            "points": listed(nodes),
+            "stiffness": listed(stiffness),
+        }
     if load.kind != "displacement":
         nodes, forces = facet_forces(model.mesh, model.sets, load)
         return "ConstantForceField", {"indices": listed(nodes), "forces": listed(forces)}
     indices = listed(nodes_of(model, load.set_name))
     if np.isnan(load.numbers).any():
-        raise tetopt.InputError("sofa: a set moves in all directions or in none; give numbers instead of free")
+        raise tetopt.InputError(
+            "sofa: a set moves in all directions or in none; give numbers instead of free"
+        )
     if not load.numbers.any():
         return "FixedProjectiveConstraint", {"indices": indices}
     path = listed([[0, 0, 0], load.numbers, load.numbers])  # from 0 to 1 s, then fixed
-    return "LinearMovementProjectiveConstraint", {"indices": indices, "keyTimes": "0 1 1e9", "movements": path}
+    return "LinearMovementProjectiveConstraint", {
+        "indices": indices,
+        "keyTimes": "0 1 1e9",
+        "movements": path,
+    }
 
 
 def sofa(model):
     """A scene for SOFA v24.12, in equilibrium at t = 2 s."""
     if model.mesh.ndim != 3 or model.materials is None or any(load.step for load in model.loads):
-        raise tetopt.InputError("sofa: expected tetrahedra, a modulus mapping (`young`) and loads of one step")
+        raise tetopt.InputError(
+            "sofa: expected tetrahedra, a modulus mapping (`young`) and loads of one step"
+        )
     mesh, materials = model.mesh, model.materials
     gravity = sum((load.numbers for load in model.loads if load.kind == "gravity"), np.zeros(3))
     root = ET.Element("Node", name="root", dt="0.1", gravity=listed(gravity))
     for plugin in (
-        "Constraint.Projective", "LinearSolver.Direct", "Mass", "MechanicalLoad", "ODESolver.Backward",
-        "SolidMechanics.FEM.Elastic", "SolidMechanics.Spring", "StateContainer", "Topology.Container.Dynamic",
-    ):  # fmt: skip
+        "Constraint.Projective",
+        "LinearSolver.Direct",
+        "Mass",
+        "MechanicalLoad",
+        "ODESolver.Backward",
+        "SolidMechanics.FEM.Elastic",
+        "SolidMechanics.Spring",
+        "StateContainer",
+        "Topology.Container.Dynamic",
+    ):
         ET.SubElement(root, "RequiredPlugin", name=f"Sofa.Component.{plugin}")
     ET.SubElement(root, "DefaultAnimationLoop")
     solid = ET.SubElement(root, "Node", name="solid")
     ET.SubElement(solid, "EulerImplicitSolver")
     ET.SubElement(solid, "SparseLDLSolver", template="CompressedRowSparseMatrixMat3x3")
     ET.SubElement(
-        solid, "TetrahedronSetTopologyContainer", name="mesh", position=listed(mesh.points),
+        solid,
+        "TetrahedronSetTopologyContainer",
+        name="mesh",
+        position=listed(mesh.points),
         tetrahedra=listed(mesh.cells),
-    )  # fmt: skip
+    )
     ET.SubElement(solid, "TetrahedronSetGeometryAlgorithms", template="Vec3")
-    ET.SubElement(solid, "MechanicalObject", name="dofs", template="Vec3", position="@mesh.position")
-    density = np.full(1, 1000.0) if materials.density is None else materials.density  # water's, kg/m3
+    ET.SubElement(
+        solid, "MechanicalObject", name="dofs", template="Vec3", position="@mesh.position"
+    )
+    # water's, kg/m3
+    density = np.full(1, 1000.0) if materials.density is None else materials.density
     if np.ptp(density) > 0.0:
         raise tetopt.InputError("sofa: expected one density for all cells")
     in_mm = float(density[0]) * (1e-9 if model.units == "kPa" else 1e-12)  # kg, or t, in a mm3
     ET.SubElement(solid, "DiagonalMass", massDensity=repr(in_mm), topology="@mesh")
     ET.SubElement(
-        solid, "TetrahedronFEMForceField", template="Vec3", topology="@mesh", method="large",
-        youngModulus=listed(materials.young[materials.of_cell]), poissonRatio=listed(materials.nu[materials.of_cell]),
-    )  # fmt: skip
+        solid,
+        "TetrahedronFEMForceField",
+        template="Vec3",
+        topology="@mesh",
+        method="large",
+        youngModulus=listed(materials.young[materials.of_cell]),
+        poissonRatio=listed(materials.nu[materials.of_cell]),
+    )
     for load in model.loads:
         if load.kind != "gravity":
             kind, values = load_of(model, load)
-            ET.SubElement(solid, kind, name=f"{load.kind}_{load.set_name}", template="Vec3", **values)
+            ET.SubElement(
+                solid, kind, name=f"{load.kind}_{load.set_name}", template="Vec3", **values
+            )
     ET.indent(root)
     return ET.tostring(root, encoding="unicode")
 
 
-# %%
-# From here on, this process knows the suffix `.scn`: `tetopt.save_model` writes it, whole or not at all, as do
-# `tetopt.run` and the command (`from tetopt.cli import main`).
+# %% From here on, this process knows the suffix `.scn`: `tetopt.save_model` writes it, whole or not
+# at all, as do `tetopt.run` and the command (`from tetopt.cli import main`).
 
 tetopt.register_format(".scn", sofa, "SOFA scene", runs=True)
 
@@ -137,11 +166,12 @@ with tempfile.TemporaryDirectory() as folder:
     tetopt.save_model(path, model)
     solid = ET.parse(path).find("Node[@name='solid']")
 
-# %%
-# Read the file back with an independent reader. The forces in the scene add up to the pressure, 0.1 kPa, times the area
-# of the loaded side.
+# %% Read the file back with an independent reader. The forces in the scene add up to the pressure,
+# 0.1 kPa, times the area of the loaded side.
 
-forces = np.array(solid.find("ConstantForceField").get("forces").split(), dtype=float).reshape(-1, 3)
+forces = np.array(solid.find("ConstantForceField").get("forces").split(), dtype=float).reshape(
+    -1, 3
+)
 total_mN = -forces.sum(axis=0)[2]
 print(f"force on the upper side: {total_mN:.1f} mN")
 
@@ -152,6 +182,10 @@ held_nodes = np.array(solid.find("FixedProjectiveConstraint").get("indices").spl
 pushed_nodes = np.array(solid.find("ConstantForceField").get("indices").split(), dtype=int)
 plotter = pyvista.Plotter(window_size=(700, 600))
 plotter.add_mesh(mesh.to_pyvista(), style="wireframe", color="#999999", line_width=1)
-plotter.add_points(mesh.points[held_nodes], color="#c03030", point_size=9, render_points_as_spheres=True)
-plotter.add_points(mesh.points[pushed_nodes], color="#2060c0", point_size=9, render_points_as_spheres=True)
+plotter.add_points(
+    mesh.points[held_nodes], color="#c03030", point_size=9, render_points_as_spheres=True
+)
+plotter.add_points(
+    mesh.points[pushed_nodes], color="#2060c0", point_size=9, render_points_as_spheres=True
+)
 plotter.show()

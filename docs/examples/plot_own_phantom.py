@@ -2,8 +2,8 @@
 Write your own phantom
 ======================
 
-A phantom is a table of shapes with exactly known intensities: the quickest way to test a mesh, a modulus mapping or a
-simulation against a known answer.
+A phantom is a table of shapes with exactly known intensities: the quickest way to test a mesh, a
+modulus mapping or a simulation against a known answer.
 """
 
 import tempfile
@@ -14,9 +14,8 @@ import pyvista
 
 import tetopt
 
-# %%
-# Shapes are painted in order, each over the previous ones. World axes are right, anterior and superior; the box is
-# centred at 0, 0, 0.
+# %% Shapes are painted in order, each over the previous ones. World axes are right, anterior and
+# superior; the box is centred at 0, 0, 0.
 
 TABLE = """
 name = "breast"
@@ -56,17 +55,17 @@ with tempfile.TemporaryDirectory() as folder:
     path.write_text(TABLE, encoding="utf-8")
     phantom = tetopt.load_phantom(path)
 
-# %%
-# Render the phantom as voxels, with labels on the same grid. With labels, the result has the label of each cell.
+# %% Render the phantom as voxels, with labels on the same grid. With labels, the result has the
+# label of each cell.
 
 image = phantom.image()
 labels = phantom.label_image()
 result = tetopt.mesh_image(tetopt.content(image, labels), nodes=1200)
 mesh, of_cell = result.mesh, result.labels
 
-# %%
-# The exact volume of the lesion is 4/3 pi a b c. The cells with its label have two per cent less. Flat facets would cut
-# off more of a curved surface, but nodes lie off it by what their facets cut off.
+# %% The exact volume of the lesion is 4/3 pi a b c. The cells with its label have two per cent
+# less. Flat facets would cut off more of a curved surface, but nodes lie off it by what their
+# facets cut off.
 
 fields = tetopt.cell_fields(mesh, image)
 exact_mm3 = 4.0 / 3.0 * np.pi * 8 * 6 * 6

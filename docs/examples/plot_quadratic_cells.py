@@ -2,17 +2,16 @@
 Compare linear and quadratic elements
 =====================================
 
-Solve the same mesh with linear and with quadratic displacements. Quadratic elements have more unknowns, but are much
-more accurate for the same number of unknowns.
+Solve the same mesh with linear and with quadratic displacements. Quadratic elements have more
+unknowns, but are much more accurate for the same number of unknowns.
 """
 
 import matplotlib.pyplot as plt
 
 import tetopt
 
-# %%
-# A gland with two stiff nodules; intensities are Young's moduli in kPa. The top is fixed, and the bottom is pushed in
-# by 1 % of the height. In 2-D, this is plane stress.
+# %% A gland with two stiff nodules; intensities are Young's moduli in kPa. The top is fixed, and
+# the bottom is pushed in by 1 % of the height. In 2-D, this is plane stress.
 
 image = tetopt.load_phantom("prostate_2d").image()
 
@@ -23,9 +22,8 @@ def solution(mesh, order):
     return tetopt.solve(model)
 
 
-# %%
-# The reference solution is a fine mesh with quadratic elements. The strain energy of a compression converges to it from
-# above, so its error is a fair comparison.
+# %% The reference solution is a fine mesh with quadratic elements. The strain energy of a
+# compression converges to it from above, so its error is a fair comparison.
 
 fine = tetopt.mesh_image(image, nodes=3000).mesh
 exact = solution(fine, order=2).strain_energy
@@ -39,7 +37,9 @@ for mesh in meshes:
         errors[order].append(abs(solved.strain_energy / exact - 1.0))
         unknowns[order].append(solved.u.size)
 for order in (1, 2):
-    row = ", ".join(f"{error:.4f} at {size}" for error, size in zip(errors[order], unknowns[order], strict=True))
+    row = ", ".join(
+        f"{error:.4f} at {size}" for error, size in zip(errors[order], unknowns[order], strict=True)
+    )
     print(f"order {order}: error of the energy {row} unknowns")
 
 # %%
@@ -61,7 +61,9 @@ left.legend()
 mesh = meshes[3]
 stress = tetopt.solution_fields(mesh, solution(mesh, 2)).cell_data["von_mises"]
 figure, right = plt.subplots(figsize=(5.2, 4.8), layout="constrained")
-drawn = right.tripcolor(*mesh.points.T, mesh.cells, stress, cmap="inferno", edgecolors="#404a5a", linewidth=0.2)
+drawn = right.tripcolor(
+    *mesh.points.T, mesh.cells, stress, cmap="inferno", edgecolors="#404a5a", linewidth=0.2
+)
 right.set_aspect("equal")
 right.axis("off")
 figure.colorbar(drawn, ax=right, label="von Mises stress, kPa", shrink=0.8)

@@ -2,8 +2,8 @@
 Mesh two contrasts
 ==================
 
-Some structures are visible in only one contrast. A mesh of two contrasts follows both; weights set how much each
-counts.
+Some structures are visible in only one contrast. A mesh of two contrasts follows both; weights set
+how much each counts.
 """
 
 import matplotlib.pyplot as plt
@@ -11,18 +11,18 @@ import numpy as np
 
 import tetopt
 
-# %%
-# Two contrasts of one phantom on the same voxels. The disc and the ellipse are visible only in the first, the box only
-# in the second. For a contrast on another grid, use ``tetopt.resample_contrast``.
+# %% Two contrasts of one phantom on the same voxels. The disc and the ellipse are visible only in
+# the first, the box only in the second. For a contrast on another grid, use
+# ``tetopt.resample_contrast``.
 
 labels = tetopt.load_phantom("fig2_2d").label_image()
 shape = labels.data.astype(int)
 first = tetopt.Image(np.array([100, 200, 20, 100])[shape], labels.affine)
 second = tetopt.Image(np.array([0.5, 0.5, 0.5, 0.9])[shape], labels.affine)
 
-# %%
-# Three meshes of 250 nodes: of the first contrast, of the second, and of both. Contrasts are normalised by their
-# variance, so their scales do not matter; ``weights=[1, 0.5]`` would halve the second.
+# %% Three meshes of 250 nodes: of the first contrast, of the second, and of both. Contrasts are
+# normalised by their variance, so their scales do not matter; ``weights=[1, 0.5]`` would halve the
+# second.
 
 meshes = {
     "of the first": tetopt.mesh_image(first, nodes=250).mesh,
@@ -38,11 +38,12 @@ def fraction(image, mesh):
 
 for name, mesh in meshes.items():
     print(
-        f"mesh {name:13}: {fraction(first, mesh):.4f} of the first, {fraction(second, mesh):.4f} of the second is left"
+        f"mesh {name:13}: {fraction(first, mesh):.4f} of the first, {fraction(second, mesh):.4f} "
+        "of the second is left"
     )
 
-# %%
-# For each contrast, the mesh of both is nearly as good as the mesh of that contrast, and much better for the other.
+# %% For each contrast, the mesh of both is nearly as good as the mesh of that contrast, and much
+# better for the other.
 
 both = meshes["of both"]
 worst = max(fraction(first, both), fraction(second, both))
@@ -57,7 +58,9 @@ for name, mesh in meshes.items():
         figure, ax = plt.subplots(figsize=(4.4, 4.4), layout="constrained")
         ax.set_title(f"mesh {name}, {shown} image")
         means = tetopt.cell_moments(image, mesh).mean
-        ax.tripcolor(*mesh.points.T, mesh.cells, means, cmap=colours, edgecolors="#7f8fa6", linewidth=0.4)
+        ax.tripcolor(
+            *mesh.points.T, mesh.cells, means, cmap=colours, edgecolors="#7f8fa6", linewidth=0.4
+        )
         ax.set_aspect("equal")
         ax.axis("off")
 plt.show()

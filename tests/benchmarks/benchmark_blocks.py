@@ -1,10 +1,12 @@
-"""What a volume by blocks and a mesh by parts take: time of each stage, memory of each process; a table and a file.
+"""What a volume by blocks and a mesh by parts take: time of each stage, memory of each process; a
+table and a file.
 
     python tests/benchmarks/benchmark_blocks.py 1024 --folder /scratch -o bench_blocks.json
 
-Of EDGE^3 voxels of 16 bits, painted chunk by chunk if the folder has none yet: 400 ellipsoids of all sizes, whose radii
-are such that small ones have as much surface as large ones, and noise. Nodes are in proportion to EDGE^2, as surfaces
-are, 500,000 for 1024. The largest takes 1.3 GB of disk and three quarters of an hour, 256 a minute.
+Of EDGE^3 voxels of 16 bits, painted chunk by chunk if the folder has none yet: 400 ellipsoids of
+all sizes, whose radii are such that small ones have as much surface as large ones, and noise. Nodes
+are in proportion to EDGE^2, as surfaces are, 500,000 for 1024. The largest takes 1.3 GB of disk and
+three quarters of an hour, 256 a minute.
 """
 
 from __future__ import annotations
@@ -41,13 +43,24 @@ NOISE_SD = 30.0  # of intensities from 0 to 1000
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Paint, measure, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("edge", type=int, help="voxels along each axis")
     parser.add_argument("--nodes", type=int, help="of the mesh")
     parser.add_argument("--parts", type=int, default=1, help="at the least")
-    parser.add_argument("--workers", type=int, default=2, help="processes of dask's; 0: this one runs all parts")
-    parser.add_argument("--worker-gb", type=float, default=3.0, help="of memory for each worker, enforced")
-    parser.add_argument("--folder", type=Path, default=Path(), help="where the volume and the folder of work are made")
+    parser.add_argument(
+        "--workers", type=int, default=2, help="processes of dask's; 0: this one runs all parts"
+    )
+    parser.add_argument(
+        "--worker-gb", type=float, default=3.0, help="of memory for each worker, enforced"
+    )
+    parser.add_argument(
+        "--folder",
+        type=Path,
+        default=Path(),
+        help="where the volume and the folder of work are made",
+    )
     parser.add_argument("-o", "--output", type=Path, required=True, help="JSON file")
     parser.add_argument("--force", action="store_true", help="replace an existing file")
     options = parser.parse_args(argv)
@@ -62,7 +75,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     except InputError as error:
         print(f"benchmark_blocks: {error}", file=sys.stderr)
         return 2
-    rows = {"edge": options.edge, "nodes": nodes, "painted_seconds": painted, "cores": os.cpu_count(), **measured}
+    rows = {
+        "edge": options.edge,
+        "nodes": nodes,
+        "painted_seconds": painted,
+        "cores": os.cpu_count(),
+        **measured,
+    }
     save_json(output, rows)
     show(rows)
     print(f"\nall numbers in {output}")
@@ -72,7 +91,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def balls(edge: int) -> str:
     """The phantom's file."""
     random, (least, most) = np.random.default_rng(21), BALL_RADII
-    # Of radius r there are in proportion to r^-2.5: number times surface, in steps of a factor, is about the same.
+    # Of radius r there are in proportion to r^-2.5: number times surface, in steps of a factor, is
+    # about the same.
     fraction = random.random(N_BALLS)
     radii = np.sort((least**-1.5 + fraction * (most**-1.5 - least**-1.5)) ** (-1 / 1.5))[::-1]
     text = f"""
@@ -106,8 +126,12 @@ def paint(volume: Path, edge: int) -> None:
     save_zarr(volume, Image.stored(voxels, voxels.affine), voxels, np.int16)
 
 
-def measure(volume: Path, nodes: int, n_parts: int, n_workers: int, worker_bytes: float) -> dict[str, Any]:
-    """A run in parts: its stages in their order, what each worker had at its peak, and the records of its rounds."""
+def measure(
+    volume: Path, nodes: int, n_parts: int, n_workers: int, worker_bytes: float
+) -> dict[str, Any]:
+    """A run in parts: its stages in their order, what each worker had at its peak, and the
+    records of its rounds.
+    """
     folder = volume.with_suffix(".work")
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
@@ -118,7 +142,12 @@ def measure(volume: Path, nodes: int, n_parts: int, n_workers: int, worker_bytes
 
     def stage(name: str) -> None:
         """What is begun now, when and with what; what was begun before ends."""
-        now = {"name": name, "at": time.perf_counter(), "cpu": time.process_time(), "n_tasks": len(done)}
+        now = {
+            "name": name,
+            "at": time.perf_counter(),
+            "cpu": time.process_time(),
+            "n_tasks": len(done),
+        }
         sizes = [path.stat().st_size for path in folder.rglob("*") if path.is_file()]
         stages.append({**now, "peak": peak_bytes(), "disk": sum(sizes), "load": os.getloadavg()[0]})
 
@@ -150,11 +179,16 @@ def measure(volume: Path, nodes: int, n_parts: int, n_workers: int, worker_bytes
     shutil.rmtree(folder)
     tasks = [{**task._asdict(), "result": task.result._asdict()} for task in done]
     return {
-        "stages": stages, "tasks": tasks, "worker_peaks": sorted(peaks.values()),
-        "predicted_task_bytes": predicted, "client_peak": peak_bytes(), "n_nodes": len(result.mesh.points),
-        "n_cells": len(result.mesh.cells), "violated": list(result.violated),
+        "stages": stages,
+        "tasks": tasks,
+        "worker_peaks": sorted(peaks.values()),
+        "predicted_task_bytes": predicted,
+        "client_peak": peak_bytes(),
+        "n_nodes": len(result.mesh.points),
+        "n_cells": len(result.mesh.cells),
+        "violated": list(result.violated),
         "history": [record._asdict() for record in result.history],
-    }  # fmt: skip
+    }
 
 
 class Done(NamedTuple):
@@ -187,20 +221,33 @@ def _noted(tasks: Iterator[Done], done: list[Done]) -> Iterator[Done]:
 
 def show(rows: dict[str, Any]) -> None:
     """Print a table of the stages, and the peaks."""
-    print(f"{rows['edge']}^3 voxels, {rows['n_nodes']} nodes, {rows['n_cells']} cells, {rows['cores']} cores")
+    print(
+        f"{rows['edge']}^3 voxels, {rows['n_nodes']} nodes, {rows['n_cells']} cells, "
+        f"{rows['cores']} cores"
+    )
     print(f"painted in {rows['painted_seconds']:.0f} s (0: it was there)")
-    print("| stage | s | CPU s of the client | of tasks, s | client's peak, GB | folder of work, MB | load |")
+    print(
+        "| stage | s | CPU s of the client | of tasks, s | client's peak, GB | folder of work, "
+        "MB | load |"
+    )
     print("|---|---|---|---|---|---|---|")
     stages = rows["stages"]
     for this, after in pairwise(stages):
         tasks = sum(task["seconds"] for task in rows["tasks"][this["n_tasks"] : after["n_tasks"]])
         print(
-            f"| {this['name']} | {after['at'] - this['at']:.1f} | {after['cpu'] - this['cpu']:.1f} | {tasks:.0f} "
+            f"| {this['name']} | {after['at'] - this['at']:.1f} | "
+            f"{after['cpu'] - this['cpu']:.1f} | {tasks:.0f} "
             f"| {after['peak'] / 1e9:.2f} | {after['disk'] / 1e6:.0f} | {after['load']:.1f} |"
         )
-    print(f"| all | {stages[-1]['at'] - stages[0]['at']:.0f} | {stages[-1]['cpu'] - stages[0]['cpu']:.0f} | | | | |")
+    print(
+        f"| all | {stages[-1]['at'] - stages[0]['at']:.0f} | "
+        f"{stages[-1]['cpu'] - stages[0]['cpu']:.0f} | | | | |"
+    )
     words = ", ".join(f"{peak / 1e9:.2f}" for peak in rows["worker_peaks"])
-    print(f"\npeaks of workers {words} GB; {rows['predicted_task_bytes'] / 1e9:.2f} predicted for the largest task")
+    print(
+        f"\npeaks of workers {words} GB; {rows['predicted_task_bytes'] / 1e9:.2f} predicted for "
+        "the largest task"
+    )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,5 @@
-"""How fast the kernels are on this machine, beside the library call that each replaces; a table and a JSON file.
+"""How fast the kernels are on this machine, beside the library call that each replaces; a table and
+a JSON file.
 
     python tests/benchmarks/benchmark_kernels.py -o bench_kernels.json [IMAGE]
 
@@ -37,10 +38,14 @@ from tetopt.system.files import checked_output, save_json
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("image", type=Path, nargs="?", help="volume to measure on")
     parser.add_argument("-o", "--output", type=Path, required=True, help="JSON file")
-    parser.add_argument("--quick", action="store_true", help="small meshes, to try the program itself")
+    parser.add_argument(
+        "--quick", action="store_true", help="small meshes, to try the program itself"
+    )
     parser.add_argument("--force", action="store_true", help="replace an existing file")
     options = parser.parse_args(argv)
     try:
@@ -58,10 +63,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         "versions": versions(),
     }
     rows |= sampling(image, 2_000 if options.quick else 37_000)
-    rows["sampling_by_size"] = [sampling_by_size(image, n) for n in ((300, 600) if options.quick else (4_000, 145_000))]
+    rows["sampling_by_size"] = [
+        sampling_by_size(image, n) for n in ((300, 600) if options.quick else (4_000, 145_000))
+    ]
     rows["paper"] = [paper(image, nodes, iterations=2 if options.quick else 6) for nodes in sizes]
     rows["bar"] = bar(image, 300 if options.quick else 5_000)
-    rows["engine"] = engine(image, path, (300, 500, 700, 900) if options.quick else (5_000, 14_000, 37_000, 145_000))
+    rows["engine"] = engine(
+        image, path, (300, 500, 700, 900) if options.quick else (5_000, 14_000, 37_000, 145_000)
+    )
     rows["peak_memory_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     save_json(output, rows)
     show(rows)
@@ -81,7 +90,9 @@ def best_seconds(task: Callable[[], Any], repeats: int = 5) -> float:
 
 
 def sampling(image: tetopt.Image, nodes: int) -> dict[str, Any]:
-    """Voxels per second of the sampler and of scipy's find_simplex, on the same tessellation and volume."""
+    """Voxels per second of the sampler and of scipy's find_simplex, on the same tessellation and
+    volume.
+    """
     lattice = tetopt.lattice_mesh(image, nodes=nodes)
     index = image.to_index(lattice.points)
     inside = (index > -0.5 + 1e-9) & (index < np.array(image.shape) - 0.5 - 1e-9)
@@ -89,7 +100,8 @@ def sampling(image: tetopt.Image, nodes: int) -> dict[str, Any]:
     tessellation = Delaunay(shaken)
     cells = oriented(shaken, tessellation.simplices)
     cells = cells[volumes(shaken, cells) > 1e-9]
-    cells = cells[np.lexsort(np.sort(cells, axis=1).T[::-1])]  # as tetopt's own meshes are: neighbours near each other
+    # as tetopt's own meshes are: neighbours near each other
+    cells = cells[np.lexsort(np.sort(cells, axis=1).T[::-1])]
     sides = facets(cells)
     grid = sampling_grid(image, shaken)
     ticks = to_ticks(image.to_index(shaken), grid)
@@ -97,11 +109,16 @@ def sampling(image: tetopt.Image, nodes: int) -> dict[str, Any]:
     ours_and_facets = best_seconds(lambda: moment_sums(grid, ticks, cells))
     ours_at_once = best_seconds(lambda: tetopt.cell_moments(image, tetopt.Mesh(shaken, cells)))
 
-    centres = image.to_world(np.stack(np.meshgrid(*map(np.arange, image.shape), indexing="ij"), -1).reshape(-1, 3))
+    centres = image.to_world(
+        np.stack(np.meshgrid(*map(np.arange, image.shape), indexing="ij"), -1).reshape(-1, 3)
+    )
     theirs = best_seconds(lambda: tessellation.find_simplex(centres), repeats=2)
-    # In raster order each search starts next to its end; in no order, as for scattered points, it walks far.
+    # In raster order each search starts next to its end; in no order, as for scattered points, it
+    # walks far.
     some = np.random.default_rng(0).permutation(centres)[:200_000]
-    scattered = best_seconds(lambda: tessellation.find_simplex(some), repeats=1) * len(centres) / len(some)
+    scattered = (
+        best_seconds(lambda: tessellation.find_simplex(some), repeats=1) * len(centres) / len(some)
+    )
     total = best_seconds(lambda: (image.data.sum(), (image.data * image.data).sum()))
     return {
         "sampling_cells": len(cells),
@@ -117,13 +134,21 @@ def sampling(image: tetopt.Image, nodes: int) -> dict[str, Any]:
 
 
 def sampling_by_size(image: tetopt.Image, nodes: int) -> dict[str, float]:
-    """The sampler alone on a mesh of that many nodes: tetrahedra a second, and beside numpy's two sums."""
-    mesh = tetopt.optimize(image, tetopt.lattice_mesh(image, nodes=nodes), k_D=0.0, iterations=1).mesh
+    """The sampler alone on a mesh of that many nodes: tetrahedra a second, and beside numpy's
+    two sums.
+    """
+    mesh = tetopt.optimize(
+        image, tetopt.lattice_mesh(image, nodes=nodes), k_D=0.0, iterations=1
+    ).mesh
     grid = sampling_grid(image, mesh.points)
     ticks, sides = to_ticks(image.to_index(mesh.points), grid), facets(mesh.cells)
     seconds = best_seconds(lambda: moment_sums(grid, ticks, mesh.cells, sides))
     total = best_seconds(lambda: (image.data.sum(), (image.data * image.data).sum()))
-    return {"cells": len(mesh.cells), "cells_per_second": len(mesh.cells) / seconds, "over_numpy": seconds / total}
+    return {
+        "cells": len(mesh.cells),
+        "cells_per_second": len(mesh.cells) / seconds,
+        "over_numpy": seconds / total,
+    }
 
 
 def paper(image: tetopt.Image, nodes: int, iterations: int) -> dict[str, Any]:
@@ -156,21 +181,30 @@ def bar(image: tetopt.Image, nodes: int) -> dict[str, Any]:
 
 
 def engine(image: tetopt.Image, path: Path, sizes: Sequence[int]) -> dict[str, Any]:
-    """The fast engine against the paper's scheme, at k_D = 0.5; how time and memory grow; a flip pass alone."""
+    """The fast engine against the paper's scheme, at k_D = 0.5; how time and memory grow; a flip
+    pass alone.
+    """
     mesh = tetopt.lattice_mesh(image, nodes=sizes[0])
     prepare_kernels(image, 0.5)
     reference = tetopt.optimize_paper(image, mesh, k_D=0.5, iterations=20).history
-    same = tetopt.optimize(image, mesh, k_D=0.5, iterations=20, shape_power=1.0, min_dihedral=0.0).history
+    same = tetopt.optimize(
+        image, mesh, k_D=0.5, iterations=20, shape_power=1.0, min_dihedral=0.0
+    ).history
     reached = next((row.seconds for row in same if row.E <= reference[-1].E), None)
     numbers: dict[str, Any] = {
-        "nodes": len(mesh.points), "paper_E": reference[-1].E, "paper_seconds": reference[-1].seconds,
-        "fast_E": same[-1].E, "fast_seconds": same[-1].seconds, "fast_seconds_to_paper_E": reached,
+        "nodes": len(mesh.points),
+        "paper_E": reference[-1].E,
+        "paper_seconds": reference[-1].seconds,
+        "fast_E": same[-1].E,
+        "fast_seconds": same[-1].seconds,
+        "fast_seconds_to_paper_E": reached,
         "faster_by": None if reached is None else reference[-1].seconds / reached,
-    }  # fmt: skip
+    }
     numbers["runs"] = [in_a_child(path, nodes) for nodes in sizes[1:]]
     first, last = numbers["runs"][1], numbers["runs"][-1]
     numbers["time_grows_as_nodes_to_the"] = float(
-        np.log(last["seconds_per_iteration"] / first["seconds_per_iteration"]) / np.log(last["nodes"] / first["nodes"])
+        np.log(last["seconds_per_iteration"] / first["seconds_per_iteration"])
+        / np.log(last["nodes"] / first["nodes"])
     )
     numbers["flip_seconds_per_mtet"] = flip_pass(image, sizes[1])
     return numbers
@@ -191,17 +225,23 @@ def in_a_child(path: Path, nodes: int) -> dict[str, Any]:
         "seconds, after = time.perf_counter() - begin, peak()\n"
         "first, last = result.history[0], result.history[-1]\n"
         "q = tetopt.quality(result.mesh.points, result.mesh.cells)\n"
-        "print(json.dumps({'nodes': q.n_nodes, 'cells': q.n_cells, 'seconds': seconds, 'iterations': last.iteration,\n"
+        "print(json.dumps({'nodes': q.n_nodes, 'cells': q.n_cells, 'seconds': seconds, "
+        "'iterations': last.iteration,\n"
         "    'seconds_per_iteration': (last.seconds - first.seconds) / last.iteration,\n"
-        "    'E_D_of_initial': last.E_D / first.E_D, 'mean_rho': q.mean_rho, 'min_dihedral': q.min_dihedral,\n"
+        "    'E_D_of_initial': last.E_D / first.E_D, 'mean_rho': q.mean_rho, 'min_dihedral': "
+        "q.min_dihedral,\n"
         "    'gb_more_per_mtet': (after - before) / q.n_cells * 1e6, 'peak_gb': after}))\n"
     )
-    done = subprocess.run([sys.executable, "-c", program, str(path), str(nodes)], check=True, capture_output=True)
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(path), str(nodes)], check=True, capture_output=True
+    )
     return json.loads(done.stdout.splitlines()[-1])
 
 
 def flip_pass(image: tetopt.Image, nodes: int) -> float:
-    """Seconds per million tetrahedra to look at every facet and edge of a mesh that is good already."""
+    """Seconds per million tetrahedra to look at every facet and edge of a mesh that is good
+    already.
+    """
     mesh = tetopt.optimize(image, tetopt.lattice_mesh(image, nodes=nodes), k_D=0.5).mesh
     state, _ = flip(Run(plain(image), mesh, 0.5).state)
     return best_seconds(lambda: flip(state)) / len(mesh.cells) * 1e6
@@ -212,12 +252,19 @@ def show(rows: dict[str, Any]) -> None:
     print(f"{rows['image']}, {rows['cores']} cores, {rows['threads']} threads")
     per_second = rows["sampling_voxels_per_second"] / 1e6
     print(f"  sampling, {rows['sampling_cells']:7d} tets          {per_second:10.1f} Mvoxel/s")
-    raster, scattered = rows["find_simplex_voxels_per_second"], rows["find_simplex_scattered_voxels_per_second"]
+    raster, scattered = (
+        rows["find_simplex_voxels_per_second"],
+        rows["find_simplex_scattered_voxels_per_second"],
+    )
     print(f"  scipy find_simplex, raster order  {raster / 1e6:10.2f} Mvoxel/s")
     print(f"  scipy find_simplex, random order  {scattered / 1e6:10.2f} Mvoxel/s")
     print(f"  ratio to raster order             {rows['sampling_over_find_simplex']:10.0f}")
-    print(f"  ratio to random order             {rows['sampling_over_find_simplex_scattered']:10.0f}")
-    print(f"  to raster order, with facets      {rows['sampling_and_facets_over_find_simplex']:10.0f}")
+    print(
+        f"  ratio to random order             {rows['sampling_over_find_simplex_scattered']:10.0f}"
+    )
+    print(
+        f"  to raster order, with facets      {rows['sampling_and_facets_over_find_simplex']:10.0f}"
+    )
     print(f"  to raster order, cell_moments     {rows['cell_moments_over_find_simplex']:10.0f}")
     print(f"  sampling over numpy's two sums    {rows['sampling_over_numpy_sums']:10.1f}")
     for row in rows["sampling_by_size"]:
@@ -233,11 +280,13 @@ def show(rows: dict[str, Any]) -> None:
 def _show_paper(rows: Sequence[dict[str, Any]], result: dict[str, Any]) -> None:
     for row in rows:
         print(
-            f"  --method paper, {row['nodes']:6d} nodes      {row['seconds_per_iteration']:10.2f} s an iteration, "
+            f"  --method paper, {row['nodes']:6d} nodes      "
+            f"{row['seconds_per_iteration']:10.2f} s an iteration, "
             f"Delaunay {100 * row['delaunay_fraction']:.0f} % of it"
         )
     print(
-        f"  {result['nodes']} nodes, k_D = 0.2, 20 iterations: E_D {result['E_D_of_initial']:.3f} of initial, "
+        f"  {result['nodes']} nodes, k_D = 0.2, 20 iterations: E_D "
+        f"{result['E_D_of_initial']:.3f} of initial, "
         f"mean rho {result['mean_rho']:.4f}, {result['seconds']:.1f} s"
     )
 
@@ -245,16 +294,20 @@ def _show_paper(rows: Sequence[dict[str, Any]], result: dict[str, Any]) -> None:
 def _show_engine(fast: dict[str, Any]) -> None:
     if fast["faster_by"] is not None:
         print(
-            f"  --method fast, {fast['nodes']} nodes, k_D = 0.5, p = 1, to E {fast['paper_E']:.4f} of 20 paper "
-            f"iterations: {fast['fast_seconds_to_paper_E']:.2f} s against {fast['paper_seconds']:.1f} s, "
+            f"  --method fast, {fast['nodes']} nodes, k_D = 0.5, p = 1, to E "
+            f"{fast['paper_E']:.4f} of 20 paper "
+            f"iterations: {fast['fast_seconds_to_paper_E']:.2f} s against "
+            f"{fast['paper_seconds']:.1f} s, "
             f"{fast['faster_by']:.0f} times faster; ends at {fast['fast_E']:.4f}"
         )
     for row in fast["runs"]:
         print(
-            f"  --method fast, {row['nodes']} nodes, {row['cells']} tets, k_D = 0.5: {row['seconds']:.1f} s, "
+            f"  --method fast, {row['nodes']} nodes, {row['cells']} tets, k_D = 0.5: "
+            f"{row['seconds']:.1f} s, "
             f"{row['iterations']} iterations; E_D {row['E_D_of_initial']:.3f} of initial, mean rho "
             f"{row['mean_rho']:.4f}, angles from {row['min_dihedral']:.1f}; "
-            f"{row['seconds'] / row['cells'] * 1e6:.0f} s and {row['gb_more_per_mtet']:.2f} GB more per Mtet"
+            f"{row['seconds'] / row['cells'] * 1e6:.0f} s and {row['gb_more_per_mtet']:.2f} GB "
+            "more per Mtet"
         )
     print(f"  time of an iteration grows as nodes^{fast['time_grows_as_nodes_to_the']:.2f}")
     print(f"  flip pass over a good mesh        {fast['flip_seconds_per_mtet']:10.2f} s per Mtet")

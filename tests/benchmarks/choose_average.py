@@ -1,9 +1,11 @@
-"""How the error of a simulation depends on the average over a cell's voxels: the evidence behind the default.
+"""How the error of a simulation depends on the average over a cell's voxels: the evidence behind
+the default.
 
-Phantoms, and volumes of yours, are meshed uniformly and graded, for linear and for quadratic cells with as many nodes
-in all; each mesh is compressed with each average and compared with the voxels' solution, as in `tetopt compare`.
-"points" is no average, but the modulus of the voxel at each Gauss point of a cell: what a solver could have that reads
-the image itself. The last rows are geometric means over images, meshes and nu, relative to the first average.
+Phantoms, and volumes of yours, are meshed uniformly and graded, for linear and for quadratic cells
+with as many nodes in all; each mesh is compressed with each average and compared with the voxels'
+solution, as in `tetopt compare`. "points" is no average, but the modulus of the voxel at each Gauss
+point of a cell: what a solver could have that reads the image itself. The last rows are geometric
+means over images, meshes and nu, relative to the first average.
 
     python tests/benchmarks/choose_average.py -o averages.json [T1.nii.gz ...]
 """
@@ -32,24 +34,49 @@ from tetopt.study.compare_report import Settings
 from tetopt.system.files import checked_output, save_json
 
 POINTS = "points"
-AVERAGES = ("mean", "power:0.5", "geometric", "power:-0.5", "harmonic", "hill", "gauss", "nodes", POINTS)
+AVERAGES = (
+    "mean",
+    "power:0.5",
+    "geometric",
+    "power:-0.5",
+    "harmonic",
+    "hill",
+    "gauss",
+    "nodes",
+    POINTS,
+)
 CORNER_FRACTION = 1 / 7.2  # of all nodes of quadratic tetrahedra, before a mesh has shown its own
 COUNT_TOLERANCE = 0.03  # of the requested number of nodes
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the sweep; 0 when all is written, 2 with one line on an input to mend."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("images", type=Path, nargs="*", help="volumes, besides the phantoms")
-    parser.add_argument("-o", "--output", type=Path, required=True, help="JSON file for every number")
-    parser.add_argument("--phantoms", nargs="*", default=PHANTOM_NAMES, help="phantoms to take (%(default)s)")
-    parser.add_argument("--averages", nargs="+", default=AVERAGES, help="the first is what others are relative to")
-    parser.add_argument("--orders", type=int, nargs="+", choices=(1, 2), default=(1, 2))
-    parser.add_argument("--modes", nargs="+", choices=("uniform", "graded"), default=("uniform", "graded"))
-    parser.add_argument(
-        "--nodes", type=int, default=5000, help="of each mesh, in the middle of edges too (%(default)s)"
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--dofs", type=int, default=4_000_000, help="size of the reference grid (%(default)s)")
+    parser.add_argument("images", type=Path, nargs="*", help="volumes, besides the phantoms")
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, help="JSON file for every number"
+    )
+    parser.add_argument(
+        "--phantoms", nargs="*", default=PHANTOM_NAMES, help="phantoms to take (%(default)s)"
+    )
+    parser.add_argument(
+        "--averages", nargs="+", default=AVERAGES, help="the first is what others are relative to"
+    )
+    parser.add_argument("--orders", type=int, nargs="+", choices=(1, 2), default=(1, 2))
+    parser.add_argument(
+        "--modes", nargs="+", choices=("uniform", "graded"), default=("uniform", "graded")
+    )
+    parser.add_argument(
+        "--nodes",
+        type=int,
+        default=5000,
+        help="of each mesh, in the middle of edges too (%(default)s)",
+    )
+    parser.add_argument(
+        "--dofs", type=int, default=4_000_000, help="size of the reference grid (%(default)s)"
+    )
     parser.add_argument("--force", action="store_true", help="replace an existing output")
     options = parser.parse_args(argv)
     try:
@@ -74,9 +101,15 @@ def _run(options: argparse.Namespace) -> int:
             for mode in options.modes:
                 mesh = _mesh(image, mode, options.nodes, order)
                 about = {"image": name, "mesh": mode, "order": order, "n_corners": len(mesh.points)}
-                print(f"{name}, {mode}, order {order}, {len(mesh.points)} corners: errors of {', '.join(SHOWN_ERRORS)}")
+                print(
+                    f"{name}, {mode}, order {order}, {len(mesh.points)} corners: errors of "
+                    f"{', '.join(SHOWN_ERRORS)}"
+                )
                 for average in options.averages:
-                    rows += [about | row for row in _measured(standard, mesh, order, average, settings.percent)]
+                    rows += [
+                        about | row
+                        for row in _measured(standard, mesh, order, average, settings.percent)
+                    ]
                     print(_line(rows[-len(settings.nus) :]), flush=True)
     summary = _summary(rows, options.averages)
     save_json(path, {"rows": rows, f"relative_to_{options.averages[0]}": summary})
@@ -87,7 +120,9 @@ def _run(options: argparse.Namespace) -> int:
 
 def _mesh(image: tetopt.Image, mode: str, nodes: int, order: int) -> tetopt.Mesh:
     """A mesh of about so many nodes of the order."""
-    mesh = tetopt.mesh_image(image, nodes if order == 1 else round(CORNER_FRACTION * nodes), mode=mode).mesh
+    mesh = tetopt.mesh_image(
+        image, nodes if order == 1 else round(CORNER_FRACTION * nodes), mode=mode
+    ).mesh
     for _ in range(3 if order == 2 else 0):
         count = len(quadratic(mesh.points, mesh.cells)[0])
         if abs(count / nodes - 1.0) <= COUNT_TOLERANCE:
@@ -96,7 +131,9 @@ def _mesh(image: tetopt.Image, mode: str, nodes: int, order: int) -> tetopt.Mesh
     return mesh
 
 
-def _moduli(image: tetopt.Image, mesh: tetopt.Mesh, order: int, average: str) -> NDArray[np.float64]:
+def _moduli(
+    image: tetopt.Image, mesh: tetopt.Mesh, order: int, average: str
+) -> NDArray[np.float64]:
     """Of the cells, or at their Gauss points, from the image of the modulus."""
     if average == POINTS:
         places = np.einsum("qa,cai->cqi", gauss_rule(mesh.ndim, order)[0], mesh.points[mesh.cells])
@@ -113,23 +150,40 @@ def _measured(
     push = push_of(standard.image, percent)
     for nu, exact in standard.references.items():
         pressed = compression(
-            mesh, young, exact.nu, fixed_nodes=top, pushed_nodes=bottom, displacement=push, order=order
+            mesh,
+            young,
+            exact.nu,
+            fixed_nodes=top,
+            pushed_nodes=bottom,
+            displacement=push,
+            order=order,
         )
         errors = compare(exact, mesh, pressed.u, pressed.strain_energy, standard.coarse_labels)
         stiffer = pressed.strain_energy / exact.strain_energy - 1.0
-        yield {"average": average, "nu": nu, "n_nodes": len(pressed.u), "stiffer": stiffer, "errors": errors}
+        yield {
+            "average": average,
+            "nu": nu,
+            "n_nodes": len(pressed.u),
+            "stiffer": stiffer,
+            "errors": errors,
+        }
 
 
 def _line(rows: Sequence[dict[str, Any]]) -> str:
     each = [
-        f"nu {row['nu']}: {row['stiffer']:+.4f} {row['errors'].displacement:.4f} {row['errors'].interface_strain:.4f}"
+        f"nu {row['nu']}: {row['stiffer']:+.4f} {row['errors'].displacement:.4f} "
+        f"{row['errors'].interface_strain:.4f}"
         for row in rows
     ]
     return f"  {rows[0]['average']:10}  " + "  ".join(each)
 
 
-def _summary(rows: Sequence[dict[str, Any]], averages: Sequence[str]) -> dict[str, dict[str, float]]:
-    """Geometric mean over images, meshes and nu of each error, relative to that with the first average, by order."""
+def _summary(
+    rows: Sequence[dict[str, Any]], averages: Sequence[str]
+) -> dict[str, dict[str, float]]:
+    """Geometric mean over images, meshes and nu of each error, relative to that with the first
+    average, by order.
+    """
     summary = {}
     for order in sorted({row["order"] for row in rows}):
         for average in averages:

@@ -1,8 +1,10 @@
-"""How the error of a simulation depends on the largest cell of a graded mesh: the evidence behind its default.
+"""How the error of a simulation depends on the largest cell of a graded mesh: the evidence behind
+its default.
 
-Phantoms, and volumes of yours, are meshed uniformly, graded with several largest edges, and once for the simulation
-itself: graded by the reference's own strain, sqrt(E) times its part along the push, which no mesher knows. That mesh
-says what nodes in other places could do at most. Each is compressed and compared with a voxel grid's solution.
+Phantoms, and volumes of yours, are meshed uniformly, graded with several largest edges, and once
+for the simulation itself: graded by the reference's own strain, sqrt(E) times its part along the
+push, which no mesher knows. That mesh says what nodes in other places could do at most. Each is
+compressed and compared with a voxel grid's solution.
 
     python tests/benchmarks/choose_sizes.py -o sizes.json [T1.nii.gz ...]
 """
@@ -31,13 +33,23 @@ STANDARD_NU = "0.3"
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the sweep; 0 when all is written, 2 with one line on an input to mend."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("images", type=Path, nargs="*", help="volumes, besides the phantoms")
-    parser.add_argument("-o", "--output", type=Path, required=True, help="JSON file for every number")
-    parser.add_argument("--phantoms", nargs="*", default=PHANTOM_NAMES, help="phantoms to take (%(default)s)")
-    parser.add_argument("--largest", type=float, nargs="+", default=[1.0, 1.2, COARSEST_RATIO, 2.0, np.inf])
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, help="JSON file for every number"
+    )
+    parser.add_argument(
+        "--phantoms", nargs="*", default=PHANTOM_NAMES, help="phantoms to take (%(default)s)"
+    )
+    parser.add_argument(
+        "--largest", type=float, nargs="+", default=[1.0, 1.2, COARSEST_RATIO, 2.0, np.inf]
+    )
     parser.add_argument("--nodes", type=int, default=2000)
-    parser.add_argument("--dofs", type=int, default=150_000, help="size of the reference grid (%(default)s)")
+    parser.add_argument(
+        "--dofs", type=int, default=150_000, help="size of the reference grid (%(default)s)"
+    )
     parser.add_argument("--force", action="store_true", help="replace an existing output")
     options = parser.parse_args(argv)
     try:
@@ -49,7 +61,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     path = checked_output(options.output, (".json",), options.force)
-    settings = Settings(nodes=0, reference_dofs=options.dofs, nus=(float(STANDARD_NU),), average="mean")
+    settings = Settings(
+        nodes=0, reference_dofs=options.dofs, nus=(float(STANDARD_NU),), average="mean"
+    )
     rows = []
     for name, image, labels in cases(options.phantoms, options.images):
         mapping, _ = default_mapping(image)
@@ -75,17 +89,26 @@ def _meshes(
         sizes = tetopt.Sizes(longest=factor * edge)
         yield f"graded, largest {factor:g}", tetopt.mesh_image(image, nodes, sizes=sizes).mesh
     strained = _strained(standard)
-    yield "uniform, by the strain", tetopt.optimize(strained, tetopt.lattice_mesh(strained, nodes=nodes)).mesh
+    yield (
+        "uniform, by the strain",
+        tetopt.optimize(strained, tetopt.lattice_mesh(strained, nodes=nodes)).mesh,
+    )
     for k_D in (0.5, 0.85):
         yield f"graded by the strain, k_D {k_D:g}", tetopt.mesh_image(strained, nodes, k_D=k_D).mesh
-        mesh = tetopt.optimize(strained, tetopt.lattice_mesh(strained, nodes=nodes), k_D=k_D, nodes=nodes).mesh
+        mesh = tetopt.optimize(
+            strained, tetopt.lattice_mesh(strained, nodes=nodes), k_D=k_D, nodes=nodes
+        ).mesh
         yield f"lattice graded by the strain, k_D {k_D:g}", mesh
 
 
 def _strained(standard: Standard) -> tetopt.Image:
-    """sqrt(E) times the strain along the push, of the reference: E_D of it is about the error of a mesh's energy."""
+    """sqrt(E) times the strain along the push, of the reference: E_D of it is about the error of
+    a mesh's energy.
+    """
     modulus, reference = standard.modulus, standard.references[STANDARD_NU]
-    strain = at_centres(modulus, reference.u, np.arange(modulus.data.size))[1].reshape(*modulus.shape, 3, 3)
+    strain = at_centres(modulus, reference.u, np.arange(modulus.data.size))[1].reshape(
+        *modulus.shape, 3, 3
+    )
     push = int(np.argmax([abs(strain[..., d, d].mean()) for d in range(modulus.ndim)]))
     return tetopt.Image(np.sqrt(modulus.data) * strain[..., push, push], modulus.affine)
 

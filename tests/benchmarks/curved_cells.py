@@ -1,10 +1,12 @@
-"""What curved edges win: distance from a sphere, and volumes of labels, with straight and with curved cells.
+"""What curved edges win: distance from a sphere, and volumes of labels, with straight and with
+curved cells.
 
     python tests/benchmarks/curved_cells.py -o curved.json [LABELS.nii.gz]
 
-The labels of a sphere of 20 mm on voxels of 1 mm are meshed with order 2, and so is the image of labels, if named. The
-distance is the mean over the facets between labels, at the seven points of Radon's rule; volumes are relative to the
-voxels'. Straight cells are the same cells with their midpoints removed.
+The labels of a sphere of 20 mm on voxels of 1 mm are meshed with order 2, and so is the image of
+labels, if named. The distance is the mean over the facets between labels, at the seven points of
+Radon's rule; volumes are relative to the voxels'. Straight cells are the same cells with their
+midpoints removed.
 """
 
 from __future__ import annotations
@@ -26,7 +28,9 @@ NODES, NODES_OF_LABELS = (3_000, 8_000), 5_000  # in all
 def sphere() -> tetopt.Image:
     """Label 1 within the sphere, 0 around it."""
     centre = np.stack(np.meshgrid(*3 * [np.arange(2 * HALF) - HALF + 0.5], indexing="ij"))
-    return tetopt.Image((np.sqrt((centre**2).sum(axis=0)) < RADIUS).astype(float), origin_at_centre())
+    return tetopt.Image(
+        (np.sqrt((centre**2).sum(axis=0)) < RADIUS).astype(float), origin_at_centre()
+    )
 
 
 def origin_at_centre() -> np.ndarray:
@@ -46,7 +50,9 @@ def distance(mesh: tetopt.Mesh, label: np.ndarray, is_curved: bool) -> float:
     """Mean distance between the sphere and the facets between labels, mm."""
     nodes, cells = quadratic(mesh.points, mesh.cells, mesh.midpoints if is_curved else None)
     sides = facets(mesh.cells)
-    shared = np.flatnonzero((sides.cells[:, 1] >= 0) & (label[sides.cells[:, 0]] != label[sides.cells[:, 1]]))
+    shared = np.flatnonzero(
+        (sides.cells[:, 1] >= 0) & (label[sides.cells[:, 0]] != label[sides.cells[:, 1]])
+    )
     cell = sides.cells[shared, 0]
     opposite = np.argmax(sides.of_cell[cell] == shared[:, None], axis=1)
     points, weights = curved_rule(2)
@@ -57,16 +63,23 @@ def distance(mesh: tetopt.Mesh, label: np.ndarray, is_curved: bool) -> float:
         own = nodes[cells[cell[here]]]
         at = np.einsum("qa,mai->mqi", shape_values(places, 2), own)
         off[here] = np.abs(np.linalg.norm(at, axis=2) - RADIUS)
-        a, b, c = np.delete(np.einsum("qak,mai->kmqi", shape_slopes(places, 2), own), corner, axis=0)
-        area[here] = np.linalg.norm(np.cross(b - a, c - a), axis=2)  # per area of the flat reference, at each point
+        a, b, c = np.delete(
+            np.einsum("qak,mai->kmqi", shape_slopes(places, 2), own), corner, axis=0
+        )
+        # per area of the flat reference, at each point
+        area[here] = np.linalg.norm(np.cross(b - a, c - a), axis=2)
     return float(np.average(off, weights=area * weights))
 
 
 def main(argv: list[str] | None = None) -> None:
     """Mesh, measure, save the rows and print them."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("labels", type=Path, nargs="?", metavar="LABELS.nii.gz")
-    parser.add_argument("-o", "--output", type=Path, required=True, help="JSON file for every number")
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, help="JSON file for every number"
+    )
     options = parser.parse_args(argv)
     output = checked_output(options.output, (".json",), True)
     rows, kinds = dict[str, object](), {"straight": False, "curved": True}

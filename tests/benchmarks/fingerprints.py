@@ -1,11 +1,13 @@
-"""Checksums of meshes over the ground that tetopt covers: the same before and after a change that is to change nothing.
+"""Checksums of meshes over the ground that tetopt covers: the same before and after a change that
+is to change nothing.
 
-    python tests/benchmarks/fingerprints.py -o new.json [--against tests/fingerprints.json] [--only NAME ...]
+    python tests/benchmarks/fingerprints.py -o new.json [--against tests/fingerprints.json] [--only
+    NAME ...]
 
-Each row is one run of the command: the sha256 of its points and cells, and of its whole file. They are the same on any
-number of threads. Between kinds of processors, or versions of numpy and scipy, last digits may differ: then write the
-file to compare with from the version before, on the same machine. The exit code is 1 if a row differs. All runs
-together take three minutes on 2 cores.
+Each row is one run of the command: the sha256 of its points and cells, and of its whole file. They
+are the same on any number of threads. Between kinds of processors, or versions of numpy and scipy,
+last digits may differ: then write the file to compare with from the version before, on the same
+machine. The exit code is 1 if a row differs. All runs together take three minutes on 2 cores.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ from tetopt.io.mni import mni_path, mni_tissue
 from tetopt.report.summary import versions
 from tetopt.system.files import checked_output, save_json
 
-# The words after `tetopt mesh`, by the name of the run; T1, GM, TISSUE, BRAIN, ... are files made below.
+# The words after `tetopt mesh`, by the name of the run; T1, GM, TISSUE, BRAIN, ... are files made
+# below.
 RUN_WORDS = {
     "graded": "T1 --nodes 5000",
     "graded_fine": "T1 --nodes 15000",
@@ -39,7 +42,8 @@ RUN_WORDS = {
     "target_error": "HALF --target-error 0.03",
     "sizes": "HALF --nodes 4000 --size-min 6 --edge-size 30 --gradation 0.3",
     "paper": "HALF --method paper --nodes 1000 --iterations 6",
-    "paper_accept": "HALF --method paper --nodes 600 --iterations 4 --retessellate accept --k-d 0.5",
+    "paper_accept": "HALF --method paper --nodes 600 --iterations 4 --retessellate accept --k-d "
+    "0.5",
     "paper_shape_only": "HALF --method paper --nodes 600 --iterations 4 --k-d 0",
     "mask": "HALF --mask BRAIN --nodes 3000",
     "mask_uniform": "HALF --mask BRAIN --uniform --nodes 2000",
@@ -63,11 +67,18 @@ FIRST_RUNS = {
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run, print, write, compare."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("-o", "--output", type=Path, required=True, help="JSON file")
     parser.add_argument("--against", type=Path, help="JSON file of an earlier call")
     parser.add_argument(
-        "--only", nargs="+", choices=list(RUN_WORDS), default=list(RUN_WORDS), metavar="NAME", help="these runs"
+        "--only",
+        nargs="+",
+        choices=list(RUN_WORDS),
+        default=list(RUN_WORDS),
+        metavar="NAME",
+        help="these runs",
     )
     parser.add_argument("--force", action="store_true", help="replace an existing file")
     options = parser.parse_args(argv)
@@ -86,7 +97,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         parts = [part for part in rows[name] if rows[name][part] != earlier[name].get(part)]
         print(f"differs: {name}: {', '.join(parts)}")
     if options.against is not None:
-        print(f"{len(rows) - len(differing) - len(missing)} of {len(rows)} runs as in {options.against}")
+        print(
+            f"{len(rows) - len(differing) - len(missing)} of {len(rows)} runs as in "
+            f"{options.against}"
+        )
     return 1 if differing or missing else 0
 
 
@@ -103,17 +117,28 @@ def fingerprints(folder: Path, names: Sequence[str]) -> Iterator[tuple[str, dict
 
 
 def made_images(folder: Path) -> dict[str, Path]:
-    """A brain of half the resolution, its tissues and its mask; phantoms of fractions, and on sheared axes."""
+    """A brain of half the resolution, its tissues and its mask; phantoms of fractions, and on
+    sheared axes.
+    """
     t1, tissue = tetopt.load_image(mni_path("t1")), mni_tissue()
     half = t1.affine @ np.diag([2.0, 2.0, 2.0, 1.0])
-    turned = np.array([[1.8, 0.3, 0.2, -20.0], [-0.2, 1.7, 0.4, 5.0], [0.0, -0.3, -2.5, 9.0], [0.0, 0.0, 0.0, 1.0]])
+    turned = np.array(
+        [
+            [1.8, 0.3, 0.2, -20.0],
+            [-0.2, 1.7, 0.4, 5.0],
+            [0.0, -0.3, -2.5, 9.0],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
     phantom = tetopt.load_phantom("ellipsoids_brain").image(voxel_mm=3.0)
     images = {
         "HALF": tetopt.Image(t1.data[::2, ::2, ::2], half),
         "TISSUE": tetopt.Image(tissue.data[::2, ::2, ::2], half),
         "BRAIN": tetopt.Image((tissue.data[::2, ::2, ::2] > 1).astype(np.uint8), half),
         "FRACTIONS": tetopt.Image(phantom.data / 7.0, phantom.affine),
-        "OBLIQUE": tetopt.Image(tetopt.load_phantom("two_spheres").image(voxel_mm=2.0).data, turned),
+        "OBLIQUE": tetopt.Image(
+            tetopt.load_phantom("two_spheres").image(voxel_mm=2.0).data, turned
+        ),
     }
     paths = {name: folder / f"{name.lower()}.nii.gz" for name in images}
     for name, image in images.items():
@@ -124,9 +149,13 @@ def made_images(folder: Path) -> dict[str, Path]:
 def run(name: str, words: str, files: dict[str, Path], folder: Path) -> dict[str, str]:
     """One run of the command: the checksums of what it wrote."""
     path = folder / f"{name}.vtu"
-    words_of_run = [str(files.get(word, word)).replace("OUT", str(folder)) for word in words.split()]
+    words_of_run = [
+        str(files.get(word, word)).replace("OUT", str(folder)) for word in words.split()
+    ]
     command = [sys.executable, "-m", "tetopt", "mesh", *words_of_run, "-o", str(path), "--force"]
-    done = subprocess.run(command, env=os.environ | {"SOURCE_DATE_EPOCH": "0"}, capture_output=True, text=True)
+    done = subprocess.run(
+        command, env=os.environ | {"SOURCE_DATE_EPOCH": "0"}, capture_output=True, text=True
+    )
     if done.returncode not in (0, 1):
         raise tetopt.InputError(f"{name}: {done.stderr.strip()}")
     mesh = tetopt.load_mesh(path).mesh

@@ -1,7 +1,8 @@
-"""A cohort of 200 with failures put in, its client killed on the way: everything is accounted for (`make test-cohort`).
+"""A cohort of 200 with failures put in, its client killed on the way: everything is accounted for
+(`make test-cohort`).
 
-python tests/cohort/campaign.py [SUBJECTS [SEED]]. Prints a table, and ends with 1 where a row of it is not as it
-should be. Failures are put in from outside: tetopt knows nothing of them.
+python tests/cohort/campaign.py [SUBJECTS [SEED]]. Prints a table, and ends with 1 where a row of it
+is not as it should be. Failures are put in from outside: tetopt knows nothing of them.
 """
 
 import contextlib
@@ -29,7 +30,8 @@ N_KILLS = 3  # of the client, in the first half
 LEAVE_SECONDS = 60.0  # until a killed client's workers and runs have gone
 FILE_BYTES = 3000  # of the largest file where a disk is full: less than a mesh, more than a log
 KINDS = ("plain", "mask", "labels", "two contrasts")
-# Each failure: of how many of 200 subjects, what the row says, whether a rerun mends it, nothing being put in any more.
+# Each failure: of how many of 200 subjects, what the row says, whether a rerun mends it, nothing
+# being put in any more.
 FAILURES = {
     "truncated image": (2, ("failed", "image.nii.gz"), False),
     "mask beside the image": (1, ("failed", "far.nii.gz"), False),
@@ -48,7 +50,9 @@ def image_of(rng, shift=0.0):
     affine[:3, 3] = shift
     places = np.stack(np.meshgrid(*[np.arange(12.0)] * 3, indexing="ij"), axis=-1) - 5.5
     inside = np.linalg.norm(places, axis=-1) < 4.0 + rng.random()
-    return tetopt.Image(np.where(inside, 100.0, 10.0) + rng.random(inside.shape), affine), 1.0 * inside
+    return tetopt.Image(
+        np.where(inside, 100.0, 10.0) + rng.random(inside.shape), affine
+    ), 1.0 * inside
 
 
 def saved_subject(folder, rng, kind, failure):
@@ -69,10 +73,13 @@ def saved_subject(folder, rng, kind, failure):
         path.write_bytes(path.read_bytes()[:-1000])
     elif failure is not None and failure.endswith("beside the image"):
         row[failure.split()[0]] = folder / "far.nii.gz"
-        tetopt.save_image(folder / "far.nii.gz", tetopt.Image(inside, image_of(rng, 500.0)[0].affine))
+        tetopt.save_image(
+            folder / "far.nii.gz", tetopt.Image(inside, image_of(rng, 500.0)[0].affine)
+        )
     elif failure == "damaged header":
         data = bytearray(gzip.decompress(path.read_bytes()))
-        data[40:42] = (99).to_bytes(2, "little")  # NIfTI's dim[0], the number of dimensions: at most 7
+        # NIfTI's dim[0], the number of dimensions: at most 7
+        data[40:42] = (99).to_bytes(2, "little")
         row["image"] = folder / "image.nii"
         row["image"].write_bytes(data)
     elif failure == "requirement violated":
@@ -102,13 +109,17 @@ def processes_of(out):
     for each in psutil.process_iter():
         with contextlib.suppress(psutil.Error):  # it has ended meanwhile
             words = each.cmdline()
-            if each.pid != os.getpid() and any(str(out) in text for text in (*words, *each.environ().values())):
+            if each.pid != os.getpid() and any(
+                str(out) in text for text in (*words, *each.environ().values())
+            ):
                 processes[each.pid] = words
     return processes
 
 
 class Saboteur(threading.Thread):
-    """Kills workers of some subjects, and leaves others no room on the disk, as long as their runs have a folder."""
+    """Kills workers of some subjects, and leaves others no room on the disk, as long as their
+    runs have a folder.
+    """
 
     def __init__(self, out, failures):
         super().__init__(daemon=True)
@@ -145,22 +156,38 @@ class Saboteur(threading.Thread):
 
 
 def whole(out):
-    """The subjects that are there, with their files' numbers and times; what is half-written is an error."""
+    """The subjects that are there, with their files' numbers and times; what is half-written is
+    an error.
+    """
     there = {}
     for folder in sorted(out.glob("sub-*")):
-        names = sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+        names = sorted(
+            str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()
+        )
         mesh = folder / f"{folder.name}_desc-tetopt_mesh.vtu"
         assert mesh.with_suffix(".json").is_file(), f"{folder}: only {names}"
         json.loads(mesh.with_suffix(".json").read_text())
         assert mesh.stat().st_size > 0, mesh
         assert "figures/thumbnail.png" in names, f"{folder}: only {names}"
         assert not [name for name in names if ".tmp" in name or "tetopt-" in name], names
-        there[folder.name] = [((folder / name).stat().st_ino, (folder / name).stat().st_mtime_ns) for name in names]
+        there[folder.name] = [
+            ((folder / name).stat().st_ino, (folder / name).stat().st_mtime_ns) for name in names
+        ]
     return there
 
 
 def begun(folder, out, *options):
-    words = [sys.executable, "-m", "tetopt", "cohort", str(folder / "t.tsv"), "-o", str(out), *COMMON, *options]
+    words = [
+        sys.executable,
+        "-m",
+        "tetopt",
+        "cohort",
+        str(folder / "t.tsv"),
+        "-o",
+        str(out),
+        *COMMON,
+        *options,
+    ]
     with open(folder / "words.txt", "ab") as stream:
         return subprocess.Popen(words, stdout=stream, stderr=stream)
 
@@ -190,26 +217,52 @@ def unlike(out, failures, expected):
         if row.get("status") != status or words not in row.get("reason", ""):
             lines.append(f"{key} ({failures.get(key)}): {row.get('status')}, {row.get('reason')}")
         if (status == "failed") == (out / key).exists():
-            lines.append(f"{key}: {'a mesh, though it failed' if status == 'failed' else 'no mesh'}")
+            lines.append(
+                f"{key}: {'a mesh, though it failed' if status == 'failed' else 'no mesh'}"
+            )
         if (status == "failed") != (out / "logs" / f"{key}.failed.json").exists():
             lines.append(f"{key}: is {status}, but its record of a failure is another's")
     return lines
 
 
 def same_bytes(folder, out, key):
-    """Whether a subject's mesh and pictures are those of `tetopt mesh` with the words of the table."""
+    """Whether a subject's mesh and pictures are those of `tetopt mesh` with the words of the
+    table.
+    """
     with open(folder / "t.tsv", newline="") as stream:
-        row = next(row for row in csv.DictReader(stream, delimiter="\t") if f"sub-{row['subject']}" == key)
+        row = next(
+            row for row in csv.DictReader(stream, delimiter="\t") if f"sub-{row['subject']}" == key
+        )
     alone = folder / "alone" / key
     (alone / "figures").mkdir(parents=True)
     mesh = alone / f"{key}_desc-tetopt_mesh.vtu"
     outputs = ["-o", mesh, "--json", mesh.with_suffix(".json"), "--figures", alone / "figures"]
     images = [row[name] for name in ("image", "image_2") if row[name] != "n/a"]
-    own = [word for name in ("mask", "labels") if row[name] != "n/a" for word in (f"--{name}", row[name])]
-    words = [sys.executable, "-m", "tetopt", "mesh", *images, *own, *COMMON, "--nodes", row["nodes"], *outputs]
+    own = [
+        word
+        for name in ("mask", "labels")
+        if row[name] != "n/a"
+        for word in (f"--{name}", row[name])
+    ]
+    words = [
+        sys.executable,
+        "-m",
+        "tetopt",
+        "mesh",
+        *images,
+        *own,
+        *COMMON,
+        "--nodes",
+        row["nodes"],
+        *outputs,
+    ]
     subprocess.run(list(map(str, words)), check=False, capture_output=True)
-    paths = [path.relative_to(alone) for path in alone.rglob("*") if path.suffix in (".vtu", ".png")]
-    return len(paths) >= 4 and all((alone / path).read_bytes() == (out / key / path).read_bytes() for path in paths)
+    paths = [
+        path.relative_to(alone) for path in alone.rglob("*") if path.suffix in (".vtu", ".png")
+    ]
+    return len(paths) >= 4 and all(
+        (alone / path).read_bytes() == (out / key / path).read_bytes() for path in paths
+    )
 
 
 def killed_on_the_way(folder, out, dice, n_subjects):
@@ -228,14 +281,21 @@ def killed_on_the_way(folder, out, dice, n_subjects):
         now = whole(out)
         wrong += [f"{key}: lost or made twice" for key in there if now.get(key) != there[key]]
         there = now
-        print(f"killed at {len(there)} subjects; nothing left of it after {seconds[-1]:.1f} s", flush=True)
+        print(
+            f"killed at {len(there)} subjects; nothing left of it after {seconds[-1]:.1f} s",
+            flush=True,
+        )
     return there, wrong
 
 
 def campaign(folder, n_subjects, seed):
     """Rows of what was tried: words, result, whether it is as it should be."""
     dice, rng, out = random.Random(seed), np.random.default_rng(seed), folder / "out"
-    kinds = [name for name, (count, _, _) in FAILURES.items() for _ in range(max(1, count * n_subjects // 200))]
+    kinds = [
+        name
+        for name, (count, _, _) in FAILURES.items()
+        for _ in range(max(1, count * n_subjects // 200))
+    ]
     numbers = dice.sample(range(n_subjects), len(kinds))
     failures = {f"sub-{k:03d}": kind for k, kind in zip(numbers, kinds, strict=True)}
     made(folder, n_subjects, rng, failures)
@@ -248,27 +308,44 @@ def campaign(folder, n_subjects, seed):
     saboteur = Saboteur(out, failures)
     saboteur.start()
     there, wrong = killed_on_the_way(folder, out, dice, n_subjects)
-    yield f"client killed -9 {N_KILLS} times", f"{len(there)} meshes by then, lost or made twice {len(wrong)}", wrong
+    yield (
+        f"client killed -9 {N_KILLS} times",
+        f"{len(there)} meshes by then, lost or made twice {len(wrong)}",
+        wrong,
+    )
     code = begun(folder, out).wait()
     saboteur.is_over = True
     saboteur.join()
     now = whole(out)
     wrong = [f"{key}: lost or made twice" for key in there if now.get(key) != there[key]]
     wrong += unlike(out, failures, expected) + ([] if code == 1 else [f"exit code {code}"])
-    wrong += [f"{key}: {kind} did not happen" for key, kind in failures.items()
-              if kind.startswith(("killed", "disk")) and not saboteur.counts[key]]  # fmt: skip
+    wrong += [
+        f"{key}: {kind} did not happen"
+        for key, kind in failures.items()
+        if kind.startswith(("killed", "disk")) and not saboteur.counts[key]
+    ]
     counts = [row["status"] for row in rows_of(out).values()]
     words = ", ".join(f"{counts.count(name)} {name}" for name in sorted(set(counts)))
-    yield f"{len(failures)} failures in {n_subjects}", f"{words}; {time.monotonic() - begin:.0f} s", wrong
+    yield (
+        f"{len(failures)} failures in {n_subjects}",
+        f"{words}; {time.monotonic() - begin:.0f} s",
+        wrong,
+    )
 
     code, before = begun(folder, out).wait(), now
     now = whole(out)
     again = {key for key in now if now[key] != before.get(key)}
     meant = {key for key, kind in failures.items() if FAILURES[kind][2]}
-    wrong = [f"{key}: touched" for key in sorted(again - meant)] + [f"{key}: not made" for key in sorted(meant - again)]
+    wrong = [f"{key}: touched" for key in sorted(again - meant)] + [
+        f"{key}: not made" for key in sorted(meant - again)
+    ]
     expected |= dict.fromkeys(meant, ("done", ""))
     wrong += unlike(out, failures, expected) + ([] if code == 1 else [f"exit code {code}"])
-    yield "run again, nothing put in", f"{len(again)} made, {len(now) - len(again)} not touched", wrong
+    yield (
+        "run again, nothing put in",
+        f"{len(again)} made, {len(now) - len(again)} not touched",
+        wrong,
+    )
 
     some = dice.sample(sorted(now), 5)
     wrong = [f"{key}: other bytes" for key in some if not same_bytes(folder, out, key)]
@@ -293,4 +370,9 @@ def main(n_subjects, seed):
 
 if __name__ == "__main__":
     numbers = [int(word) for word in sys.argv[1:]]
-    sys.exit(main(numbers[0] if numbers else 200, numbers[1] if len(numbers) > 1 else time.time_ns() % 10**6))
+    sys.exit(
+        main(
+            numbers[0] if numbers else 200,
+            numbers[1] if len(numbers) > 1 else time.time_ns() % 10**6,
+        )
+    )

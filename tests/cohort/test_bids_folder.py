@@ -28,7 +28,9 @@ def filled(folder, *names):
 
 
 def rows(subjects, folder):
-    return [(each.subject, each.session, str(each.images[0].relative_to(folder))) for each in subjects]
+    return [
+        (each.subject, each.session, str(each.images[0].relative_to(folder))) for each in subjects
+    ]
 
 
 def test_raw_images_of_the_suffix_by_subject_and_session(tmp_path):
@@ -44,9 +46,13 @@ def test_raw_images_of_the_suffix_by_subject_and_session(tmp_path):
         "sourcedata/sub-07/anat/sub-07_T1w.nii.gz",
     )
     (folder / "sub-02/anat/sub-02_T1w.json").write_text('{"a":')  # never opened
-    (folder / "sub-02" / "layout_config.json").write_text("[")  # nor pybids's own settings of an untrusted folder
-    (folder / "sub-01/ses-b/anat/sub-01_ses-b_T1w.nii").unlink()  # as where a DataLad dataset's content is not fetched
-    (folder / "sub-01/ses-b/anat/sub-01_ses-b_T1w.nii").symlink_to("../../../.git/annex/objects/none")
+    # nor pybids's own settings of an untrusted folder
+    (folder / "sub-02" / "layout_config.json").write_text("[")
+    # as where a DataLad dataset's content is not fetched
+    (folder / "sub-01/ses-b/anat/sub-01_ses-b_T1w.nii").unlink()
+    (folder / "sub-01/ses-b/anat/sub-01_ses-b_T1w.nii").symlink_to(
+        "../../../.git/annex/objects/none"
+    )
     (folder / "sub-02" / "loop").symlink_to(folder / "sub-02")
     subjects = bids_subjects(folder)
     assert rows(subjects, folder) == [
@@ -56,7 +62,9 @@ def test_raw_images_of_the_suffix_by_subject_and_session(tmp_path):
     ]
     assert subjects[2].place == "sub-02/anat/sub-02_T1w.nii.gz"
     assert subjects[2].options == {}
-    assert rows(bids_subjects(folder, "T2w", ["sub-02"]), folder) == [("02", "", "sub-02/anat/sub-02_T2w.nii.gz")]
+    assert rows(bids_subjects(folder, "T2w", ["sub-02"]), folder) == [
+        ("02", "", "sub-02/anat/sub-02_T2w.nii.gz")
+    ]
     with pytest.warns(UserWarning, match=r"left out subjects without _T1w in ses-b: 1 \(sub-02\)"):
         chosen = bids_subjects(folder, sessions=["ses-b"])
     assert rows(chosen, folder) == [("01", "b", "sub-01/ses-b/anat/sub-01_ses-b_T1w.nii")]
@@ -79,12 +87,18 @@ def test_entities_choose_among_several(tmp_path):
     with pytest.warns(UserWarning, match=r"left out subjects without _run-2_T1w: 1 \(sub-2\)"):
         chosen = bids_subjects(folder, "run-2_T1w")
     assert rows(chosen, folder) == [("1", "", "sub-1/anat/sub-1_acq-mprage_run-02_T1w.nii.gz")]
-    assert rows(bids_subjects(folder, "rec-norm_T1w", ["2"]), folder)[0][2] == "sub-2/anat/sub-2_rec-norm_T1w.nii.gz"
+    assert (
+        rows(bids_subjects(folder, "rec-norm_T1w", ["2"]), folder)[0][2]
+        == "sub-2/anat/sub-2_rec-norm_T1w.nii.gz"
+    )
 
 
 def test_all_that_is_wrong_is_told_at_once(tmp_path):
     folder = filled(
-        tmp_path / "raw", "sub-1/anat/sub-1_T1w.nii.gz", "sub-2/anat/sub-3_T1w.nii.gz", "sub-2/anat/\x1b_T1w.nii"
+        tmp_path / "raw",
+        "sub-1/anat/sub-1_T1w.nii.gz",
+        "sub-2/anat/sub-3_T1w.nii.gz",
+        "sub-2/anat/\x1b_T1w.nii",
     )
     with pytest.raises(Problems) as caught:
         bids_subjects(folder, participants=["1", "2", "8", "9"])
@@ -111,7 +125,9 @@ PATTERNS = {  # by words of them: a session, and what matches
 
 
 def test_patterns_of_the_documents_find_what_programs_write(tmp_path, monkeypatch):
-    """One file each, in folders as fMRIPrep, FreeSurfer and SynthSeg leave them, with other subjects and spaces."""
+    """One file each, in folders as fMRIPrep, FreeSurfer and SynthSeg leave them, with other
+    subjects and spaces.
+    """
     words = (Path(__file__).parents[2] / "docs" / "howto" / "cohorts.md").read_text()
     written = re.findall(r"^--(?:mask|labels) (\S+)$", words, re.M)
     others = [name.replace("sub-1", "sub-10") for _, name in PATTERNS.values()]
@@ -130,12 +146,17 @@ def test_folders_that_are_none(tmp_path):
     with pytest.raises(InputError, match="root does not exist"):
         bids_subjects(tmp_path / "none")
     with pytest.raises(
-        InputError, match=r"expected a BIDS dataset, or a table \('dataset_description\.json' is missing"
+        InputError,
+        match=r"expected a BIDS dataset, or a table \('dataset_description\.json' is missing",
     ):
         bids_subjects(tmp_path)
     file = tmp_path / "dataset_description.json"
     file.write_text('{"a":')
-    for text, words in (('{"a":', "not a valid json"), ("[" * 10**5, "recursion"), ("{}", "'Name' field missing")):
+    for text, words in (
+        ('{"a":', "not a valid json"),
+        ("[" * 10**5, "recursion"),
+        ("{}", "'Name' field missing"),
+    ):
         file.write_text(text)
         with pytest.raises(InputError, match=words) as caught:
             bids_subjects(tmp_path)
@@ -171,22 +192,32 @@ def test_without_the_library_one_line_says_what_to_install(tmp_path, monkeypatch
 
 @pytest.mark.full
 def test_a_cohort_folder_passes_the_validator_of_bids(tmp_path):
-    """The field's own validator, with what BIDS has no names for told apart: no error, only advice."""
+    """The field's own validator, with what BIDS has no names for told apart: no error, only
+    advice.
+    """
     validator = shutil.which("bids-validator-deno", path=str(Path(sys.executable).parent))
     if validator is None:
         pytest.skip("no bids-validator-deno")
     out = tmp_path / "out"
     begin(out, [tmp_path.as_uri()])
     for name in [
-        "cohort.tsv", "cohort.html", "logs/sub-1_ses-a.log", "logs/sub-2.failed.json",
-        "sub-1/ses-a/sub-1_ses-a_desc-tetopt_mesh.vtu", "sub-1/ses-a/sub-1_ses-a_desc-tetopt_mesh.json",
-        "sub-1/ses-a/figures/slice.png", "sub-2/sub-2_desc-tetopt_mesh.inp", "sub-2/figures/slice.png",
-    ]:  # fmt: skip
+        "cohort.tsv",
+        "cohort.html",
+        "logs/sub-1_ses-a.log",
+        "logs/sub-2.failed.json",
+        "sub-1/ses-a/sub-1_ses-a_desc-tetopt_mesh.vtu",
+        "sub-1/ses-a/sub-1_ses-a_desc-tetopt_mesh.json",
+        "sub-1/ses-a/figures/slice.png",
+        "sub-2/sub-2_desc-tetopt_mesh.inp",
+        "sub-2/figures/slice.png",
+    ]:
         (out / name).parent.mkdir(parents=True, exist_ok=True)
         (out / name).write_text("x")
 
     def codes():
-        run = subprocess.run([validator, "--format", "json", out], capture_output=True, text=True, check=False)
+        run = subprocess.run(
+            [validator, "--format", "json", out], capture_output=True, text=True, check=False
+        )
         issues = json.loads(run.stdout)["issues"]["issues"]
         return {(issue["severity"], issue["code"]) for issue in issues}
 

@@ -1,4 +1,6 @@
-"""`tetopt cohort` as a user runs it: interrupted, a worker killed, resumed, changed; nothing lost or done twice."""
+"""`tetopt cohort` as a user runs it: interrupted, a worker killed, resumed, changed; nothing
+lost or done twice.
+"""
 
 import csv
 import json
@@ -36,7 +38,10 @@ WAIT_SECONDS = 240  # a machine with much else to do still gets there
 
 def meshes(folder):
     """The subjects' meshes that are there, with when they were written."""
-    return {path.parent.name: path.stat().st_mtime_ns for path in sorted((folder / "out").glob("sub-*/*.vtu"))}
+    return {
+        path.parent.name: path.stat().st_mtime_ns
+        for path in sorted((folder / "out").glob("sub-*/*.vtu"))
+    }
 
 
 def table_rows(folder):
@@ -45,7 +50,9 @@ def table_rows(folder):
 
 
 def write_rows(folder, *rows):
-    (folder / "t.tsv").write_text("\n".join(["subject\timage\tlabels\tnodes", *map("\t".join, rows), ""]))
+    (folder / "t.tsv").write_text(
+        "\n".join(["subject\timage\tlabels\tnodes", *map("\t".join, rows), ""])
+    )
 
 
 @pytest.fixture
@@ -57,12 +64,23 @@ def small(tmp_path):
 
 @pytest.mark.full
 def test_a_cohort_from_python_is_that_of_the_command(small):
-    """The same folder: a rerun by either finds all done. What is no option, or no value of one, is refused at once."""
+    """The same folder: a rerun by either finds all done. What is no option, or no value of one,
+    is refused at once.
+    """
     one = {"participants": ["01"], "iterations": 0}
-    assert tetopt.run_cohort(small / "t.tsv", small / "out", on=lambda event: None, workers=1, **one) == {
-        "sub-01": "done"
-    }
-    command = ["cohort", small / "t.tsv", "-o", small / "out", "--iterations", "0", "--participant-label", "01"]
+    assert tetopt.run_cohort(
+        small / "t.tsv", small / "out", on=lambda event: None, workers=1, **one
+    ) == {"sub-01": "done"}
+    command = [
+        "cohort",
+        small / "t.tsv",
+        "-o",
+        small / "out",
+        "--iterations",
+        "0",
+        "--participant-label",
+        "01",
+    ]
     there = meshes(small)
     assert exit_code(*command) == 0
     assert meshes(small) == there
@@ -75,31 +93,45 @@ def test_a_cohort_from_python_is_that_of_the_command(small):
         tetopt.run_cohort(small / "t.tsv", small / "out", nodes="many")
 
 
-def test_what_failed_is_a_row_and_a_rerun_would_make_what_changed_and_what_failed(small, capfd, scheduler):
+def test_what_failed_is_a_row_and_a_rerun_would_make_what_changed_and_what_failed(
+    small, capfd, scheduler
+):
     """Labels on another grid are taken to the image's."""
     image = tetopt.load_image(small / "a.nii.gz")
     far = np.array(image.affine)
     far[:3, 3] += 500.0
     tetopt.save_image(small / "far.nii.gz", tetopt.Image(1.0 * (image.data > 50), far))
-    coarse = tetopt.Image(1.0 * (image.data[::2, ::2, ::2] > 50), image.affine @ np.diag([2.0, 2.0, 2.0, 1.0]))
+    coarse = tetopt.Image(
+        1.0 * (image.data[::2, ::2, ::2] > 50), image.affine @ np.diag([2.0, 2.0, 2.0, 1.0])
+    )
     tetopt.save_image(small / "coarse.nii.gz", coarse)
     (small / "cut.nii.gz").write_bytes((small / "a.nii.gz").read_bytes()[:300])
     command = ["cohort", small / "t.tsv", "-o", small / "out", "--iterations", 0, "--nodes", 60]
     command += ["--scheduler", scheduler]
-    labelled, far = ["01", "a.nii.gz", "coarse.nii.gz", "n/a"], ["03", "a.nii.gz", "far.nii.gz", "n/a"]
+    labelled, far = (
+        ["01", "a.nii.gz", "coarse.nii.gz", "n/a"],
+        ["03", "a.nii.gz", "far.nii.gz", "n/a"],
+    )
     write_rows(small, labelled, ["02", "cut.nii.gz", "n/a", "n/a"], far)
     assert exit_code(*command) == 1
     rows, page = table_rows(small), (small / "out" / "cohort.html").read_text()
     assert {name: row["status"] for name, row in rows.items()} == {
-        "sub-01": "done", "sub-02": "failed", "sub-03": "failed"
-    }  # fmt: skip
+        "sub-01": "done",
+        "sub-02": "failed",
+        "sub-03": "failed",
+    }
     log = " ".join((small / "out" / "logs" / "sub-01.log").read_text().split())
     assert "resampled to the image's grid" in log
     for name, file in (("sub-02", "cut.nii.gz"), ("sub-03", "far.nii.gz")):
         failure = json.loads((small / "out" / "logs" / f"{name}.failed.json").read_text())
         reason = failure["reason"]
         assert failure["command"].startswith(f"tetopt mesh -o {name}.vtu --")
-        assert file in rows[name]["reason"] == reason in (small / "out" / "logs" / f"{name}.log").read_text()
+        assert (
+            file
+            in rows[name]["reason"]
+            == reason
+            in (small / "out" / "logs" / f"{name}.log").read_text()
+        )
         assert name in page
     assert list(meshes(small)) == ["sub-01"]
     # One has other options by now, one a whole image.
@@ -115,21 +147,41 @@ def test_what_failed_is_a_row_and_a_rerun_would_make_what_changed_and_what_faile
 
 
 def test_a_failure_is_forgotten_where_the_mesh_is_what_is_asked_for(small, monkeypatch, capfd):
-    """Options that fail, and then those again of the mesh that is there: it is done, though nothing is run."""
+    """Options that fail, and then those again of the mesh that is there: it is done, though
+    nothing is run.
+    """
     monkeypatch.setattr(cohort_plan, "requested", lambda *_: {"sha256": "1"})
     begin(small / "out")
-    save_run(small / "out", "sub-01", {"request": {"options": {}, "files": {}, "sha256": "1"}, "violated": {}})
+    save_run(
+        small / "out",
+        "sub-01",
+        {"request": {"options": {}, "files": {}, "sha256": "1"}, "violated": {}},
+    )
     save_failure(small / "out", "sub-01", "too few nodes")
-    assert exit_code("cohort", small / "t.tsv", "-o", small / "out", "--participant-label", "01") == 0
+    assert (
+        exit_code("cohort", small / "t.tsv", "-o", small / "out", "--participant-label", "01") == 0
+    )
     assert "1 subject: 1 done; 0 to run" in capfd.readouterr().err
     assert table_rows(small)["sub-01"]["status"] == "done"
 
 
 def begun(folder):
     """A run that has begun, its words in a file."""
-    command = [sys.executable, "-m", "tetopt", "cohort", folder / "t.tsv", "-o", folder / "out", "--iterations", "1"]
+    command = [
+        sys.executable,
+        "-m",
+        "tetopt",
+        "cohort",
+        folder / "t.tsv",
+        "-o",
+        folder / "out",
+        "--iterations",
+        "1",
+    ]
     with open(folder / "words.txt", "w") as stream:
-        return subprocess.Popen([*command, "--nodes", "60"], stdout=stream, stderr=stream, cwd=folder)
+        return subprocess.Popen(
+            [*command, "--nodes", "60"], stdout=stream, stderr=stream, cwd=folder
+        )
 
 
 def wait_for(folder, number, run):
@@ -142,8 +194,14 @@ def wait_for(folder, number, run):
 
 
 def workers_of(pid):
-    """The worker processes of a run: those that have a run of `tetopt mesh` for a child, or could have."""
-    return [child.pid for child in psutil.Process(pid).children() if "spawn_main" in " ".join(child.cmdline())]
+    """The worker processes of a run: those that have a run of `tetopt mesh` for a child, or
+    could have.
+    """
+    return [
+        child.pid
+        for child in psutil.Process(pid).children()
+        if "spawn_main" in " ".join(child.cmdline())
+    ]
 
 
 @pytest.mark.deep
@@ -178,23 +236,37 @@ def refused(folder, capsys, *options):
 
 def test_all_that_is_wrong_is_said_before_anything_is_run(small, capsys):
     lines = [
-        "subject\timage\tnodes\tmask\tnods\tk-d", "01\ta.nii.gz\t-4\tn/a\tn/a\tn/a", "02\tb.nii.gz\tn/a\tn/a\tn/a\tn/a",
-        "03\ta.nii.gz\tmany\tn/a\tn/a\tn/a", "0 1\ta.nii.gz\tn/a\tn/a\tn/a\tn/a", "05\ta.nii.gz\tn/a\tm.nii\tn/a\tn/a",
-        "06\ta.nii.gz\tn/a\tn/a\t5\tn/a", "07\ta.nii.gz\tn/a\tn/a\tn/a\t1.5", "08\ta.nii.gz\t60\tn/a\tn/a\t0.5",
-    ]  # fmt: skip
+        "subject\timage\tnodes\tmask\tnods\tk-d",
+        "01\ta.nii.gz\t-4\tn/a\tn/a\tn/a",
+        "02\tb.nii.gz\tn/a\tn/a\tn/a\tn/a",
+        "03\ta.nii.gz\tmany\tn/a\tn/a\tn/a",
+        "0 1\ta.nii.gz\tn/a\tn/a\tn/a\tn/a",
+        "05\ta.nii.gz\tn/a\tm.nii\tn/a\tn/a",
+        "06\ta.nii.gz\tn/a\tn/a\t5\tn/a",
+        "07\ta.nii.gz\tn/a\tn/a\tn/a\t1.5",
+        "08\ta.nii.gz\t60\tn/a\tn/a\t0.5",
+    ]
     (small / "t.tsv").write_text("\n".join(lines) + "\n")
     said = refused(small, capsys)
-    places = [int(number) for line in said for number in re.findall(r"^tetopt: \S+t\.tsv, line (\d+): ", line)]
+    places = [
+        int(number)
+        for line in said
+        for number in re.findall(r"^tetopt: \S+t\.tsv, line (\d+): ", line)
+    ]
     assert sorted(places) == [2, 3, 4, 5, 6, 7, 8]
     assert any("nods" in line and "did you mean nodes?" in line for line in said)
 
 
-@pytest.mark.parametrize(("options", "words"), [
-    (("--threads", "0"), "--threads: expected 1 or more"),
-    (("--format", "docx"), "--format: expected one of"),
-    (("--mask", "m-{subject}.nii"), "m-01.nii does not exist"), (("--participant-label", "9"), "has no subject 9"),
-    (("--mask", "a.nii.gz", "--background", "3"), "give only one of them"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--threads", "0"), "--threads: expected 1 or more"),
+        (("--format", "docx"), "--format: expected one of"),
+        (("--mask", "m-{subject}.nii"), "m-01.nii does not exist"),
+        (("--participant-label", "9"), "has no subject 9"),
+        (("--mask", "a.nii.gz", "--background", "3"), "give only one of them"),
+    ],
+)
 def test_options_of_all_that_cannot_be_are_refused(small, capsys, monkeypatch, options, words):
     monkeypatch.chdir(small)
     assert any(words in line for line in refused(small, capsys, *options))
@@ -206,7 +278,12 @@ def test_words_of_a_run_mean_the_same_in_any_folder(small, monkeypatch):
     monkeypatch.chdir(small)
     options = RunOptions(young="mapping.csv")
     (entry, _) = cohort_plan.entries_of(read_table(Path("t.tsv")), options, small / "out", ".vtu")
-    assert entry.words() == ("--nodes=60", f"--young={small / 'mapping.csv'}", "--", str(small / "a.nii.gz"))
+    assert entry.words() == (
+        "--nodes=60",
+        f"--young={small / 'mapping.csv'}",
+        "--",
+        str(small / "a.nii.gz"),
+    )
 
 
 def test_threads_are_of_all_subjects_and_a_volume_of_the_first_image_is_an_option(small, capsys):
@@ -214,14 +291,22 @@ def test_threads_are_of_all_subjects_and_a_volume_of_the_first_image_is_an_optio
     (small / "t.tsv").write_text("subject\timage\tthreads\n01\ta.nii.gz\t1\n")
     assert "remove the column" in refused(small, capsys)[0]
     (small / "t.tsv").write_text("subject\timage\timage_2\n01\ta.nii.gz:0\ta.nii.gz:0\n")
-    assert [line.rpartition("/")[2] for line in refused(small, capsys)] == ["a.nii.gz:0 does not exist"]
+    assert [line.rpartition("/")[2] for line in refused(small, capsys)] == [
+        "a.nii.gz:0 does not exist"
+    ]
 
 
 def test_files_and_places_that_cannot_be_are_all_said(small, capsys):
     """A link to nothing, an empty file, a mask where others leave the background out."""
     (small / "link.nii").symlink_to("nothing")
     (small / "empty.nii").touch()
-    lines = ("subject\timage\tmask", "1\ta.nii.gz\t", "2\ta.nii.gz\ta.nii.gz", "3\tlink.nii\t", "4\tempty.nii\t")
+    lines = (
+        "subject\timage\tmask",
+        "1\ta.nii.gz\t",
+        "2\ta.nii.gz\ta.nii.gz",
+        "3\tlink.nii\t",
+        "4\tempty.nii\t",
+    )
     (small / "t.tsv").write_text("\n".join(lines) + "\n")
     said = refused(small, capsys, "--background", "3")
     assert len(said) == 3
@@ -230,24 +315,37 @@ def test_files_and_places_that_cannot_be_are_all_said(small, capsys):
 
 
 def test_each_subject_has_files_of_its_own(small, monkeypatch):
-    """Though options that several share are checked once; threads are no words of a run, which gets its part."""
+    """Though options that several share are checked once; threads are no words of a run, which
+    gets its part.
+    """
     monkeypatch.chdir(small)
     for name in ("s1.nii", "s2.nii", "m1.nii", "m2.nii"):
         (small / name).write_bytes(b"1")
     options = RunOptions(mask=Path("m{subject}.nii"), sizing=Path("s{subject}.nii"), threads=2)
     (small / "t.tsv").write_text("subject\timage\tmask\n1\ta.nii.gz\t\n2\ta.nii.gz\ts1.nii\n")
-    first, second = cohort_plan.entries_of(read_table(Path("t.tsv")), options, small / "out", ".vtu")
-    assert [each.plan.job.sizing for each in (first, second)] == [small / "s1.nii", small / "s2.nii"]
+    first, second = cohort_plan.entries_of(
+        read_table(Path("t.tsv")), options, small / "out", ".vtu"
+    )
+    assert [each.plan.job.sizing for each in (first, second)] == [
+        small / "s1.nii",
+        small / "s2.nii",
+    ]
     assert [each.plan.job.mask for each in (first, second)] == [small / "m1.nii", small / "s1.nii"]
     assert second.words() == (
-        f"--mask={small / 's1.nii'}", f"--sizing={small / 's2.nii'}", "--", str(small / "a.nii.gz")
-    )  # fmt: skip
+        f"--mask={small / 's1.nii'}",
+        f"--sizing={small / 's2.nii'}",
+        "--",
+        str(small / "a.nii.gz"),
+    )
 
 
 @pytest.mark.parametrize(("only_failed", "keys"), [(False, ["b", "c", "d"]), (True, ["b"])])
 def test_what_is_chosen(only_failed, keys):
     states = {"a": "done", "b": "failed", "c": "changed", "d": "missing", "e": "violated"}
-    entries = [cohort_plan.PlannedSubject(None, key, None, SubjectState(each, "")) for key, each in states.items()]
+    entries = [
+        cohort_plan.PlannedSubject(None, key, None, SubjectState(each, ""))
+        for key, each in states.items()
+    ]
     assert [each.key for each in cohort_plan.chosen(entries, only_failed)] == keys
 
 
@@ -256,11 +354,17 @@ def test_the_same_fault_of_many_subjects_is_said_once(small, capsys):
     assert len(said) == 1
     assert "t.tsv, line 2 and 1 more: --k-d: expected 0 <= k_D < 1, got 1.5" in said[0]
     assert (
-        "unknown placeholder {sub}; use {subject} and {session}" in refused(small, capsys, "--mask", "m-{sub}.nii")[0]
+        "unknown placeholder {sub}; use {subject} and {session}"
+        in refused(small, capsys, "--mask", "m-{sub}.nii")[0]
     )
-    (small / "t.tsv").write_text("subject\timage\tnodes\tk-d\tuniform\n01\ta.nii.gz\tmany\t0,9\ttrue\n")
+    (small / "t.tsv").write_text(
+        "subject\timage\tnodes\tk-d\tuniform\n01\ta.nii.gz\tmany\t0,9\ttrue\n"
+    )
     (line,) = refused(small, capsys)
-    assert "--nodes: expected a whole number, got 'many'; --k-d: expected a number, got '0,9'; write 0.9" in line
+    assert (
+        "--nodes: expected a whole number, got 'many'; --k-d: expected a number, got '0,9'; "
+        "write 0.9" in line
+    )
 
 
 def test_a_second_run_is_refused_before_it_plans(small, capsys, monkeypatch):
@@ -278,10 +382,22 @@ def test_the_table_of_what_would_be_run(small, capsys):
     options = ("--mask", f"{small}/m-{{subject}}.nii.gz")
     for name in ("01", "02"):
         (small / f"m-{name}.nii.gz").write_bytes((small / "a.nii.gz").read_bytes())
-    words = ["cohort", small / "t.tsv", "-o", small / "out", "--write-table", small / "u.tsv", *options]
+    words = [
+        "cohort",
+        small / "t.tsv",
+        "-o",
+        small / "out",
+        "--write-table",
+        small / "u.tsv",
+        *options,
+    ]
     assert exit_code(*words) == 0
     lines = (small / "u.tsv").read_text().splitlines()
-    assert lines == ["subject\timage\tmask\tnodes", "01\ta.nii.gz\tm-01.nii.gz\t60", "02\ta.nii.gz\tm-02.nii.gz\tn/a"]
+    assert lines == [
+        "subject\timage\tmask\tnodes",
+        "01\ta.nii.gz\tm-01.nii.gz\t60",
+        "02\ta.nii.gz\tm-02.nii.gz\tn/a",
+    ]
     assert not (small / "out").exists()
 
 
@@ -299,7 +415,11 @@ def test_what_is_larger_than_the_machine_takes_no_workers_from_others(monkeypatc
     monkeypatch.setattr(estimate_module, "available_bytes", lambda: int(8e9))
     monkeypatch.setattr("dask.system.CPU_COUNT", 4)
     estimate = {"a": 2e9, "b": 1e11}
-    assert estimate_module.share_for(9, estimate, CohortOptions(output=Path("out")), None) == (2, 2, 4e9)
+    assert estimate_module.share_for(9, estimate, CohortOptions(output=Path("out")), None) == (
+        2,
+        2,
+        4e9,
+    )
 
 
 def test_the_page_of_a_run_under_way(tmp_path, monkeypatch):
@@ -317,13 +437,19 @@ def test_what_another_run_has_done_meanwhile_is_not_done_again(small, monkeypatc
 
     @contextmanager
     def locked(work, _keys):
-        save_run(work.parent, "sub-01", {"request": {"options": {}, "files": {}, "sha256": "1"}, "violated": {}})
+        save_run(
+            work.parent,
+            "sub-01",
+            {"request": {"options": {}, "files": {}, "sha256": "1"}, "violated": {}},
+        )
         yield
 
     keys = []
     monkeypatch.setattr(cohort_module, "locked", locked)
     monkeypatch.setattr(cohort_plan, "requested", lambda *_: {"sha256": "1"})
     monkeypatch.setattr(cohort_module, "estimated", lambda _: {})
-    monkeypatch.setattr(cohort_module, "_run", lambda _, to_run: keys.extend(entry.key for entry in to_run))
+    monkeypatch.setattr(
+        cohort_module, "_run", lambda _, to_run: keys.extend(entry.key for entry in to_run)
+    )
     exit_code("cohort", small / "t.tsv", "-o", small / "out")
     assert keys == ["sub-02"]

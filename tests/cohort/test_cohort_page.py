@@ -25,15 +25,27 @@ def cohort(tmp_path_factory):
 
 
 def data_of(text):
-    return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)[1])
+    return json.loads(
+        re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)[1]
+    )
 
 
 def test_failures_are_on_top_with_their_logs(cohort):
     out, text = cohort
-    assert sorted(path.name for path in out.glob("cohort.*")) == ["cohort.html", "cohort.json", "cohort.tsv"]
+    assert sorted(path.name for path in out.glob("cohort.*")) == [
+        "cohort.html",
+        "cohort.json",
+        "cohort.tsv",
+    ]
     assert "100 subjects: 94 done, 1 with a violated requirement, 4 failed, 1 not run." in text
-    assert text.index("<h2>Failed: 4</h2>") < text.index("<h2>Distributions</h2>") < text.index("<h2>Subjects</h2>")
-    failures = re.findall(r"<tr><td>([^<]*)</td><td>(.*?)</td></tr>", text[: text.index("<h2>Distributions")])
+    assert (
+        text.index("<h2>Failed: 4</h2>")
+        < text.index("<h2>Distributions</h2>")
+        < text.index("<h2>Subjects</h2>")
+    )
+    failures = re.findall(
+        r"<tr><td>([^<]*)</td><td>(.*?)</td></tr>", text[: text.index("<h2>Distributions")]
+    )
     early, killed = (
         "image.nii.gz: expected a NIfTI image, got a file that ends early",
         f"ended by SIGKILL {plain(HOSTILE)}",
@@ -50,7 +62,8 @@ def test_what_differs_is_said_with_how_many(tmp_path):
         run["options"]["nodes"] = 250 if k < 2 else 300
         run["options"]["k_D"] = k / 10
         if k == 9:
-            run["request"]["options"] |= {"gradation": HOSTILE, "k-d": "0.9"}  # the latter is options.k_D
+            # the latter is options.k_D
+            run["request"]["options"] |= {"gradation": HOSTILE, "k-d": "0.9"}
         save_run(tmp_path, key_of(k), run, thumbnail(rng))
     save_cohort_files(tmp_path, collect(tmp_path))
     text = (tmp_path / "cohort.html").read_text(encoding="utf-8")
@@ -61,7 +74,9 @@ def test_what_differs_is_said_with_how_many(tmp_path):
         column["name"] for column in data_of(text)["columns"]
     }
     assert "Common to all meshes: tetopt 0.1.0, method fast, young 3.0, format .vtu." in text
-    assert re.search(r"Meshing took [\d.]+ min of computing time, excluding start-up and pictures[.]", text)
+    assert re.search(
+        r"Meshing took [\d.]+ min of computing time, excluding start-up and pictures[.]", text
+    )
 
 
 def test_the_colours_of_pictures_are_told_above_them(cohort, tmp_path):
@@ -70,7 +85,8 @@ def test_the_colours_of_pictures_are_told_above_them(cohort, tmp_path):
     assert text.index("<h2>Subjects</h2>") < text.index(words) < text.index('<div id="subjects">')
     save_run(tmp_path, "sub-1", {"violated": {}})
     save_cohort_files(tmp_path, collect(tmp_path))
-    assert words not in (tmp_path / "cohort.html").read_text(encoding="utf-8")  # there is no picture
+    # there is no picture
+    assert words not in (tmp_path / "cohort.html").read_text(encoding="utf-8")
 
 
 def test_names_do_no_harm(cohort):
@@ -145,7 +161,10 @@ def test_a_browser_sorts_and_filters(cohort, tmp_path):
     made = document(copied(text, tmp_path / "a.html", FRAMES, STEPS), "--window-size=1280,900")
     said = re.findall(r'<p class="said"[^>]*>([^<]*)</p>', made)
     rows = [row for row in collect(out) if row.numbers.get("quality.mean_rho") is not None]
-    rising = [row.key for row in sorted(rows, key=lambda row: float(f"{row.numbers['quality.mean_rho']:.4g}"))]
+    rising = [
+        row.key
+        for row in sorted(rows, key=lambda row: float(f"{row.numbers['quality.mean_rho']:.4g}"))
+    ]
     assert said[0].startswith(key_of(43))  # a requirement violated
     assert said[3] == said[0]
     assert said[1].split()[0] == rising[0]
@@ -183,7 +202,9 @@ def test_a_bar_says_what_lies_beyond_it(tmp_path):
     text = (tmp_path / "cohort.html").read_text(encoding="utf-8")
     made = document(copied(text, tmp_path / "a.html", FRAMES, BARS))
     lowest, highest, left, right = re.findall(r'<p class="said">([^<]*)</p>', made)
-    assert re.fullmatch(r"up to (0.\d+ l|\d+ ml): 1 subject, 1 flagged \(sub-0001 3.05 ml\)", lowest)
+    assert re.fullmatch(
+        r"up to (0.\d+ l|\d+ ml): 1 subject, 1 flagged \(sub-0001 3.05 ml\)", lowest
+    )
     assert re.fullmatch(r"1.\d+ l or more: 1 subject, 1 flagged \(sub-0020 9 l\)", highest)
     assert left == "≤ " + lowest[len("up to ") : lowest.index(":")]
     assert right == "≥ " + highest[: highest.index(" or more")]

@@ -33,13 +33,21 @@ def test_each_kind_of_odd_subject():
     assert flagged({}) == []
     flipped = {"affine": np.diag([-1.0, -1.0, 1.2, 1.0])}
     assert flagged(flipped) == [("grid.orientation", "orientation LPS: 19 of 20 have RAS")]
-    assert flagged({"lost": 17}) == [("label", "lost label 17 (hippocampus): it has 3992 voxels but no cell")]
-    assert flagged({"lost": 17}, violated=("labels",)) == [("violated", "violated labels"), *flagged({"lost": 17})]
+    assert flagged({"lost": 17}) == [
+        ("label", "lost label 17 (hippocampus): it has 3992 voxels but no cell")
+    ]
+    assert flagged({"lost": 17}, violated=("labels",)) == [
+        ("violated", "violated labels"),
+        *flagged({"lost": 17}),
+    ]
     assert flagged({"absent": 53}) == [("label", "no label 53 in its image: 19 of 20 have it")]
     assert flagged({}, violated=("min_dihedral",)) == [("violated", "violated min_dihedral")]
     [(column, words)] = flagged({"affine": OBLIQUE})
     assert column == "grid.oblique_degrees"
-    assert words == "obliqueness is 25.8 degrees, far above the others' median 0 degrees (13 robust deviations)"
+    assert (
+        words == "obliqueness is 25.8 degrees, far above the others' median 0 degrees (13 robust "
+        "deviations)"
+    )
 
 
 def test_a_small_mask_is_told_with_the_median():
@@ -66,7 +74,9 @@ def test_a_label_that_few_have():
 
 def test_no_majority_no_odd_one():
     rng = np.random.default_rng(4)
-    runs = [run_of(rng, affine=np.diag([sign, sign, 1.2, 1.0])) for sign in (1.0, 1.0, 1.0, -1.0, -1.0)]
+    runs = [
+        run_of(rng, affine=np.diag([sign, sign, 1.2, 1.0])) for sign in (1.0, 1.0, 1.0, -1.0, -1.0)
+    ]
     rows = [row_of(k, run) for k, run in enumerate(runs)]
     assert flags_of(rows) == [[]] * 5  # three of five
     assert [bool(each) for each in flags_of(rows[1:4])] == [False, False, True]  # two of three
@@ -77,11 +87,17 @@ def test_a_mixed_cohort_says_that_it_is_not_judged():
     """By what has no majority alone; and of few subjects, that they are few."""
     rng = np.random.default_rng(4)
     signs = [1.0, 1.0, 1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0]
-    rows = [row_of(k, run_of(rng, affine=np.diag([sign, sign, 1.2, 1.0]))) for k, sign in enumerate(signs)]
+    rows = [
+        row_of(k, run_of(rng, affine=np.diag([sign, sign, 1.2, 1.0])))
+        for k, sign in enumerate(signs)
+    ]
     [words] = unjudged(rows)
     assert re.match("The 9 3-D meshes are too mixed to judge by orientation: ", words)
     assert unjudged([rows[0], *rows[:4], *rows[:4]]) == []
-    assert [each[:21] for each in unjudged([rows[0], rows[-1]])] == ["2 3-D meshes are too ", "The 2 3-D meshes are "]
+    assert [each[:21] for each in unjudged([rows[0], rows[-1]])] == [
+        "2 3-D meshes are too ",
+        "The 2 3-D meshes are ",
+    ]
 
 
 def test_few_subjects_have_no_medians():
@@ -111,8 +127,12 @@ def test_planes_and_volumes_are_not_compared():
 
 def test_deviations_are_scaled_by_the_median_absolute_deviation():
     values = np.random.default_rng(0).normal(3.0, 2.0, 100_000)
-    np.testing.assert_allclose(deviations(values, False, 1e-9), (values - 3.0) / 2.0, rtol=0.02, atol=0.02)
-    np.testing.assert_allclose(deviations(np.exp(values), True, 1e-9), deviations(values, False, 1e-9), atol=1e-9)
+    np.testing.assert_allclose(
+        deviations(values, False, 1e-9), (values - 3.0) / 2.0, rtol=0.02, atol=0.02
+    )
+    np.testing.assert_allclose(
+        deviations(np.exp(values), True, 1e-9), deviations(values, False, 1e-9), atol=1e-9
+    )
 
 
 def test_numbers_that_are_the_same_are_measured_by_the_least_scale():
@@ -129,7 +149,9 @@ def test_numbers_that_are_the_same_are_measured_by_the_least_scale():
 
 def flags_of_column(column, values):
     row = Row("sub-1", "done", "", (), {}, {}, {}, {}, {})
-    return flags_of([row._replace(numbers={"quality.ndim": 3, column: float(value)}) for value in values])
+    return flags_of(
+        [row._replace(numbers={"quality.ndim": 3, column: float(value)}) for value in values]
+    )
 
 
 @pytest.mark.parametrize("n", [8, 20, 500])
@@ -137,7 +159,10 @@ def test_usual_numbers_are_seldom_flagged(n):
     """At most 1 normal one of 1000, of Student's t with 5 degrees of freedom 5 of 1000."""
     rng = np.random.default_rng(n)
     columns = 50_000 // n
-    for numbers, most in ((rng.normal(size=(columns, n)), 1e-3), (rng.standard_t(5, size=(columns, n)), 5e-3)):
+    for numbers, most in (
+        (rng.normal(size=(columns, n)), 1e-3),
+        (rng.standard_t(5, size=(columns, n)), 5e-3),
+    ):
         far = [np.abs(deviations(row, False, 1e-9)) > limit(n) for row in numbers]
         assert np.mean(far) <= most
 

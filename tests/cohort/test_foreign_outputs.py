@@ -1,4 +1,6 @@
-"""Links and files of the user's in a cohort's folder: refused in a line with nothing touched, or of no harm."""
+"""Links and files of the user's in a cohort's folder: refused in a line with nothing touched, or
+of no harm.
+"""
 
 import json
 import shutil
@@ -48,9 +50,11 @@ def words(out, *options):
 ATTACKS = [
     *((".work", kind) for kind in KINDS),
     *(("logs", kind) for kind in ("folder link", "hanging link")),
-    ("logs/sub-01.log", "file link"), ("logs/sub-01.failed.json", "device link"), ("logs/other.log", "file link"),
+    ("logs/sub-01.log", "file link"),
+    ("logs/sub-01.failed.json", "device link"),
+    ("logs/other.log", "file link"),
     *((f"cohort.{each}", "hanging link") for each in ("tsv", "json", "html")),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("name", "kind"), ATTACKS)
@@ -90,12 +94,19 @@ def test_a_subjects_folder_that_is_a_link_is_read_and_not_replaced(out, capfd, m
     before = content(elsewhere)
     assert exit_code(*words(out, "--collect")) == 0
     with monkeypatch.context() as patch:  # what is asked for is what is there
-        patch.setattr(cohort_plan, "requested", lambda *_: json.loads(numbers_path(out, KEY).read_text())["request"])
+        patch.setattr(
+            cohort_plan,
+            "requested",
+            lambda *_: json.loads(numbers_path(out, KEY).read_text())["request"],
+        )
         assert exit_code(*words(out)) == 0
     assert "1 subject: 1 done; 0 to run" in capfd.readouterr().err
     whole = content(out.parent)
     assert exit_code(*words(out)) == 2
-    assert f"tetopt: {out / name}: expected the subject's folder, got a link to" in capfd.readouterr().err
+    assert (
+        f"tetopt: {out / name}: expected the subject's folder, got a link to"
+        in capfd.readouterr().err
+    )
     assert content(out.parent) == whole
     with pytest.raises(InputError, match=f"^{out / name}: expected the subject's folder"):
         publish(out / ".work" / "sub-01.run-1", out, KEY)
@@ -110,7 +121,12 @@ def test_sessions_of_a_subject_that_is_a_link_are_not_replaced(out, image, capfd
     (out.parent / "t.tsv").write_text(f"subject\tsession\timage\n02\ta\t{image}\n02\tb\t{image}\n")
     before = content(out.parent)
     assert exit_code(*words(out)) == 2
-    assert capfd.readouterr().err.count(f"tetopt: {place}: expected the subject's folder, got a link to") == 1
+    assert (
+        capfd.readouterr().err.count(
+            f"tetopt: {place}: expected the subject's folder, got a link to"
+        )
+        == 1
+    )
     assert content(out.parent) == before
 
 

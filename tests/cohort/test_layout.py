@@ -34,7 +34,8 @@ def test_a_folder_is_new_empty_or_a_cohorts(out, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "text", ["{}", "[]", "not JSON", '{"GeneratedBy": [{"Name": "fMRIPrep"}]}', '{"GeneratedBy": 3}']
+    "text",
+    ["{}", "[]", "not JSON", '{"GeneratedBy": [{"Name": "fMRIPrep"}]}', '{"GeneratedBy": 3}'],
 )
 def test_a_folder_of_something_else_is_refused(tmp_path, text):
     (tmp_path / "dataset_description.json").write_text(text)
@@ -77,12 +78,18 @@ def test_numbers_come_last(out, monkeypatch):
 
 
 def test_what_ended_runs_have_left_is_removed(out):
-    """Of the named subjects alone; of a scheduler's workers that still run them, which then give up."""
+    """Of the named subjects alone; of a scheduler's workers that still run them, which then give
+    up.
+    """
     work_of(out, "sub-1", "mine")
     other = work_of(out, "sub-2", "another run's")
     (out / ".work" / "sub-1.lock").touch()
     clean(out, ["sub-1"])
-    assert sorted((out / ".work").iterdir()) == [out / ".work" / "sub-1.lock", other, out / ".work" / "tetopt-lock"]
+    assert sorted((out / ".work").iterdir()) == [
+        out / ".work" / "sub-1.lock",
+        other,
+        out / ".work" / "tetopt-lock",
+    ]
     clean(out)
     assert not other.exists()
 
@@ -95,5 +102,9 @@ def test_what_a_user_has_put_beside_a_mesh_stays(out):
     (place / "results" / "stress.frd").write_text("mine")
     work = work_of(out, "sub-1", "second", ".vtu")
     publish(work, out, "sub-1")
-    assert sorted(each.name for each in place.iterdir()) == ["a.txt", "results", "sub-1_desc-tetopt_mesh.vtu"]
+    assert sorted(each.name for each in place.iterdir()) == [
+        "a.txt",
+        "results",
+        "sub-1_desc-tetopt_mesh.vtu",
+    ]
     assert (place / "results" / "stress.frd").read_text() == "mine"

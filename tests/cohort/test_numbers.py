@@ -43,15 +43,19 @@ def test_rows_are_those_there_and_those_expected(cohort):
     assert cohort[-1].files == {}
     first = "sub-0001/sub-0001_desc-tetopt_mesh"
     assert cohort[0].files == {
-        "mesh": f"{first}.vtu", "numbers": f"{first}.json", "figures": "sub-0001/figures",
+        "mesh": f"{first}.vtu",
+        "numbers": f"{first}.json",
+        "figures": "sub-0001/figures",
         "thumbnail": "sub-0001/figures/thumbnail.png",
-    }  # fmt: skip
+    }
 
 
 def test_sessions_and_what_is_no_subject(tmp_path):
     save_run(tmp_path, "sub-2_ses-b", run_of(RNG))
     save_run(tmp_path, "sub-10", run_of(RNG))
-    save_run(tmp_path, "sub-2_ses-a", run_of(RNG, violated={"min_dihedral": "two\nlines", "box": "out"}))
+    save_run(
+        tmp_path, "sub-2_ses-a", run_of(RNG, violated={"min_dihedral": "two\nlines", "box": "out"})
+    )
     save_failure(tmp_path, "sub-1", "x")
     save_failure(tmp_path, "other", "x")
     (tmp_path / "sub-<b>").mkdir()
@@ -68,7 +72,11 @@ def test_numbers_that_are_none_are_a_failure(tmp_path, text):
     save_run(tmp_path, "sub-1", run_of(RNG))
     numbers_path(tmp_path, "sub-1").write_text(text)
     [row] = collect(tmp_path)
-    assert (row.status, row.reason, row.numbers) == ("failed", "its numbers cannot be read; run it again", {})
+    assert (row.status, row.reason, row.numbers) == (
+        "failed",
+        "its numbers cannot be read; run it again",
+        {},
+    )
 
 
 def test_a_failure_is_told_instead_of_an_older_mesh(tmp_path):
@@ -91,7 +99,10 @@ def test_numbers_without_a_mesh_are_a_failure(tmp_path):
 
 def test_numbers_have_names_with_dots():
     run = run_of(RNG)
-    run |= {"materials": {"young_kPa": [1.0, 2.0], "nu": [0.1] * 5, "binning": None}, "dropped_components": 2}
+    run |= {
+        "materials": {"young_kPa": [1.0, 2.0], "nu": [0.1] * 5, "binning": None},
+        "dropped_components": 2,
+    }
     run |= {"contrasts": [{"image": "a", "weight": 2.0}] * 6}
     run["labels"][1]["lost_components"] = [{"voxels": 50, "place": [0.0, 1.0, 2.0]}] * 6
     columns = flattened(run)
@@ -109,7 +120,15 @@ def test_numbers_have_names_with_dots():
     assert columns["interfaces.0.area"] == 1000.0
     assert columns["request.options.young"] == "3.0"
     assert "request.options.nodes" not in columns
-    left_out = ("history", "sets", "violated", "box", "label_names", "inputs.sha256", "labels.0.label")
+    left_out = (
+        "history",
+        "sets",
+        "violated",
+        "box",
+        "label_names",
+        "inputs.sha256",
+        "labels.0.label",
+    )
     assert [name for name in columns if name.startswith(left_out)] == []
 
 
@@ -122,7 +141,9 @@ def test_orientation_is_that_of_nibabel():
             affine[:3, :3] = (np.eye(3) * signs)[order] + 0.1
             assert orientation_code(affine) == "".join(aff2axcodes(affine))
     turn = np.radians(12.3)
-    turned = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+    turned = np.array(
+        [[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]]
+    )
     assert oblique_degrees(np.block([[turned * [1, 2, 3], np.ones((3, 1))], [0, 0, 0, 1]])) == 12.3
 
 
@@ -147,8 +168,9 @@ def test_the_table_reads_back(cohort, tmp_path):
     about = json.loads(path.with_suffix(".json").read_text())
     assert list(about) == list(rows[0])
     assert about["labels.17.volume"] == {
-        "Description": "Label 17 (hippocampus): volume of its voxels", "Units": "mm^3"
-    }  # fmt: skip
+        "Description": "Label 17 (hippocampus): volume of its voxels",
+        "Units": "mm^3",
+    }
 
 
 def test_no_text_is_a_formula():
@@ -159,7 +181,11 @@ def test_no_text_is_a_formula():
 
 
 def test_every_column_is_described():
-    assert [name for name in flattened(run_of(RNG)) if description(name)["Description"].endswith("of run.json")] == []
+    assert [
+        name
+        for name in flattened(run_of(RNG))
+        if description(name)["Description"].endswith("of run.json")
+    ] == []
     assert description("options.k_D") == {"Description": "Option k_D"}
     assert description("quality_initial.min_edge")["Units"] == "mm"
     assert description("new.thing")["Description"] == "new.thing of run.json"
@@ -167,10 +193,21 @@ def test_every_column_is_described():
 
 @pytest.mark.parametrize(
     ("beginning", "record"),
-    [("labels.N.", LabelFidelity), ("interfaces.N.", LabelInterface), ("mask.", MaskFidelity), ("quality.", Quality)],
+    [
+        ("labels.N.", LabelFidelity),
+        ("interfaces.N.", LabelInterface),
+        ("mask.", MaskFidelity),
+        ("quality.", Quality),
+    ],
 )
 def test_what_is_measured_is_described(beginning, record):
-    """A new number of a run has a line in the table of descriptions, and one that is gone has none."""
+    """A new number of a run has a line in the table of descriptions, and one that is gone has
+    none.
+    """
     table = toml_of(Path(tetopt.cohort.__file__).parent / "columns.toml", "table")
-    described = {name.removeprefix(beginning).partition(".")[0] for name in table if name.startswith(beginning)}
+    described = {
+        name.removeprefix(beginning).partition(".")[0]
+        for name in table
+        if name.startswith(beginning)
+    }
     assert described == set(record._fields) - {"label"}

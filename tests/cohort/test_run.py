@@ -55,8 +55,19 @@ def test_a_subject_is_what_mesh_alone_writes(done, image, tmp_path):
     """To the byte, but for what differs from run to run: seconds, memory."""
     task, ended = done
     assert (ended.status, ended.reason) == ("done", "")
-    folder, alone, name = subject_folder(task.out, "sub-1"), tmp_path / "alone", "sub-1_desc-tetopt_mesh"
-    outputs = ["-o", alone / f"{name}.vtu", "--json", alone / f"{name}.json", "--figures", alone / "figures"]
+    folder, alone, name = (
+        subject_folder(task.out, "sub-1"),
+        tmp_path / "alone",
+        "sub-1_desc-tetopt_mesh",
+    )
+    outputs = [
+        "-o",
+        alone / f"{name}.vtu",
+        "--json",
+        alone / f"{name}.json",
+        "--figures",
+        alone / "figures",
+    ]
     alone.mkdir()
     assert exit_code("mesh", "--nodes", 60, "--iterations", 1, *outputs, image) == 0
     names = sorted(str(path.relative_to(alone)) for path in alone.rglob("*"))
@@ -82,7 +93,9 @@ def test_a_log_repeats_no_line(task, monkeypatch):
 
     monkeypatch.setattr(run_module, "run", said)
     run_subject(task)
-    assert log_path(task.out, "sub-1").read_text() == "compiling, 1 of 2\ncompiling, 2 of 2\nenough\n"
+    assert (
+        log_path(task.out, "sub-1").read_text() == "compiling, 1 of 2\ncompiling, 2 of 2\nenough\n"
+    )
 
 
 def test_a_subject_that_fails_is_one_line_and_what_was_there_stays(done, tmp_path):
@@ -93,14 +106,19 @@ def test_a_subject_that_fails_is_one_line_and_what_was_there_stays(done, tmp_pat
     log_path(task.out, "sub-1").unlink()
     os.link(tmp_path / "notes.txt", log_path(task.out, "sub-1"))
     ended = run_subject(with_options(task, nodes=0))
-    assert (ended.status, ended.reason) == ("failed", "`nodes`: expected a whole number from 5 to 50000000, got 0")
+    assert (ended.status, ended.reason) == (
+        "failed",
+        "`nodes`: expected a whole number from 5 to 50000000, got 0",
+    )
     assert log_path(task.out, "sub-1").read_text() == f"{ended.reason}\n"
     assert numbers_path(task.out, "sub-1").read_bytes() == before
     assert (tmp_path / "notes.txt").read_text() == "years of work"
 
 
 def test_a_mesh_that_violates_a_requirement_is_a_mesh(task, tmp_path):
-    """A mask of two thin plates, and too few nodes for it: `tetopt mesh` ends with 1. Warnings are in its log."""
+    """A mask of two thin plates, and too few nodes for it: `tetopt mesh` ends with 1. Warnings
+    are in its log.
+    """
     inside = np.zeros((24, 24, 24))
     inside[4:20, 4:20, 11] = inside[11, 4:20, 4:20] = 1.0
     tetopt.save_image(tmp_path / "thin.nii.gz", tetopt.Image(100.0 * inside + np.arange(24.0)))
@@ -109,16 +127,27 @@ def test_a_mesh_that_violates_a_requirement_is_a_mesh(task, tmp_path):
     ended = run_subject(with_options(task, **thin))
     assert ended.status == "violated"
     assert "overlap with a Dice of only" in ended.reason
-    assert ended.reason == "; ".join(numbers_in(numbers_path(task.out, "sub-1"))["violated"].values())
+    assert ended.reason == "; ".join(
+        numbers_in(numbers_path(task.out, "sub-1"))["violated"].values()
+    )
     assert "overlap with a Dice of only" in log_path(task.out, "sub-1").read_text()
 
 
-@pytest.mark.parametrize(("error", "reason"), [
-    (KeyError("first\nlast\x1b[2J"), "KeyError: 'first\\nlast\\x1b[2J'"),
-    (FileNotFoundError(2, "No such file", "a.nii"), "a.nii: No such file"), (InputError("a: b\n c"), "a: b c"),
-    (MemoryError("of 3 GB"), "not enough memory: of 3 GB; use fewer nodes, a part of the image or `max_gb`"),
-])  # fmt: skip
-def test_an_error_is_a_line_and_one_of_a_programmer_a_traceback_in_the_log(task, monkeypatch, error, reason):
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (KeyError("first\nlast\x1b[2J"), "KeyError: 'first\\nlast\\x1b[2J'"),
+        (FileNotFoundError(2, "No such file", "a.nii"), "a.nii: No such file"),
+        (InputError("a: b\n c"), "a: b c"),
+        (
+            MemoryError("of 3 GB"),
+            "not enough memory: of 3 GB; use fewer nodes, a part of the image or `max_gb`",
+        ),
+    ],
+)
+def test_an_error_is_a_line_and_one_of_a_programmer_a_traceback_in_the_log(
+    task, monkeypatch, error, reason
+):
     def failing(job, on, _):
         warnings.warn("half of it is empty", stacklevel=1)
         raise error
@@ -155,7 +184,10 @@ def test_a_run_that_is_given_up_ends(task, monkeypatch):
 def test_a_subject_beyond_its_workers_memory_is_not_begun(task, monkeypatch):
     monkeypatch.setattr(run_module, "memory_limit", lambda: 2e9)
     ended = run_subject(task._replace(n_bytes=3e9))
-    words = "needs 3 GB of memory, but a worker has 2 GB; reduce the number of nodes, or use larger workers"
+    words = (
+        "needs 3 GB of memory, but a worker has 2 GB; reduce the number of nodes, or use "
+        "larger workers"
+    )
     assert (ended.status, ended.reason) == ("failed", words)
 
 
@@ -164,10 +196,15 @@ def test_failures_are_recorded_and_forgotten(tmp_path, monkeypatch, task):
     names = [task._replace(key=f"sub-{k}") for k in range(3)]
     errors = {
         "sub-1": None,
-        "sub-2": WorkerEnded("its worker ended, 2 times, possibly because it exceeded its limit of 0.4 GB"),
+        "sub-2": WorkerEnded(
+            "its worker ended, 2 times, possibly because it exceeded its limit of 0.4 GB"
+        ),
         "sub-0": None,
     }
-    ended = [run_module.Ended("sub-0", "done", "", 1.0, 1), run_module.Ended("sub-1", "failed", "cut short", 1.0, 0)]
+    ended = [
+        run_module.Ended("sub-0", "done", "", 1.0, 1),
+        run_module.Ended("sub-1", "failed", "cut short", 1.0, 0),
+    ]
     failure_path(task.out, "sub-0").write_text("{}")
 
     def run_tasks(pool, function, tasks, place):
@@ -177,7 +214,10 @@ def test_failures_are_recorded_and_forgotten(tmp_path, monkeypatch, task):
     monkeypatch.setattr(run_module, "run_tasks", run_tasks)
     outcomes = list(run_all(names, None, task.out))
     reason = "its worker ended, 2 times, possibly because it exceeded its limit of 0.4 GB"
-    assert [each[:3] for each in outcomes] == [*(each[:3] for each in ended), ("sub-2", "failed", reason)]
+    assert [each[:3] for each in outcomes] == [
+        *(each[:3] for each in ended),
+        ("sub-2", "failed", reason),
+    ]
     records = [json.loads(failure_path(task.out, key).read_text()) for key in ("sub-1", "sub-2")]
     assert records[0] == {"key": "sub-1", "reason": "cut short", "command": "tetopt mesh ..."}
     assert records[1]["reason"] == reason

@@ -1,4 +1,6 @@
-"""What there is of a subject, by its files alone: each status, why, and what a rerun makes of it."""
+"""What there is of a subject, by its files alone: each status, why, and what a rerun makes of
+it.
+"""
 
 import json
 
@@ -12,7 +14,11 @@ KEY = "sub-1"
 
 
 def request(**changes):
-    whole = {"options": {"nodes": 60, "format": ".vtu"}, "files": {"images": [["a.nii", "0"]]}, "tetopt": "0.1.0"}
+    whole = {
+        "options": {"nodes": 60, "format": ".vtu"},
+        "files": {"images": [["a.nii", "0"]]},
+        "tetopt": "0.1.0",
+    }
     return {**whole, **changes, "sha256": json.dumps({**whole, **changes})}
 
 
@@ -50,13 +56,19 @@ def test_a_failure_counts_until_there_is_what_is_asked_for(out):
     assert status(out) == SubjectState("done", "")
 
 
-@pytest.mark.parametrize("harm", [
-    lambda mesh, numbers: mesh.unlink(), lambda mesh, numbers: numbers.unlink(),
-    lambda mesh, numbers: numbers.write_text('{"request": '), lambda mesh, numbers: numbers.write_text("[]"),
-    lambda mesh, numbers: numbers.write_bytes(b""), lambda mesh, numbers: mesh.write_bytes(b""),
-    lambda mesh, numbers: numbers.write_text('{"request": 3}'),
-    lambda mesh, numbers: numbers.write_text('{"request": {"format": 3}, "violated": 4}'),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "harm",
+    [
+        lambda mesh, numbers: mesh.unlink(),
+        lambda mesh, numbers: numbers.unlink(),
+        lambda mesh, numbers: numbers.write_text('{"request": '),
+        lambda mesh, numbers: numbers.write_text("[]"),
+        lambda mesh, numbers: numbers.write_bytes(b""),
+        lambda mesh, numbers: mesh.write_bytes(b""),
+        lambda mesh, numbers: numbers.write_text('{"request": 3}'),
+        lambda mesh, numbers: numbers.write_text('{"request": {"format": 3}, "violated": 4}'),
+    ],
+)
 def test_what_is_damaged_is_made_again(out, harm):
     saved(out)
     harm(subject_folder(out, KEY) / mesh_name(KEY, ".vtu"), numbers_path(out, KEY))
@@ -71,7 +83,10 @@ def test_a_mesh_of_another_format_is_a_change(out):
 def test_differences_are_said_and_the_line_is_short():
     before = request()
     assert differences(before, request(files={"images": [["a.nii", "1"]]})) == "another image"
-    assert differences(before, request(files={**before["files"], "mask": [["m", "1"]]})) == "another mask"
+    assert (
+        differences(before, request(files={**before["files"], "mask": [["m", "1"]]}))
+        == "another mask"
+    )
     assert differences(before, request(tetopt="0.2.0")) == "tetopt was 0.1.0, now 0.2.0"
     many = request(options={"nodes": 60, "format": ".vtu"} | {f"o{k}": k for k in range(6)})
     assert differences(before, many) == (

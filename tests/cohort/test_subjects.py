@@ -4,7 +4,15 @@ from pathlib import Path
 
 import pytest
 
-from tetopt.cohort.subjects import Problems, Subject, doubled, key, matching, read_table, write_table
+from tetopt.cohort.subjects import (
+    Problems,
+    Subject,
+    doubled,
+    key,
+    matching,
+    read_table,
+    write_table,
+)
 from tetopt.errors import InputError
 
 
@@ -20,43 +28,75 @@ def subject(name, session="", **others):
 
 def test_a_table_says_what_is_meshed(tmp_path):
     path = table(
-        tmp_path / "s.tsv", "subject\tsession\timage\timage_2\tmask\tnodes\tk-d\t#note",
-        "sub-01\tses-a\ta.nii\tb.nii\tn/a\t500\t\told", "02\t\t/c.nii\tn/a\tm.nii\tn/a\t0.3\t",
-    )  # fmt: skip
+        tmp_path / "s.tsv",
+        "subject\tsession\timage\timage_2\tmask\tnodes\tk-d\t#note",
+        "sub-01\tses-a\ta.nii\tb.nii\tn/a\t500\t\told",
+        "02\t\t/c.nii\tn/a\tm.nii\tn/a\t0.3\t",
+    )
     first, second = read_table(path)
-    assert first == Subject("01", "a", (tmp_path / "a.nii", tmp_path / "b.nii"), {"nodes": "500"}, f"{path}, line 2")
+    assert first == Subject(
+        "01", "a", (tmp_path / "a.nii", tmp_path / "b.nii"), {"nodes": "500"}, f"{path}, line 2"
+    )
     assert second == Subject(
-        "02", "", (Path("/c.nii"),), {"mask": str(tmp_path / "m.nii"), "k_d": "0.3"}, f"{path}, line 3"
+        "02",
+        "",
+        (Path("/c.nii"),),
+        {"mask": str(tmp_path / "m.nii"), "k_d": "0.3"},
+        f"{path}, line 3",
     )
     assert [key(first), key(second)] == ["sub-01_ses-a", "sub-02"]
 
 
 def test_files_of_mappings_are_relative_to_the_table(tmp_path):
-    path = table(tmp_path / "s.tsv", "subject\timage\tyoung\tnu\tdensity", "1\ta.nii\tmapping.csv\t0.3\t../rho.TOML")
+    path = table(
+        tmp_path / "s.tsv",
+        "subject\timage\tyoung\tnu\tdensity",
+        "1\ta.nii\tmapping.csv\t0.3\t../rho.TOML",
+    )
     (row,) = read_table(path)
-    mappings = {"young": str(tmp_path / "mapping.csv"), "nu": "0.3", "density": str(tmp_path.parent / "rho.TOML")}
+    mappings = {
+        "young": str(tmp_path / "mapping.csv"),
+        "nu": "0.3",
+        "density": str(tmp_path.parent / "rho.TOML"),
+    }
     assert row.options == mappings
-    labels = table(tmp_path / "l.tsv", "subject\timage\tmerge\tlabel_size", "1\ta.nii\tgroups.csv\tsizes.csv")
+    labels = table(
+        tmp_path / "l.tsv", "subject\timage\tmerge\tlabel_size", "1\ta.nii\tgroups.csv\tsizes.csv"
+    )
     (other,) = read_table(labels)
-    assert other.options == {"merge": str(tmp_path / "groups.csv"), "label_size": str(tmp_path / "sizes.csv")}
+    assert other.options == {
+        "merge": str(tmp_path / "groups.csv"),
+        "label_size": str(tmp_path / "sizes.csv"),
+    }
     (tmp_path / "inner").mkdir()
     write_table(tmp_path / "inner" / "u.tsv", [row])
     assert "\t../../rho.TOML\t0.3\t../mapping.csv\n" in (tmp_path / "inner" / "u.tsv").read_text()
 
 
-@pytest.mark.parametrize(("suffix", "lines"), [
-    (".csv", ['subject,image', '"a, b",x.nii']), (".csv", ["subject;image", '"a, b";x.nii']),
-    (".csv", ["\ufeffparticipant_id,image", '"a, b",x.nii']), (".tsv", ["subject\timage", "a, b\tx.nii", "", "\t"]),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("suffix", "lines"),
+    [
+        (".csv", ["subject,image", '"a, b",x.nii']),
+        (".csv", ["subject;image", '"a, b";x.nii']),
+        (".csv", ["\ufeffparticipant_id,image", '"a, b",x.nii']),
+        (".tsv", ["subject\timage", "a, b\tx.nii", "", "\t"]),
+    ],
+)
 def test_tables_as_programs_write_them(tmp_path, suffix, lines):
     (row,) = read_table(table(tmp_path / f"t{suffix}", *lines))
     assert (row.subject, key(row), row.images) == ("a, b", "sub-ab", (tmp_path / "x.nii",))
 
 
-@pytest.mark.parametrize(("lines", "words"), [
-    (["subject,file"], "missing image"), (["subject,image,image"], "occurs 2 times"),
-    (["subject,image"], "a line for each subject"), ([""], "an empty file"), (['subject,image', '"a,b'], "correct"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        (["subject,file"], "missing image"),
+        (["subject,image,image"], "occurs 2 times"),
+        (["subject,image"], "a line for each subject"),
+        ([""], "an empty file"),
+        (["subject,image", '"a,b'], "correct"),
+    ],
+)
 def test_what_is_no_table_is_refused(tmp_path, lines, words):
     with pytest.raises(InputError, match=words):
         read_table(table(tmp_path / "t.csv", *lines))
@@ -67,8 +107,10 @@ def test_all_lines_that_are_wrong_are_said(tmp_path):
     with pytest.raises(Problems) as raised:
         read_table(path)
     assert [line.removeprefix(f"{path}, ") for line in raised.value.lines] == [
-        "line 2: expected 2 cells as in the first line, got 1", "line 3: missing subject", "line 4: missing image",
-    ]  # fmt: skip
+        "line 2: expected 2 cells as in the first line, got 1",
+        "line 3: missing subject",
+        "line 4: missing image",
+    ]
 
 
 def test_names_that_come_to_the_same_are_said():
@@ -87,8 +129,12 @@ def test_names_that_no_file_can_have_are_refused():
 
 def test_a_table_that_was_written_reads_the_same(tmp_path):
     rows = [
-        subject("01", "a", images=(tmp_path / "x.nii", Path("/far/y.nii")), options={"background": "-5"}),
-        subject("02", "b", images=(tmp_path / "z\tz.nii",), options={"labels": str(tmp_path / "l.nii")}),
+        subject(
+            "01", "a", images=(tmp_path / "x.nii", Path("/far/y.nii")), options={"background": "-5"}
+        ),
+        subject(
+            "02", "b", images=(tmp_path / "z\tz.nii",), options={"labels": str(tmp_path / "l.nii")}
+        ),
     ]
     for name in ("t.tsv", "t.csv"):
         write_table(tmp_path / name, rows)
@@ -97,11 +143,23 @@ def test_a_table_that_was_written_reads_the_same(tmp_path):
         ]
 
 
-@pytest.mark.parametrize(("pattern", "session", "name"), [
-    ("sub-{subject}/ses-{session}/sub-{subject}_ses-{session}_mask.nii", "b", "sub-01/ses-b/sub-01_ses-b_mask.nii"),
-    ("sub-{subject}/ses-{session}/sub-{subject}_ses-{session}_mask.nii", "", "sub-01/sub-01_mask.nii"),
-    ("sub-{subject}/**/*_mask.nii", "b", "sub-01/sub-01_mask.nii"), ("atlas.nii", "", "atlas.nii"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("pattern", "session", "name"),
+    [
+        (
+            "sub-{subject}/ses-{session}/sub-{subject}_ses-{session}_mask.nii",
+            "b",
+            "sub-01/ses-b/sub-01_ses-b_mask.nii",
+        ),
+        (
+            "sub-{subject}/ses-{session}/sub-{subject}_ses-{session}_mask.nii",
+            "",
+            "sub-01/sub-01_mask.nii",
+        ),
+        ("sub-{subject}/**/*_mask.nii", "b", "sub-01/sub-01_mask.nii"),
+        ("atlas.nii", "", "atlas.nii"),
+    ],
+)
 def test_a_pattern_means_one_file(tmp_path, monkeypatch, pattern, session, name):
     (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / name).touch()

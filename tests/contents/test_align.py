@@ -1,4 +1,6 @@
-"""Masks, labels and contrasts land on the image's voxels by the affines; the foreground is what it should be."""
+"""Masks, labels and contrasts land on the image's voxels by the affines; the foreground is what
+it should be.
+"""
 
 import re
 from functools import partial
@@ -22,7 +24,9 @@ SHAPE, OTHER = (7, 9, 6), (8, 6, 7)
 
 
 def turned(spacing, angles=(0, 0, 0), flips=(1, 1, 1)):
-    """Affine of voxels of that spacing, turned about each axis and flipped; the grids' middles are close."""
+    """Affine of voxels of that spacing, turned about each axis and flipped; the grids' middles
+    are close.
+    """
     linear = np.eye(3)
     for axis, angle in enumerate(angles):
         i, k = (a for a in range(3) if a != axis)
@@ -53,17 +57,22 @@ PAIRS["both oblique"] = (MOVE @ PAIRS["oblique"][0], MOVE @ PAIRS["oblique"][1])
 
 
 def nearest_twin(other, image):
-    """Voxel by voxel: through the world, into the box around the voxel it falls in, lower face included."""
+    """Voxel by voxel: through the world, into the box around the voxel it falls in, lower face
+    included.
+    """
     values = np.zeros(image.shape)
     for voxel in np.ndindex(image.shape):
-        index = np.floor(other.to_index(image.to_world(voxel)) + 0.5 + 1e-6).astype(int)  # ties go up
+        # ties go up
+        index = np.floor(other.to_index(image.to_world(voxel)) + 0.5 + 1e-6).astype(int)
         if (index >= 0).all() and (index < other.shape).all():
             values[voxel] = other.data[tuple(index)]
     return values
 
 
 def linear_twin(other, image):
-    """Voxel by voxel: the eight (four) voxels around, the index held to the centres of the border."""
+    """Voxel by voxel: the eight (four) voxels around, the index held to the centres of the
+    border.
+    """
     values = np.zeros(image.shape)
     for voxel in np.ndindex(image.shape):
         index = np.clip(other.to_index(image.to_world(voxel)), 0, np.array(other.shape) - 1)
@@ -92,7 +101,9 @@ def message(function, *args):
 
 @pytest.mark.parametrize("which", PAIRS)
 def test_nearest_is_its_twin(which):
-    """Labels, a 0/255 mask and a probability map, each voxel the one whose box it lies in, 0 outside all of them."""
+    """Labels, a 0/255 mask and a probability map, each voxel the one whose box it lies in, 0
+    outside all of them.
+    """
     image, labels = pair(which, lambda rng: rng.integers(1, 9, OTHER))
     expected = nearest_twin(labels, image)
     assert 0 < np.count_nonzero(expected == 0) < expected.size  # both inside and outside are tried
@@ -104,7 +115,9 @@ def test_nearest_is_its_twin(which):
     np.testing.assert_array_equal(aligned.data, nearest_twin(mask, image) / 255)
     np.testing.assert_array_equal(aligned.affine, image.affine)
     chance = tetopt.Image(labels.data / 16, labels.affine)
-    np.testing.assert_array_equal(resample_mask(chance, image, "m").data, nearest_twin(chance, image))
+    np.testing.assert_array_equal(
+        resample_mask(chance, image, "m").data, nearest_twin(chance, image)
+    )
 
 
 @pytest.mark.parametrize("which", PAIRS)
@@ -120,7 +133,9 @@ def _translation(*shift):
 
 
 def test_same_grid_is_taken_as_it_is():
-    """Up to 1e-4 voxel, and not beyond: there a value near a voxel's border comes from its neighbour."""
+    """Up to 1e-4 voxel, and not beyond: there a value near a voxel's border comes from its
+    neighbour.
+    """
     rng = np.random.default_rng(0)
     affine = PAIRS["both oblique"][0]
     image = tetopt.Image(np.zeros(SHAPE), affine)
@@ -130,7 +145,9 @@ def test_same_grid_is_taken_as_it_is():
     np.testing.assert_array_equal(resample_contrast(near, image, "c").affine, affine)
     far = tetopt.Image(data, affine @ _translation(2e-3, 0, 0))
     assert 1e-4 < np.abs(resample_contrast(far, image, "c").data - data).max() < 2e-2
-    shape_only = tetopt.Image(np.arange(1, 1 + np.prod(SHAPE)).reshape(SHAPE), affine @ _translation(0, 2, 0))
+    shape_only = tetopt.Image(
+        np.arange(1, 1 + np.prod(SHAPE)).reshape(SHAPE), affine @ _translation(0, 2, 0)
+    )
     moved = resample_labels(shape_only, image, "l").data
     np.testing.assert_array_equal(moved[:, 2:], shape_only.data[:, :-2])
     np.testing.assert_array_equal(moved[:, :2], 0)
@@ -139,11 +156,15 @@ def test_same_grid_is_taken_as_it_is():
 @pytest.mark.parametrize("spacing", [1.0, 0.1, 0.7])
 @pytest.mark.parametrize("sign", [1, -1])
 def test_grid_shifted_by_half_a_voxel(spacing, sign):
-    """Every centre lies halfway between two voxels: all take the upper one, and the box is half open."""
+    """Every centre lies halfway between two voxels: all take the upper one, and the box is half
+    open.
+    """
     affine = np.diag([spacing] * 3 + [1.0])
     affine[:3, 3] = 17.3
     image = tetopt.Image(np.zeros((40, 3, 3)), affine)
-    labels = tetopt.Image(np.arange(1, 361).reshape(40, 3, 3), affine @ _translation(-0.5 * sign, 0, 0))
+    labels = tetopt.Image(
+        np.arange(1, 361).reshape(40, 3, 3), affine @ _translation(-0.5 * sign, 0, 0)
+    )
     aligned = resample_labels(labels, image, "l").data
     if sign > 0:  # index i + 1/2: the upper is i + 1, the last is on the upper face, outside
         np.testing.assert_array_equal(aligned[:-1], labels.data[1:])
@@ -159,7 +180,9 @@ def test_cropped_and_finer_masks():
     expected[1:3, 2:5, 5] = 1
     aligned = resample_mask(crop, image, "m").data
     np.testing.assert_array_equal(aligned, expected)
-    fine = tetopt.Image(expected.repeat(3, 0).repeat(3, 1).repeat(3, 2), np.diag([2 / 3] * 3 + [1.0]))
+    fine = tetopt.Image(
+        expected.repeat(3, 0).repeat(3, 1).repeat(3, 2), np.diag([2 / 3] * 3 + [1.0])
+    )
     fine = tetopt.Image(fine.data, fine.affine @ _translation(-1, -1, -1))
     np.testing.assert_array_equal(resample_mask(fine, image, "m").data, expected)
 
@@ -172,11 +195,15 @@ def test_two_dimensions():
     expected = nearest_twin(other, image)
     assert 0 < (expected == 0).sum() < expected.size
     np.testing.assert_array_equal(resample_labels(other, image, "l").data, expected)
-    np.testing.assert_allclose(resample_contrast(other, image, "c").data, linear_twin(other, image), atol=1e-6)
+    np.testing.assert_allclose(
+        resample_contrast(other, image, "c").data, linear_twin(other, image), atol=1e-6
+    )
 
 
 def test_labels_without_a_voxel_in_the_image_or_mask_are_named(recwarn):
-    """The largest first; neither 0 nor what the image's voxels keep in part, nor a label lost between larger ones."""
+    """The largest first; neither 0 nor what the image's voxels keep in part, nor a label lost
+    between larger ones.
+    """
     labels = np.zeros((20, 12))
     labels[:12, :6], labels[10:, 9:] = 3.0, 50.0
     labels[14:, :8] = np.arange(48).reshape(6, 8) // 8 + 20.0
@@ -191,7 +218,8 @@ def test_labels_without_a_voxel_in_the_image_or_mask_are_named(recwarn):
     sizes = ", ".join(f"{label} (8 voxels)" for label in (20, 22, 23, 24, 25))
     assert [str(each.message) for each in recwarn] == [
         f"l: labels without a voxel in the image: {sizes} and 1 more",
-        f"labels without a voxel in the mask: {sizes.removeprefix('20 (8 voxels), ')}, 21 (7 voxels)",
+        f"labels without a voxel in the mask: {sizes.removeprefix('20 (8 voxels), ')}, 21 (7 "
+        "voxels)",
     ]
 
 
@@ -233,7 +261,8 @@ def test_masks_that_are_none():
         return message(resample_mask, "m.nii", tetopt.Image(data, affine), image)
 
     assert message(resample_mask, "m.nii", tetopt.Image(np.ones((4, 3))), image) == (
-        "m.nii: expected 3 axes like the image's (4, 3, 2), got shape (4, 3); select one volume or slice"
+        "m.nii: expected 3 axes like the image's (4, 3, 2), got shape (4, 3); select one volume "
+        "or slice"
     )
     labels = np.arange(24).reshape(4, 3, 2)
     what = "m.nii: expected a mask (0 and one other value, or fractions from 0 to 1), got "
@@ -247,7 +276,8 @@ def test_masks_that_are_none():
     assert said(labels / 64) == empty + "fractions up to 0.359375"
     away = image.affine @ _translation(10, 0, 0)
     assert said(labels % 2, away) == (
-        "m.nii: the mask lies outside the image's box; it spans 19.0..27.0 x -0.5..2.5 x -0.5..1.5 mm, the "
+        "m.nii: the mask lies outside the image's box; it spans 19.0..27.0 x -0.5..2.5 x "
+        "-0.5..1.5 mm, the "
         "image -1.0..7.0 x -0.5..2.5 x -0.5..1.5 mm: do both use the same world coordinates?"
     )
     # The boxes overlap, but only where the mask is 0, or a fraction under the half.
@@ -264,25 +294,35 @@ def test_labels_that_are_none():
 
     labels = np.arange(24).reshape(4, 3, 2)
     assert said(labels[0]) == (
-        "l.nrrd: expected 3 axes like the image's (4, 3, 2), got shape (3, 2); select one volume or slice"
+        "l.nrrd: expected 3 axes like the image's (4, 3, 2), got shape (3, 2); select one volume "
+        "or slice"
     )
     for bad, value in ((labels + 0.5, "0.5"), (labels - 1, "-1"), (labels + 2**31, "2147483648")):
         assert re.match(
-            rf"l\.nrrd: labels must be whole numbers from 0 to 2147483647; .* the first {value} at", said(bad)
+            rf"l\.nrrd: labels must be whole numbers from 0 to 2147483647; .* the first {value} at",
+            said(bad),
         )
-    assert said(labels * 0) == "l.nrrd: expected labels above 0, got 0 in every voxel; is it the right file?"
+    assert (
+        said(labels * 0)
+        == "l.nrrd: expected labels above 0, got 0 in every voxel; is it the right file?"
+    )
     assert said(labels, _translation(0, 3, 0)) == (
-        "l.nrrd: no label above 0 lies in the image's box; it spans -0.5..3.5 x 2.5..5.5 x -0.5..1.5 mm, the image "
+        "l.nrrd: no label above 0 lies in the image's box; it spans -0.5..3.5 x 2.5..5.5 x "
+        "-0.5..1.5 mm, the image "
         "-0.5..3.5 x -0.5..2.5 x -0.5..1.5 mm: do both use the same world coordinates?"
     )
 
 
 def test_label_files_of_floats():
     labels = tetopt.Image(np.array([[0.0, 32_767.0], [2.0, 1.0]], dtype=np.float64))
-    np.testing.assert_array_equal(resample_labels(labels, tetopt.Image(np.zeros((2, 2))), "l").data, labels.data)
+    np.testing.assert_array_equal(
+        resample_labels(labels, tetopt.Image(np.zeros((2, 2))), "l").data, labels.data
+    )
     # One value in its own box, but a box smaller than the image: label and background.
     crop = tetopt.Image([[4.0]])
-    np.testing.assert_array_equal(resample_labels(crop, tetopt.Image(np.zeros((1, 2))), "l").data, [[4, 0]])
+    np.testing.assert_array_equal(
+        resample_labels(crop, tetopt.Image(np.zeros((1, 2))), "l").data, [[4, 0]]
+    )
 
 
 def test_a_contrast_covers_half_of_the_image():
@@ -291,11 +331,14 @@ def test_a_contrast_covers_half_of_the_image():
     aligned = resample_contrast(tetopt.Image(other, _translation(2, 0, 0)), image, "t2").data
     np.testing.assert_array_equal(aligned, other[[0, 0, 0, 1]])  # the border goes on
     assert message(resample_contrast, "t2", tetopt.Image(other, _translation(3, 0, 0)), image) == (
-        "t2: expected it to cover at least half of the image's voxels, got 25.0 %; it spans 2.5..6.5 x -0.5..2.5 x "
-        "-0.5..1.5 mm, the image -0.5..3.5 x -0.5..2.5 x -0.5..1.5 mm: do both use the same world coordinates?"
+        "t2: expected it to cover at least half of the image's voxels, got 25.0 %; it spans "
+        "2.5..6.5 x -0.5..2.5 x "
+        "-0.5..1.5 mm, the image -0.5..3.5 x -0.5..2.5 x -0.5..1.5 mm: do both use the same "
+        "world coordinates?"
     )
     assert message(resample_contrast, "t2", tetopt.Image(other[0]), image) == (
-        "t2: expected 3 axes like the image's (4, 3, 2), got shape (3, 2); select one volume or slice"
+        "t2: expected 3 axes like the image's (4, 3, 2), got shape (3, 2); select one volume or "
+        "slice"
     )
 
 
@@ -306,7 +349,9 @@ def ball(shape, radius, centre=None):
 
 @pytest.mark.parametrize("shape", [(30, 32), (30, 32, 28)])
 def test_foreground_by_hand(shape):
-    """A ball with a dark cavity, a speck dropped, a piece kept, and a dark pocket cut by the box kept inside."""
+    """A ball with a dark cavity, a speck dropped, a piece kept, and a dark pocket cut by the box
+    kept inside.
+    """
     n = len(shape)
     body = ball(shape, 10)
     piece, speck = ball(shape, 3, [5] * n), np.zeros(shape, dtype=bool)
@@ -326,7 +371,9 @@ def test_foreground_by_hand(shape):
     middle = tuple((s - 1) // 2 for s in shape)
     channel[(slice(0, middle[0]), *middle[1:])] = 3.0
     leaking = foreground_mask(tetopt.Image(channel), 3.0).data
-    np.testing.assert_array_equal(leaking, (body | piece) & ~ball(shape, 4) & (channel > 3.0) | pocket)
+    np.testing.assert_array_equal(
+        leaking, (body | piece) & ~ball(shape, 4) & (channel > 3.0) | pocket
+    )
     assert leaking[middle] == 0
     diagonal = tetopt.Image([[9.0, 9, 9, 9], [9, 9, 9, 9], [9, 9, 1, 9], [9, 9, 9, 1]])
     np.testing.assert_array_equal(foreground_mask(diagonal, 1.0).data == 0, np.diag([0, 0, 0, 1]))
@@ -334,7 +381,9 @@ def test_foreground_by_hand(shape):
 
 @pytest.mark.parametrize("air", [-1000.0, 0.0, 20.0])
 def test_level_of_noisy_air(air):
-    """Median and 4 sigma of the air, though body and faint rods lie on the faces; the outline is the body's."""
+    """Median and 4 sigma of the air, though body and faint rods lie on the faces; the outline is
+    the body's.
+    """
     shape = (40, 40, 20)
     rng = np.random.default_rng(5)
     body = np.broadcast_to(ball(shape[:2], 14)[:, :, None], shape)
@@ -357,7 +406,10 @@ def test_background_of_one_value_is_exact():
 
 def test_images_without_background():
     rng = np.random.default_rng(7)
-    auto, todo = r"^`background` auto: no background found, as ", "; give a value or omit `background`$"
+    auto, todo = (
+        r"^`background` auto: no background found, as ",
+        "; give a value or omit `background`$",
+    )
     for image, words in (
         (
             rng.normal(100.0, 20.0, (20, 20, 20)),
@@ -368,22 +420,34 @@ def test_images_without_background():
             np.where(ball((20, 20), 5), np.nextafter(1.0, 2.0), 1.0),
             "classes: expected intensities that 256 bins can separate",
         ),
-        (np.where(ball((20, 20), 5), 0.0, 9.0), r"no voxel on the faces of the box is dark \(4.5 or less\)"),
-        (np.where(np.arange(8000).reshape(20, 20, 20) == 0, 0.0, 9.0), r"99\.99 % of the voxels would be foreground"),
-        (np.where(np.arange(8000).reshape(20, 20, 20) == 3790, 9.0, 0.0), r"0\.0125 % of the voxels would be foreg"),
+        (
+            np.where(ball((20, 20), 5), 0.0, 9.0),
+            r"no voxel on the faces of the box is dark \(4.5 or less\)",
+        ),
+        (
+            np.where(np.arange(8000).reshape(20, 20, 20) == 0, 0.0, 9.0),
+            r"99\.99 % of the voxels would be foreground",
+        ),
+        (
+            np.where(np.arange(8000).reshape(20, 20, 20) == 3790, 9.0, 0.0),
+            r"0\.0125 % of the voxels would be foreg",
+        ),
     ):
         assert re.search(auto + words + ".*" + todo, message(foreground_mask, tetopt.Image(image)))
 
 
 def test_levels_that_leave_nothing():
     image = tetopt.Image(np.where(ball((20, 20), 5), 90.0, 10.0))
-    todo = "; choose a level between the background's and the tissue's values (the image ranges from 10 to 90)"
+    todo = (
+        "; choose a level between the background's and the tissue's values (the image ranges "
+        "from 10 to 90)"
+    )
     assert message(foreground_mask, image, 5) == "`background` 5: every voxel is foreground" + todo
     inside = tetopt.Image(image.data > 50.0, image.affine)
     words = message(foreground_mask, image, 5, inside)
     assert (
-        words
-        == f"`background` 5: every voxel is foreground{todo}; or give the labels' file as `mask`, with `mask_label`"
+        words == f"`background` 5: every voxel is foreground{todo}; or give the labels' file as "
+        "`mask`, with `mask_label`"
     )
     assert message(foreground_mask, image, 90) == "`background` 90: no voxel is foreground" + todo
     # A level given is taken at its word, however little it leaves.
@@ -393,7 +457,9 @@ def test_levels_that_leave_nothing():
 
 
 def test_foreground_of_labels_by_hand():
-    """A detached label of one voxel stays; a pocket at the side goes, however small; a cavity stays."""
+    """A detached label of one voxel stays; a pocket at the side goes, however small; a cavity
+    stays.
+    """
     labels = np.zeros((30, 32, 28))
     labels[ball(labels.shape, 10)] = 1.0
     labels[ball(labels.shape, 4)] = 0.0
@@ -417,12 +483,16 @@ def test_a_large_bright_piece_is_not_removed_silently():
     """5 of radius against 25: 515 voxels of 65,000, as a gland beside a body."""
     data = np.where(ball((60, 60, 60), 24, (26, 30, 30)), 1.0, 0.0)
     data[ball(data.shape, 5, (54, 6, 6))] = 1.0
-    with pytest.warns(UserWarning, match=r"bright ones are removed: 1, 515 mm3 in all, the largest 515 mm3"):
+    with pytest.warns(
+        UserWarning, match=r"bright ones are removed: 1, 515 mm3 in all, the largest 515 mm3"
+    ):
         assert foreground_mask(tetopt.Image(data), 0.0).data[54, 6, 6] == 0
 
 
 def shell(n, spacing, shift=0.0):
-    """A ball of 3 in a closed shell of 0.7 mm, 2, in a ball of 1, on n^3 voxels around the origin."""
+    """A ball of 3 in a closed shell of 0.7 mm, 2, in a ball of 1, on n^3 voxels around the
+    origin.
+    """
     affine = np.diag([spacing] * 3 + [1.0])
     affine[:3, 3] = -0.5 * spacing * (n - 1) + shift
     labels = tetopt.Image(np.zeros((n,) * 3), affine)
@@ -433,16 +503,25 @@ def shell(n, spacing, shift=0.0):
 @pytest.mark.parametrize("shift", [0.0, 0.25, 0.1])
 def test_voxels_divided_to_the_size_of_labels_keep_all_of_them(shift):
     """The shell stays closed: what it encloses is apart from what is around it, voxel by voxel."""
-    labels, image = shell(40, 0.5, shift), tetopt.Image(np.zeros((10,) * 3), np.diag([2.0, 2.0, 2.0, 1.0]))
+    labels, image = (
+        shell(40, 0.5, shift),
+        tetopt.Image(np.zeros((10,) * 3), np.diag([2.0, 2.0, 2.0, 1.0])),
+    )
     image = tetopt.Image(image.data, image.affine @ _translation(-4.5, -4.5, -4.5))
     assert divisions(image, [labels]) == (4, 4, 4)
     moved = resample_labels(labels, divided(image, (4, 4, 4)), "l")
     for label in (0, 1, 2, 3):
         counts = [scipy.ndimage.label(each.data == label)[1] for each in (labels, moved)]
         assert counts == [1, 1]
-    n_lost = [np.count_nonzero(moved.data == label) / np.count_nonzero(labels.data == label) for label in (1, 2, 3)]
+    n_lost = [
+        np.count_nonzero(moved.data == label) / np.count_nonzero(labels.data == label)
+        for label in (1, 2, 3)
+    ]
     np.testing.assert_allclose(n_lost, 1.0)
-    with pytest.warns(UserWarning, match=r"0.5 x 0.5 x 0.5 mm to 2 x 2 x 2 mm; label \d (loses \d+%|falls into \d+ p)"):
+    with pytest.warns(
+        UserWarning,
+        match=r"0.5 x 0.5 x 0.5 mm to 2 x 2 x 2 mm; label \d (loses \d+%|falls into \d+ p)",
+    ):
         resample_labels(labels, image, "l")
 
 
@@ -458,18 +537,26 @@ def test_voxels_are_divided_only_where_others_are_finer():
     assert parts.volume == pytest.approx(image.volume)
     for place in ((0, 0, 0), (3, 4, 5), (1, 2, 3)):
         i, j, k = place
-        np.testing.assert_array_equal(parts.data[i, 2 * j : 2 * j + 2, 5 * k : 5 * k + 5], data[place])
+        np.testing.assert_array_equal(
+            parts.data[i, 2 * j : 2 * j + 2, 5 * k : 5 * k + 5], data[place]
+        )
     np.testing.assert_allclose(parts.to_world([1, 4.5, 17.0]), image.to_world([1, 2, 3]))
 
 
 def test_values_near_whole_numbers_are_rounded():
     image = tetopt.Image(np.zeros((4, 3, 2)))
     labels = np.arange(24).reshape(4, 3, 2) % 5
-    with pytest.warns(UserWarning, match=r"l: 19 voxels were rounded to whole numbers \(by up to 0.00061\)"):
+    with pytest.warns(
+        UserWarning, match=r"l: 19 voxels were rounded to whole numbers \(by up to 0.00061\)"
+    ):
         moved = resample_labels(tetopt.Image(labels * 1.000152), image, "l")
     np.testing.assert_array_equal(moved.data, labels)
-    assert "the first 0.002 at (0, 0, 0)" in message(resample_labels, "l", tetopt.Image(labels + 0.002), image)
-    assert resample_labels(tetopt.Image(labels * (2**31 - 1) // 4), image, "l").data.max() == 2**31 - 1
+    assert "the first 0.002 at (0, 0, 0)" in message(
+        resample_labels, "l", tetopt.Image(labels + 0.002), image
+    )
+    assert (
+        resample_labels(tetopt.Image(labels * (2**31 - 1) // 4), image, "l").data.max() == 2**31 - 1
+    )
 
 
 @pytest.mark.parametrize("levels", [None, 32, 100])

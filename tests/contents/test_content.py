@@ -12,7 +12,9 @@ from tetopt.start.sums import channels_of
 def contrasts(shape=(12, 13, 14)):
     """Three of different scales: two of noise, one of blocks."""
     rng = np.random.default_rng(0)
-    blocks = np.kron(rng.integers(0, 5, (3, 4, 4)), np.ones((4, 4, 4)))[: shape[0], : shape[1], : shape[2]]
+    blocks = np.kron(rng.integers(0, 5, (3, 4, 4)), np.ones((4, 4, 4)))[
+        : shape[0], : shape[1], : shape[2]
+    ]
     return [
         tetopt.Image(1000.0 + 300.0 * rng.normal(size=shape)),
         tetopt.Image(1e-3 * rng.normal(size=shape)),
@@ -26,7 +28,9 @@ def test_an_image_alone_is_itself():
         assert target.is_plain
         assert target.image is image
         assert np.shares_memory(target.channel(0), image.data)
-        assert target.variance == pytest.approx(float(np.var(image.data, dtype=np.float64)), rel=1e-12)
+        assert target.variance == pytest.approx(
+            float(np.var(image.data, dtype=np.float64)), rel=1e-12
+        )
         assert (target.n_voxels, target.volume) == (image.data.size, image.volume)
 
 
@@ -77,9 +81,9 @@ def test_labels_are_one_hot():
         assert (rows == rows[:, :1]).all()  # the same everywhere
         assert np.count_nonzero(rows[:, 0]) == 1  # in one channel
         codes[int(label)] = rows[:, 0]
-    assert target.unit * sum(np.var(v, dtype=np.float64) for v in channels(target)) == pytest.approx(
-        float(np.var(labels.data, dtype=np.float64)), rel=2e-3
-    )
+    assert target.unit * sum(
+        np.var(v, dtype=np.float64) for v in channels(target)
+    ) == pytest.approx(float(np.var(labels.data, dtype=np.float64)), rel=2e-3)
     # 0 and 6 are 8 voxels apart and share a channel; those that touch have different ones.
     assert np.argmax(codes[0]) == np.argmax(codes[6])
     assert len({int(np.argmax(codes[k])) for k in (0, 3, 17)}) == 3
@@ -91,7 +95,9 @@ def test_labels_count_by_their_weight(weight):
     labels = labelled()
     target = content(labels, labels, weights=[0.0], label_weight=weight)
     variance = target.unit * sum(np.var(v, dtype=np.float64) for v in channels(target))
-    assert variance == pytest.approx(weight * float(np.var(labels.data, dtype=np.float64)), rel=2e-3)
+    assert variance == pytest.approx(
+        weight * float(np.var(labels.data, dtype=np.float64)), rel=2e-3
+    )
 
 
 def test_labels_that_touch_only_in_a_point_are_told_apart():
@@ -128,7 +134,9 @@ def test_sums_of_channels(n):
     mesh = tetopt.lattice_mesh(whole_box.image, nodes=120)
     for target in (whole_box, whole_box._replace(region=region)):
         grid_ = channel_grid(target, mesh.points)
-        sums = moment_sums(grid_, to_ticks(whole_box.image.to_index(mesh.points), grid_), mesh.cells)
+        sums = moment_sums(
+            grid_, to_ticks(whole_box.image.to_index(mesh.points), grid_), mesh.cells
+        )
         assert grid_.n_channels == 3
         owner = cell_of_voxel(whole_box.image, mesh).ravel()
         flat = channels(whole_box).reshape(3, -1).astype(float)
@@ -157,7 +165,9 @@ def test_beyond_a_mask_the_nearest_value_inside_counts():
     assert inside.sum() == mask.data.sum() == target.n_voxels
     np.testing.assert_array_equal(target.image.data[inside], image.data[part][inside])
     np.testing.assert_array_equal(target.region.inside, inside)
-    assert target.variance == pytest.approx(float(np.var(image.data[mask.data > 0], dtype=np.float64)), rel=1e-9)
+    assert target.variance == pytest.approx(
+        float(np.var(image.data[mask.data > 0], dtype=np.float64)), rel=1e-9
+    )
     assert target.volume == pytest.approx(mask.data.sum() * image.voxel_volume)
 
 
@@ -213,23 +223,44 @@ def test_float_labels_take_some_bytes_a_voxel():
     ("change", "message"),
     [
         ({"images": []}, "images: expected one or more, got none"),
-        ({"weights": [1.0]}, "weights: expected one for each of 3 images, 0 or 0.001 to 1000, got [1.0]"),
-        ({"weights": [1.0, -1.0, 1.0]}, "weights: expected one for each of 3 images, 0 or 0.001 to 1000, got"),
-        ({"weights": [0.0, 0.0, 0.0]}, "weights: every image or label that varies has weight 0; give at least one"),
-        ({"mask": tetopt.Image(np.zeros((12, 13, 14)))}, "mask: expected voxels of 0.5 or more, got none"),
+        (
+            {"weights": [1.0]},
+            "weights: expected one for each of 3 images, 0 or 0.001 to 1000, got [1.0]",
+        ),
+        (
+            {"weights": [1.0, -1.0, 1.0]},
+            "weights: expected one for each of 3 images, 0 or 0.001 to 1000, got",
+        ),
+        (
+            {"weights": [0.0, 0.0, 0.0]},
+            "weights: every image or label that varies has weight 0; give at least one",
+        ),
+        (
+            {"mask": tetopt.Image(np.zeros((12, 13, 14)))},
+            "mask: expected voxels of 0.5 or more, got none",
+        ),
         (
             {"mask": tetopt.Image(np.ones((12, 13, 15)))},
             "mask: expected shape (12, 13, 14) like the first, got (12, 13, 15)",
         ),
-        ({"images": contrasts()[0], "weights": [0.0]}, "weights: every image or label that varies has weight 0"),
+        (
+            {"images": contrasts()[0], "weights": [0.0]},
+            "weights: every image or label that varies has weight 0",
+        ),
         ({"weights": [1.0, 1e200, 1.0]}, "weights: expected one for each of 3 images"),
         (
             {"labels": tetopt.Image(np.zeros((12, 13, 14)))},
             "labels: expected labels above 0, got 0 in every voxel",
         ),
-        ({"labels": tetopt.Image(np.ones((12, 13, 14)) + 0.5)}, "labels: labels must be whole numbers from 0"),
+        (
+            {"labels": tetopt.Image(np.ones((12, 13, 14)) + 0.5)},
+            "labels: labels must be whole numbers from 0",
+        ),
         ({"label_weight": -1.0}, "label_weight: expected 0 or 0.001 to 1000, got -1.0"),
-        ({"mask": tetopt.Image(np.ones((12, 13, 14)), OBLIQUE)}, "mask: expected the same voxel grid"),
+        (
+            {"mask": tetopt.Image(np.ones((12, 13, 14)), OBLIQUE)},
+            "mask: expected the same voxel grid",
+        ),
     ],
 )
 def test_refused(change, message):
@@ -240,7 +271,10 @@ def test_refused(change, message):
 
 
 def test_noise_needs_neighbours_within_the_mask_along_all_axes():
-    data, inside = np.random.default_rng(0).normal(size=(20, 20, 20)), np.zeros((20, 20, 20), dtype=bool)
+    data, inside = (
+        np.random.default_rng(0).normal(size=(20, 20, 20)),
+        np.zeros((20, 20, 20), dtype=bool),
+    )
     inside[10] = True
     assert noise_level(data, inside) == 0.0
     inside[9:12] = True
@@ -256,10 +290,13 @@ def test_noise_of_few_slices_of_a_mask_is_noise(monkeypatch):
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_noise_is_of_planes_that_the_mask_has(monkeypatch, n):
-    """Two flat lesions between the sampled slices, one of which has a few voxels of a third without neighbours."""
+    """Two flat lesions between the sampled slices, one of which has a few voxels of a third
+    without neighbours.
+    """
     shape = (60, 24, 20)[:n]
     data, inside = np.random.default_rng(0).normal(0.0, 2.0, shape), np.zeros(shape, dtype=bool)
-    monkeypatch.setattr("tetopt.contents.noise.NOISE_VOXELS", data.size // 14)  # slices 13 apart, from 3
+    # slices 13 apart, from 3
+    monkeypatch.setattr("tetopt.contents.noise.NOISE_VOXELS", data.size // 14)
     inside[8:14] = inside[20:25] = True
     expected = pytest.approx(2.0, rel=0.3)
     assert noise_level(data, inside) == expected
@@ -274,8 +311,13 @@ def test_noise_is_of_planes_that_the_mask_has(monkeypatch, n):
 
 
 def test_both_estimates_of_the_noise_within_a_mask_are_one(monkeypatch):
-    """That of the octree is of scaled values: for whole masks, for lesions between the slices, and for one voxel."""
-    data, inside = np.random.default_rng(0).normal(0.0, 2.0, (60, 24, 20)), np.ones((60, 24, 20), dtype=bool)
+    """That of the octree is of scaled values: for whole masks, for lesions between the slices,
+    and for one voxel.
+    """
+    data, inside = (
+        np.random.default_rng(0).normal(0.0, 2.0, (60, 24, 20)),
+        np.ones((60, 24, 20), dtype=bool),
+    )
     monkeypatch.setattr("tetopt.contents.noise.NOISE_VOXELS", data.size // 14)
     for outside in (slice(0, 6), slice(15, 60), slice(6, 14), slice(14, 15)):
         masked = tetopt.content(tetopt.Image(data), mask=tetopt.Image(1.0 * inside))

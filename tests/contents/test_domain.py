@@ -12,7 +12,9 @@ from tetopt.start.clip import clipped, lattice_within, lost_fraction, onto_surfa
 
 
 def test_a_sphere_has_no_stairs():
-    """Twice as near to the true sphere as the surface halfway between voxels, and nowhere far from that."""
+    """Twice as near to the true sphere as the surface halfway between voxels, and nowhere far
+    from that.
+    """
     centre, radius = np.array([14.3, 15.1, 14.7]), 9.0
     r = np.linalg.norm(grid((30, 30, 30)) - centre, axis=-1)
     region = region_of(tetopt.Image(1.0 * (r < radius)))
@@ -43,7 +45,9 @@ def test_voxels_stay_on_their_side():
 @pytest.mark.parametrize("thickness", [2.0, 3.0, 5.0])
 @pytest.mark.parametrize("kind", ["shell", "tube", "plate"])
 def test_walls_have_the_volume_of_their_voxels(kind, thickness):
-    """Within 1 %; smoothing of each voxel by itself took 2 % from two voxels and added 4 % at three."""
+    """Within 1 %; smoothing of each voxel by itself took 2 % from two voxels and added 4 % at
+    three.
+    """
     at = grid((34, 34, 34)) - [16.7, 16.4, 16.6]
     if kind == "plate":
         off = at @ (np.array([0.3, 0.17, 1.0]) / np.linalg.norm([0.3, 0.17, 1.0]))
@@ -93,7 +97,9 @@ def test_all_inside_has_no_surface():
 def test_levels_are_linear_between_centres():
     level = np.random.default_rng(0).normal(size=(5, 6, 7)).astype(np.float32)
     at = np.random.default_rng(1).uniform(-0.5, 6.0, size=(50, 3))
-    np.testing.assert_allclose(levels(level, at), map_coordinates(level.astype(float), at.T, order=1, mode="nearest"))
+    np.testing.assert_allclose(
+        levels(level, at), map_coordinates(level.astype(float), at.T, order=1, mode="nearest")
+    )
 
 
 @pytest.mark.parametrize("n", [2, 3])
@@ -105,7 +111,8 @@ def test_the_way_onto_the_surface_is_the_shortest_in_mm(n):
     at = np.random.default_rng(0).uniform(6.0, 12.0, size=(40, n))
     there, is_there = onto_surface(at, image, Region(level < 0, level.astype(np.float32)))
     assert is_there.all()
-    # In the world the normal of the plane is the index normal by the inverse transposed; the way is along it.
+    # In the world the normal of the plane is the index normal by the inverse transposed; the way is
+    # along it.
     world = normal @ np.linalg.inv(affine[:-1, :-1])
     way = (there - at) @ affine[:-1, :-1].T
     side = way - np.outer(way @ world, world) / (world @ world)
@@ -123,7 +130,8 @@ def test_nodes_on_the_box_stay_on_it():
     on_box = (index[outer][:, :, 0] == -0.5).all(axis=1)
     level = np.abs(levels(region_of(mask).level, index))
     assert on_box.any()
-    assert level[np.unique(outer[~on_box])].max() < 0.35  # the rest lies on the surface, or as good as
+    # the rest lies on the surface, or as good as
+    assert level[np.unique(outer[~on_box])].max() < 0.35
 
 
 @pytest.mark.parametrize("kind", ["pieces", "hole", "touching"])
@@ -140,7 +148,9 @@ def test_clipped(kind):
 
 
 def test_a_wall_as_thick_as_its_cells_is_whole():
-    """Inside a thin wall the level is flat, so that its values alone would put nodes in the middle on the surface."""
+    """Inside a thin wall the level is flat, so that its values alone would put nodes in the
+    middle on the surface.
+    """
     mask = np.abs(distance((34, 34, 34), 16.7, 16.4, 16.6) - 11.0) < 1.5
     image = tetopt.Image(1.0 * mask)
     mesh = lattice_within(image, region_of(image), spacing=3.0)
@@ -150,7 +160,8 @@ def test_a_wall_as_thick_as_its_cells_is_whole():
 @pytest.mark.parametrize(("shape", "spacing"), [((44, 22, 22), 4.0), ((44, 22), 6.0)])
 def test_what_flat_facets_cut_off_is_not_lost(shape, spacing):
     """Of two balls, neither is lost in a coarse mesh; without the cells of one, half is."""
-    middle, affine = [10.6] * (len(shape) - 1), np.diag([-2.0, 1.0, 1.0, 1.0][-len(shape) - 1 :])  # mirrored in 3-D
+    # mirrored in 3-D
+    middle, affine = [10.6] * (len(shape) - 1), np.diag([-2.0, 1.0, 1.0, 1.0][-len(shape) - 1 :])
     inside = np.minimum(distance(shape, 10.6, *middle), distance(shape, 32.6, *middle)) < 8.0
     image = tetopt.Image(1.0 * inside, affine)
     region = region_of(image)
@@ -158,11 +169,15 @@ def test_what_flat_facets_cut_off_is_not_lost(shape, spacing):
     assert mesh.cell_volumes.sum() < 0.97 * inside.sum() * image.voxel_volume
     assert abs(lost_fraction(mesh, image, region)) < 0.01
     one = mesh.cells[image.to_index(mesh.points)[mesh.cells].mean(axis=1)[:, 0] < 22.0]
-    assert lost_fraction(tetopt.Mesh(mesh.points, one), image, region) == pytest.approx(0.5, abs=0.01)
+    assert lost_fraction(tetopt.Mesh(mesh.points, one), image, region) == pytest.approx(
+        0.5, abs=0.01
+    )
 
 
 def test_bridged_gaps_do_not_make_up_for_what_is_lost():
-    """A block whose slots of one voxel are filled has as much too much as the slab beside it has voxels."""
+    """A block whose slots of one voxel are filled has as much too much as the slab beside it has
+    voxels.
+    """
     inside = np.zeros((40, 20, 20))
     inside[:20] = inside[30:35] = 1.0
     inside[1:20:4] = 0.0
@@ -177,7 +192,9 @@ def test_bridged_gaps_do_not_make_up_for_what_is_lost():
 def test_wanted_nodes_within_a_mask():
     image, mask = shaped("ball")
     for nodes in (200, 600, 1500):
-        assert len(lattice_within(image, region_of(mask), nodes=nodes).points) == pytest.approx(nodes, rel=0.1)
+        assert len(lattice_within(image, region_of(mask), nodes=nodes).points) == pytest.approx(
+            nodes, rel=0.1
+        )
 
 
 def test_too_thin_for_its_cells():
@@ -187,7 +204,8 @@ def test_too_thin_for_its_cells():
     mesh = tetopt.lattice_mesh(image, blocks=(1, 1, 1))
     moved = tetopt.Mesh(mesh.points + np.where(mesh.points == 14.5, 3.0, 0.0), mesh.cells)
     with pytest.raises(
-        tetopt.InputError, match="thinner than the cells, so no cell is left inside; increase the number"
+        tetopt.InputError,
+        match="thinner than the cells, so no cell is left inside; increase the number",
     ):
         clipped(moved, image, region_of(image))
 
@@ -197,4 +215,6 @@ def test_voxels_in_cubes_of_two_are_scipys(shape):
     rng = np.random.default_rng(0)
     for fraction in (0.7, 0.9, 0.97):
         inside = rng.random(shape) < fraction
-        np.testing.assert_array_equal(_opened(inside), binary_opening(inside, np.ones((2,) * len(shape))))
+        np.testing.assert_array_equal(
+            _opened(inside), binary_opening(inside, np.ones((2,) * len(shape)))
+        )

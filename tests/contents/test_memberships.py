@@ -7,7 +7,14 @@ from scipy.ndimage import label as components
 from shapes import OBLIQUE, distance, grid
 
 import tetopt
-from tetopt.contents.memberships import finer, finer_affine, labels_at, memberships, numbered, supersampling
+from tetopt.contents.memberships import (
+    finer,
+    finer_affine,
+    labels_at,
+    memberships,
+    numbered,
+    supersampling,
+)
 from tetopt.contents.smoothing import FARTHEST_DISTANCE, raw_level
 
 
@@ -32,7 +39,9 @@ def directions(n=3000):
 
 
 def bumpy(points):
-    """Labels of an organ with bumps and a sphere in it, at points (..., 3), mm; and the distance to the sphere."""
+    """Labels of an organ with bumps and a sphere in it, at points (..., 3), mm; and the distance
+    to the sphere.
+    """
     r = np.linalg.norm(points, axis=-1) + 1e-9
     x, y, z = np.moveaxis(points / r[..., None], -1, 0)
     outer = 28.0 + 7.5 * (4.0 * x * y * (x * x - y * y)) + 6.0 * (x * x - y * y) * z
@@ -58,7 +67,9 @@ def test_every_voxel_keeps_its_label():
         members = memberships(tetopt.Image(labels))
         np.testing.assert_array_equal(members.labels, [0, 3, 4, 90])
         np.testing.assert_array_equal(members.labels[members.partition], labels)
-        np.testing.assert_array_equal(members.levels.argmin(axis=0), members.channel[members.partition])
+        np.testing.assert_array_equal(
+            members.levels.argmin(axis=0), members.channel[members.partition]
+        )
 
 
 @pytest.mark.parametrize("n_labels", [180, 181])
@@ -76,7 +87,9 @@ def test_a_level_as_by_its_plain_twin(shape):
     inside = at[..., 0] < 9.3 + 0.2 * at[..., 1]
     inside[14, 2], inside[3, 1] = True, False
     members = memberships(tetopt.Image(1.0 * inside))
-    np.testing.assert_allclose(members.levels[members.channel[1]], naive.smooth_level(inside), atol=2e-5)
+    np.testing.assert_allclose(
+        members.levels[members.channel[1]], naive.smooth_level(inside), atol=2e-5
+    )
 
 
 @pytest.mark.parametrize("shape", [(19, 5, 4), (22, 9), (3, 40, 2), (1, 7, 30)])
@@ -85,14 +98,19 @@ def test_distances_are_scipys_to_the_last_bit(shape):
     for fraction in (0.5, 0.97, 0.995):
         inside = rng.random(shape) < fraction
         inside.flat[3] = False
-        near, far = (np.minimum(distance_transform_edt(side), FARTHEST_DISTANCE) for side in (inside, ~inside))
+        near, far = (
+            np.minimum(distance_transform_edt(side), FARTHEST_DISTANCE)
+            for side in (inside, ~inside)
+        )
         twin = np.where(inside, 0.5 - near.astype(np.float32), far.astype(np.float32) - 0.5)
         assert raw_level(inside).tobytes() == twin.tobytes()
 
 
 @pytest.mark.parametrize("radius", [3.0, 6.0, 9.0, 14.0])
 def test_a_sphere_has_no_stairs(radius):
-    """A tenth of a voxel off at most places, and neither grown nor shrunk; halfway between voxels it is 0.25."""
+    """A tenth of a voxel off at most places, and neither grown nor shrunk; halfway between
+    voxels it is 0.25.
+    """
     centre, way = np.array([21.3, 22.1, 21.7]), directions()
     labels = np.where(distance((44, 44, 44), *centre) < radius, 7.0, 2.0)
     level = between(memberships(tetopt.Image(labels)), 7, 2)
@@ -109,7 +127,10 @@ def test_a_shell_keeps_its_thickness(thickness):
     centre, way = np.array([19.3, 20.1, 19.7]), directions()
     r = distance((40, 40, 40), *centre)
     level = between(memberships(tetopt.Image(1.0 * ((r < 14.0) & (r > 14.0 - thickness)))), 1, 0)
-    middle, steps = centre + (14.0 - 0.5 * thickness) * way, np.linspace(0.0, 0.5 * thickness + 0.95, 200)
+    middle, steps = (
+        centre + (14.0 - 0.5 * thickness) * way,
+        np.linspace(0.0, 0.5 * thickness + 0.95, 200),
+    )
     across = crossings(level, middle, way, steps) + crossings(level, middle, -way, steps)
     assert across.mean() == pytest.approx(thickness, abs=0.12)
     assert np.quantile(across, 0.05) > thickness - 0.4
@@ -125,23 +146,33 @@ def test_nothing_is_lost():
 
 
 def test_an_interface_of_two_labels_is_that_of_each():
-    """Inside a ball cut by a plane: a sphere outside, and the plane where they meet, without a gap between them."""
+    """Inside a ball cut by a plane: a sphere outside, and the plane where they meet, without a
+    gap between them.
+    """
     centre, normal = np.array([19.6, 20.2, 19.8]), np.array([0.31, 0.42, 0.85])
     normal /= np.linalg.norm(normal)
     at = grid((40, 40, 40)) - centre
-    labels = np.where(np.linalg.norm(at, axis=-1) < 15.0, np.where(at @ normal < 0.0, 1.0, 2.0), 0.0)
+    labels = np.where(
+        np.linalg.norm(at, axis=-1) < 15.0, np.where(at @ normal < 0.0, 1.0, 2.0), 0.0
+    )
     members = memberships(tetopt.Image(labels))
     side = np.linalg.svd(normal[None])[2][1:]
     start = centre + np.random.default_rng(0).uniform(-8.0, 8.0, size=(2000, 2)) @ side
-    off = crossings(between(members, 1, 2), start, np.tile(normal, (2000, 1)), np.linspace(-0.95, 0.95, 191))
+    off = crossings(
+        between(members, 1, 2), start, np.tile(normal, (2000, 1)), np.linspace(-0.95, 0.95, 191)
+    )
     assert np.abs(off).mean() < 0.08
     assert np.abs(off).max() < 0.3
-    others = map_coordinates(members.levels[members.channel[0]], (start + off[:, None] * normal).T, order=1)
+    others = map_coordinates(
+        members.levels[members.channel[0]], (start + off[:, None] * normal).T, order=1
+    )
     assert others.min() > 1.0  # the background does not come between them
     way = directions()
     way = way[np.abs(way @ normal) > 0.3]
     for label, part in ((1, way[way @ normal < 0.0]), (2, way[way @ normal > 0.0])):
-        off = crossings(between(members, label, 0), centre + 15.0 * part, part, np.linspace(-0.95, 0.95, 191))
+        off = crossings(
+            between(members, label, 0), centre + 15.0 * part, part, np.linspace(-0.95, 0.95, 191)
+        )
         assert np.abs(off).mean() < 0.08
 
 
@@ -164,7 +195,9 @@ def test_finer_voxels_fill_the_same_box(factors):
 
 
 @pytest.mark.full
-@pytest.mark.parametrize(("spacing", "shape"), [((0.9, 0.9, 5.0), (80, 80, 16)), ((0.9, 5.0, 0.9), (80, 16, 80))])
+@pytest.mark.parametrize(
+    ("spacing", "shape"), [((0.9, 0.9, 5.0), (80, 80, 16)), ((0.9, 5.0, 0.9), (80, 16, 80))]
+)
 def test_thick_slices_do_not_show(spacing, shape):
     image = voxelised(spacing, shape)
     factors = supersampling(image.spacing)
@@ -179,7 +212,9 @@ def test_thick_slices_do_not_show(spacing, shape):
         nearest = np.repeat(nearest, factor, axis)
     for value in (3, 8):
         assert dice(labels == value, true == value) > 0.97
-        assert 1.0 - dice(labels == value, true == value) < 0.35 * (1.0 - dice(nearest == value, true == value))
+        assert 1.0 - dice(labels == value, true == value) < 0.35 * (
+            1.0 - dice(nearest == value, true == value)
+        )
         assert (labels == value).sum() == pytest.approx((nearest == value).sum(), rel=0.02)
         assert components(labels == value)[1] == 1
     beside = (np.abs(between(members, 8, 3)) < 0.5) & (members.levels[members.channel[1]] < 1.0)
@@ -187,7 +222,9 @@ def test_thick_slices_do_not_show(spacing, shape):
 
 
 def test_a_piece_that_ends_between_slices_is_rounded():
-    """A disc on one slice of five voxels keeps its height and nearly its volume, and its rims are round."""
+    """A disc on one slice of five voxels keeps its height and nearly its volume, and its rims
+    are round.
+    """
     labels = np.zeros((30, 30, 5))
     labels[..., 2] = distance((30, 30), 14.6, 14.2) < 10.0
     members = memberships(tetopt.Image(labels, np.diag([1.0, 1.0, 5.0, 1.0])), (1, 1, 5))
@@ -204,8 +241,12 @@ def test_a_piece_that_ends_between_slices_is_rounded():
 def test_labels_get_no_pieces_between_slices():
     """What two slices have in common stays between them, and nothing is there that no slice has."""
     rng = np.random.default_rng(2)
-    labels = np.stack([gaussian_filter(rng.normal(size=(40, 40, 9)), (2.0, 2.0, 0.4)) for _ in range(6)]).argmax(axis=0)
-    partition = memberships(tetopt.Image(labels, np.diag([1.0, 1.0, 5.0, 1.0])), (1, 1, 5)).partition
+    labels = np.stack(
+        [gaussian_filter(rng.normal(size=(40, 40, 9)), (2.0, 2.0, 0.4)) for _ in range(6)]
+    ).argmax(axis=0)
+    partition = memberships(
+        tetopt.Image(labels, np.diag([1.0, 1.0, 5.0, 1.0])), (1, 1, 5)
+    ).partition
     for k in range(8):
         same = labels[..., k] == labels[..., k + 1]
         for fine in range(5 * k + 2, 5 * k + 8):
@@ -233,12 +274,17 @@ def test_labels_must_be_whole_numbers():
 
 
 def test_a_rod_of_one_voxel_between_two_labels_keeps_its_volume():
-    """Each of its neighbours' levels is right for its neighbour alone, and together they leave less for the rod."""
+    """Each of its neighbours' levels is right for its neighbour alone, and together they leave
+    less for the rod.
+    """
     i, j, k = np.indices((24, 24, 24))
     labels = np.where(i + j < 23, 1, 2)
-    labels[(i + j >= 22) & (i + j <= 23) & (abs(i - j - k + 12) <= 2)] = 3  # diagonal, where the two others meet
+    # diagonal, where the two others meet
+    labels[(i + j >= 22) & (i + j <= 23) & (abs(i - j - k + 12) <= 2)] = 3
     members = memberships(tetopt.Image(labels.astype(float), np.eye(4)))
-    place = np.stack(np.meshgrid(*3 * [np.arange(-0.375, 23.5, 0.25)], indexing="ij"), axis=-1).reshape(-1, 3)
+    place = np.stack(
+        np.meshgrid(*3 * [np.arange(-0.375, 23.5, 0.25)], indexing="ij"), axis=-1
+    ).reshape(-1, 3)
     cells = np.repeat(np.arange(len(place))[:, None], 4, axis=1)
     row = labels_at(members, place, cells, np.eye(1, 4))
     assert (members.labels[members.partition] == labels).all()

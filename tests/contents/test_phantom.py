@@ -8,7 +8,13 @@ import pytest
 from scipy.special import ndtr
 
 import tetopt.contents.phantom
-from tetopt.contents.phantom import Shape, load_phantom, phantom_folder, phantom_names, signed_distance
+from tetopt.contents.phantom import (
+    Shape,
+    load_phantom,
+    phantom_folder,
+    phantom_names,
+    signed_distance,
+)
 from tetopt.errors import InputError
 
 HEAD_2D = """
@@ -54,11 +60,15 @@ def made(tmp_path):
 def shape_text(kind, **values):
     """One [[shape]] table of intensity 50 and label 1."""
     lines = {"intensity": 50, "label": 1, **values}
-    return f'\n[[shape]]\nkind = "{kind}"\n' + "".join(f"{key} = {value}\n" for key, value in lines.items())
+    return f'\n[[shape]]\nkind = "{kind}"\n' + "".join(
+        f"{key} = {value}\n" for key, value in lines.items()
+    )
 
 
 def rotation(degrees):
-    """The rotation matrix by hand: one angle in the plane, or about the fixed axes x, then y, then z."""
+    """The rotation matrix by hand: one angle in the plane, or about the fixed axes x, then y,
+    then z.
+    """
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     if np.ndim(degrees) == 0:
         return np.array([[c, -s], [s, c]])
@@ -95,7 +105,11 @@ def random_shape(kind, n, rng, made):
         along -= (along @ normal)[:, None] * normal
         surface, normals = along + (offset + side * thickness / 2) * normal, side * normal
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    return made((HEAD_2D if n == 2 else HEAD_3D) + shape_text(kind, **values)).shapes[0], surface, normals
+    return (
+        made((HEAD_2D if n == 2 else HEAD_3D) + shape_text(kind, **values)).shapes[0],
+        surface,
+        normals,
+    )
 
 
 # --- the exact h(x)
@@ -108,14 +122,26 @@ def test_exact_intensities_at_points(made):
         + shape_text("box", center_mm=[-5, -5], size_mm=[4, 2], intensity=70, label=2)
         + shape_text("layer", normal=[0, 3], offset_mm=-9, thickness_mm=1, intensity=0.5, label=3)
     )
-    points = [[1, 5.99], [1, 6.01], [2.99, 2], [3.01, 2], [-7, -6], [-7.01, -6], [1e6, -9.5], [1e6, -9.51]]
+    points = [
+        [1, 5.99],
+        [1, 6.01],
+        [2.99, 2],
+        [3.01, 2],
+        [-7, -6],
+        [-7.01, -6],
+        [1e6, -9.5],
+        [1e6, -9.51],
+    ]
     assert phantom.intensity(points).tolist() == [50, 10, 50, 10, 70, 10, 0.5, 10]
     assert phantom.labels(points).tolist() == [1, 0, 1, 0, 2, 0, 3, 0]
 
 
 def test_exact_intensities_in_3d(made):
     """A quarter turn about x, then one about y, takes the z axis to -y and leaves it there."""
-    phantom = made(HEAD_3D + shape_text("box", center_mm=[0, 0, 0], size_mm=[2, 4, 8], rotation_deg=[90, 90, 0]))
+    phantom = made(
+        HEAD_3D
+        + shape_text("box", center_mm=[0, 0, 0], size_mm=[2, 4, 8], rotation_deg=[90, 90, 0])
+    )
     reach = np.array([2.0, 4.0, 1.0])  # half edges along the world's x, y and z
     for axis in range(3):
         inside, outside = np.zeros((2, 3))
@@ -180,7 +206,9 @@ def test_signed_distance_of_box_and_layer_is_the_distance(kind, n, made):
         np.testing.assert_allclose(signed_distance(shape, surface + 3 * normals), 3, atol=1e-12)
         if kind == "layer":
             depth = 0.9 * shape.half[0]
-            np.testing.assert_allclose(signed_distance(shape, surface - depth * normals), -depth, atol=1e-12)
+            np.testing.assert_allclose(
+                signed_distance(shape, surface - depth * normals), -depth, atol=1e-12
+            )
     corner = Shape("box", np.zeros(2), np.eye(2), np.array([1.0, 2.0]), 1.0, 1)
     assert signed_distance(corner, [4.0, 6.0]) == 5.0
 
@@ -201,7 +229,8 @@ def test_signed_distance_of_box_and_layer_is_the_distance(kind, n, made):
     ],
 )
 def test_voxels_are_means_of_all_their_sub_voxels(name, voxel, supersample):
-    """The slow twin: every voxel is supersampled, none is taken for whole. So no cut voxel is missed.
+    """The slow twin: every voxel is supersampled, none is taken for whole. So no cut voxel is
+    missed.
 
     The numbers are such that no midpoint lies on a surface, where the last bit would decide.
     """
@@ -214,7 +243,9 @@ def test_voxels_are_means_of_all_their_sub_voxels(name, voxel, supersample):
 
 
 def test_a_whole_voxel_is_exact_even_when_its_intensity_is_no_binary_fraction(made):
-    """The plain mean of 7 x 7 times 0.7 is off by a rounding; that would be variance in a constant region."""
+    """The plain mean of 7 x 7 times 0.7 is off by a rounding; that would be variance in a
+    constant region.
+    """
     assert np.full((1, 49), 0.7).mean(axis=1) != 0.7, "the numbers no longer show the difference"
     text = HEAD_2D.replace("intensity = 10", "intensity = 0.7")
     text += shape_text("ellipsoid", center_mm=[0, 0], radii_mm=[9, 0.5], intensity=0.7)
@@ -223,7 +254,9 @@ def test_a_whole_voxel_is_exact_even_when_its_intensity_is_no_binary_fraction(ma
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_a_surface_that_cuts_off_no_more_than_a_corner_is_not_missed(n, made):
-    """A diagonal half-space takes one of 16^n sub-voxels from [0, 1]^n, the last, its midpoint at 31/32."""
+    """A diagonal half-space takes one of 16^n sub-voxels from [0, 1]^n, the last, its midpoint
+    at 31/32.
+    """
     start = (n * 31 / 32 - 0.002) / math.sqrt(n)
     layer = shape_text("layer", normal=[1] * n, offset_mm=start + 50, thickness_mm=100)
     image = made((HEAD_2D if n == 2 else HEAD_3D) + layer).image(supersample=16)
@@ -233,15 +266,18 @@ def test_a_surface_that_cuts_off_no_more_than_a_corner_is_not_missed(n, made):
 
 
 def test_a_midpoint_on_the_surface_is_inside(made):
-    """The layer |x| <= 1/8 ends on the midpoints of the sub-voxels next to x = 0; they belong to it."""
+    """The layer |x| <= 1/8 ends on the midpoints of the sub-voxels next to x = 0; they belong to
+    it.
+    """
     phantom = made(HEAD_2D + shape_text("layer", normal=[1, 0], offset_mm=0, thickness_mm=0.25))
     assert phantom.intensity([0.125, 3]) == 50
     assert phantom.image().data[:, 0].tolist() == [10] * 9 + [20, 20] + [10] * 9
 
 
-# Root mean square error of counting the points of Z^n in a ball of radius R, over its place and a little over
-# R, divided by R^((n-1)/2): sqrt(sum over k in Z^n, not 0, of 1 / (2 pi^2 |k|^(n+1))), from Poisson's formula
-# and the decay of the ball's Fourier transform. The sums over |k| are 9.034 in the plane and 16.532 in space.
+# Root mean square error of counting the points of Z^n in a ball of radius R, over its place and a
+# little over R, divided by R^((n-1)/2): sqrt(sum over k in Z^n, not 0, of 1 / (2 pi^2 |k|^(n+1))),
+# from Poisson's formula and the decay of the ball's Fourier transform. The sums over |k| are 9.034
+# in the plane and 16.532 in space.
 COUNTING_ERROR = {2: math.sqrt(9.034 / (2 * math.pi**2)), 3: math.sqrt(16.532 / (2 * math.pi**2))}
 
 
@@ -250,8 +286,9 @@ COUNTING_ERROR = {2: math.sqrt(9.034 / (2 * math.pi**2)), 3: math.sqrt(16.532 / 
 def test_rendered_volume_converges_to_the_ball(n, made):
     """The sum over voxels is background + contrast * volume, up to the error of counting midpoints.
 
-    Midpoints a distance d apart give the volume to c d^((n+1)/2) r^((n-1)/2), root mean square: the rate in d
-    is 1.5 in the plane and 2 in space, and c is the theory's, `COUNTING_ERROR`, to 15 percent for 200 balls.
+    Midpoints a distance d apart give the volume to c d^((n+1)/2) r^((n-1)/2), root mean square: the
+    rate in d is 1.5 in the plane and 2 in space, and c is the theory's, `COUNTING_ERROR`, to 15
+    percent for 200 balls.
     """
     rng = np.random.default_rng(5)
     spacings = np.array([1.0, 1 / 2, 1 / 4])
@@ -272,17 +309,27 @@ def test_rendered_volume_converges_to_the_ball(n, made):
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_oblique_sheared_image_has_the_sphere_where_the_file_says(n, made):
-    """Its centroid is right to 0.01 mm; the affine's columns are the file's rows; the box is covered."""
+    """Its centroid is right to 0.01 mm; the affine's columns are the file's rows; the box is
+    covered.
+    """
     axes = np.array([[0.9, 0.4, 0.1], [-0.5, 0.8, 0.0], [0.1, -0.3, 1.0]])[:n, :n]
     center, world_center = [2.5, -1.5, 0.7][:n], [40.0, -30.0, 12.0][:n]
     place = (np.array(center) + world_center).tolist()
-    text = (HEAD_2D if n == 2 else HEAD_3D).replace("voxel_mm = 1", f"voxel_mm = {[0.5, 0.7, 1.7][:n]}")
-    text = text.replace("background", f"axes = {(3 * axes).tolist()}\ncenter_mm = {world_center}\nbackground")
+    text = (HEAD_2D if n == 2 else HEAD_3D).replace(
+        "voxel_mm = 1", f"voxel_mm = {[0.5, 0.7, 1.7][:n]}"
+    )
+    text = text.replace(
+        "background", f"axes = {(3 * axes).tolist()}\ncenter_mm = {world_center}\nbackground"
+    )
     image = made(text + shape_text("ellipsoid", center_mm=place, radii_mm=5)).image()
     assert image.shape == (40, 29, 12)[:n]
     unit = axes / np.linalg.norm(axes, axis=1, keepdims=True)
-    np.testing.assert_allclose(image.affine[:-1, :-1], unit.T * (20 / np.array(image.shape)), rtol=1e-14, atol=1e-15)
-    np.testing.assert_allclose(image.to_world((np.array(image.shape) - 1) / 2), world_center, rtol=1e-14)
+    np.testing.assert_allclose(
+        image.affine[:-1, :-1], unit.T * (20 / np.array(image.shape)), rtol=1e-14, atol=1e-15
+    )
+    np.testing.assert_allclose(
+        image.to_world((np.array(image.shape) - 1) / 2), world_center, rtol=1e-14
+    )
     assert image.volume == pytest.approx(20**n * abs(np.linalg.det(unit)), rel=1e-13)
     weight = image.data.astype(np.float64) - 10
     index = np.stack(np.indices(image.shape), axis=-1)
@@ -293,8 +340,8 @@ def test_oblique_sheared_image_has_the_sphere_where_the_file_says(n, made):
 def test_blurred_edge_is_the_error_function_along_either_axis(made):
     """A half-plane blurred by sd 2 mm is 10 + 40 Phi(x / 2), along axes of 0.25 and of 0.5 mm.
 
-    On voxels of edge d the integral becomes a midpoint sum, which is as if the variance were less by
-    d^2 / 12. What remains is scipy's cut at 4 sd: 3e-5 of the step, or 0.0013.
+    On voxels of edge d the integral becomes a midpoint sum, which is as if the variance were less
+    by d^2 / 12. What remains is scipy's cut at 4 sd: 3e-5 of the step, or 0.0013.
     """
     for axis, normal in enumerate(([1, 0], [0, 1])):
         phantom = made(HEAD_2D + shape_text("layer", normal=normal, offset_mm=50, thickness_mm=100))
@@ -302,27 +349,39 @@ def test_blurred_edge_is_the_error_function_along_either_axis(made):
         x = image.to_world(np.stack(np.indices(image.shape), axis=-1))[..., axis]
         spread = math.sqrt(4 - image.spacing[axis] ** 2 / 12)
         inner = np.abs(x) < 2  # farther out the border's continuation is felt
-        np.testing.assert_allclose(image.data[inner], 10 + 40 * ndtr(x[inner] / spread), atol=0.002, rtol=0)
+        np.testing.assert_allclose(
+            image.data[inner], 10 + 40 * ndtr(x[inner] / spread), atol=0.002, rtol=0
+        )
 
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_turning_the_world_leaves_the_voxels_alone(n, made):
-    """The same box and blur seen from elsewhere: axes, shapes and the place turned and moved together."""
+    """The same box and blur seen from elsewhere: axes, shapes and the place turned and moved
+    together.
+    """
     angles = 40.0 if n == 2 else [20.0, -35.0, 65.0]
     R, shift = rotation(angles), np.array([30.0, -20.0, 10.0])[:n]
     head = HEAD_2D if n == 2 else HEAD_3D
     head = head.replace("voxel_mm = 1", f"voxel_mm = {[0.5, 1, 2][:n]}\nblur_mm = 1.5")
     center, lengths = np.array([1.3, -2.1, 0.4])[:n], [7.1, 5.3, 6.2][:n]
     still = made(head + shape_text("box", center_mm=center.tolist(), size_mm=lengths)).image()
-    head = head.replace("background", f"axes = {R.T.tolist()}\ncenter_mm = {shift.tolist()}\nbackground")
-    turned = {"center_mm": (R @ center + shift).tolist(), "size_mm": lengths, "rotation_deg": angles}
+    head = head.replace(
+        "background", f"axes = {R.T.tolist()}\ncenter_mm = {shift.tolist()}\nbackground"
+    )
+    turned = {
+        "center_mm": (R @ center + shift).tolist(),
+        "size_mm": lengths,
+        "rotation_deg": angles,
+    }
     image = made(head + shape_text("box", **turned)).image()
     np.testing.assert_allclose(image.data, still.data, rtol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["sphere", "layered_oblique", "prostate_2d"])
 def test_blur_keeps_the_mean(name):
-    """To rounding where nothing but background is near the border; else the border's continuation counts."""
+    """To rounding where nothing but background is near the border; else the border's
+    continuation counts.
+    """
     phantom = load_phantom(name)
     before, after = (phantom.image(blur_mm=sd).data.mean(dtype=np.float64) for sd in (0, 2))
     reaches_the_border = name in ("layered_oblique", "prostate_2d")
@@ -348,12 +407,16 @@ def test_file_options_are_the_defaults_and_arguments_win(made):
     text = HEAD_2D.replace("background", "blur_mm = 1\nnoise_sd = 2\nseed = 3\nbackground") + DISC
     phantom = made(text)
     plain = made(HEAD_2D + DISC)
-    np.testing.assert_array_equal(phantom.image().data, plain.image(voxel_mm=1, blur_mm=1, noise_sd=2, seed=3).data)
+    np.testing.assert_array_equal(
+        phantom.image().data, plain.image(voxel_mm=1, blur_mm=1, noise_sd=2, seed=3).data
+    )
     np.testing.assert_array_equal(phantom.image(blur_mm=0, noise_sd=0).data, plain.image().data)
     assert phantom.image(np.array([2, 5])).shape == (10, 4)
 
 
-@pytest.mark.parametrize(("voxel", "count"), [(20, 1), (14, 1), (13, 2), (3, 7), (0.3, 67), (1, 20)])
+@pytest.mark.parametrize(
+    ("voxel", "count"), [(20, 1), (14, 1), (13, 2), (3, 7), (0.3, 67), (1, 20)]
+)
 def test_voxels_are_adjusted_to_cover_the_box_exactly(voxel, count, made):
     image = made(HEAD_2D + DISC).image(voxel)
     assert image.shape == (count, count)
@@ -380,14 +443,18 @@ def test_names_are_those_of_the_folder():
 def test_folder_inside_the_installed_package_comes_first(tmp_path, monkeypatch):
     package = tmp_path / "site-packages" / "tetopt"
     (package / "phantoms").mkdir(parents=True)
-    monkeypatch.setattr(tetopt.contents.phantom, "__file__", str(package / "contents" / "phantom.py"))
+    monkeypatch.setattr(
+        tetopt.contents.phantom, "__file__", str(package / "contents" / "phantom.py")
+    )
     assert phantom_folder() == (package / "phantoms").resolve()
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_phantom(name):
-    """It is named as its file, and on every voxel its labels and unblurred centres are those of h(x)."""
+    """It is named as its file, and on every voxel its labels and unblurred centres are those of
+    h(x).
+    """
     phantom = load_phantom(name)
     assert phantom.name == name
     size = 4.0 if name == "ellipsoids_brain" else None
@@ -409,39 +476,129 @@ def test_shipped_phantom(name):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("name = ", "name ", "expected TOML, got Expected '=' after a key .*; correct the file there"),
+        (
+            "name = ",
+            "name ",
+            "expected TOML, got Expected '=' after a key .*; correct the file there",
+        ),
         ("size_mm = [20, 20]", "", "missing size_mm; name, description, size_mm, voxel_mm"),
         ('name = "test"\nd', 'd = "x"\nd', "missing name; "),
-        ("voxel_mm = 1", "voxel_mm = 1\nvoxels = 3", "unknown 'voxels'; the keys allowed here are name, desc"),
+        (
+            "voxel_mm = 1",
+            "voxel_mm = 1\nvoxels = 3",
+            "unknown 'voxels'; the keys allowed here are name, desc",
+        ),
         ('"test"', "3", "name: expected a quoted string, got 3"),
-        ("[20, 20]", "[20]", "size_mm: expected a list of 2 or 3 numbers, one per axis, got \\[20\\]"),
+        (
+            "[20, 20]",
+            "[20]",
+            "size_mm: expected a list of 2 or 3 numbers, one per axis, got \\[20\\]",
+        ),
         ("[20, 20]", "[20, 0]", "size_mm: expected lengths above 0 mm, got \\[20.0, 0.0\\]"),
-        ("voxel_mm = 1", "voxel_mm = 0", "voxel_mm: expected lengths above 0 mm, got \\[0.0, 0.0\\]"),
-        ("voxel_mm = 1", "voxel_mm = [1, 21]", "voxel_mm: expected voxels no larger than the box of"),
-        ("voxel_mm = 1", "voxel_mm = 1\ncenter_mm = [0]", "center_mm: expected a list of 2 numbers, all"),
-        ("voxel_mm = 1", 'voxel_mm = 1\nnoise_sd = "1"', "noise_sd: expected a finite number, 0 or more"),
-        ("voxel_mm = 1", "voxel_mm = 1\nseed = 1.5", "seed: expected an integer from 0 to 2147483647, got"),
-        ("voxel_mm = 1", "voxel_mm = 1\naxes = [[1, 0]]", "axes: expected 2 rows, the directions of the"),
-        ("voxel_mm = 1", "voxel_mm = 1\naxes = [[1, 0], [1]]", "axes: row 2: expected a list of 2 numbers"),
-        ("voxel_mm = 1", "voxel_mm = 1\naxes = [[1, 1], [2, 2]]", "axes: the directions .* do not span 2-D"),
-        ("{ intensity = 10, label = 0 }", "10", "background: expected a table, got 10; for example"),
-        ("{ intensity = 10, label = 0 }", "{ label = 0 }", "background: missing intensity; intensity"),
-        ("label = 0", "label = -1", "background: label: expected an integer from 0 to 2147483647, got -1"),
-        ("[[shape]]", "[shape]", "shape: expected tables, got .*; start each shape with \\[\\[shape\\]\\]"),
-        ('"ellipsoid"', '"sphere"', "shape 1: kind: expected one of ellipsoid, box, layer, got 'sphere'"),
-        ('kind = "ellipsoid"', 'kind = "layer"', "shape 1: layer: missing normal, offset_mm, thickness_mm;"),
+        (
+            "voxel_mm = 1",
+            "voxel_mm = 0",
+            "voxel_mm: expected lengths above 0 mm, got \\[0.0, 0.0\\]",
+        ),
+        (
+            "voxel_mm = 1",
+            "voxel_mm = [1, 21]",
+            "voxel_mm: expected voxels no larger than the box of",
+        ),
+        (
+            "voxel_mm = 1",
+            "voxel_mm = 1\ncenter_mm = [0]",
+            "center_mm: expected a list of 2 numbers, all",
+        ),
+        (
+            "voxel_mm = 1",
+            'voxel_mm = 1\nnoise_sd = "1"',
+            "noise_sd: expected a finite number, 0 or more",
+        ),
+        (
+            "voxel_mm = 1",
+            "voxel_mm = 1\nseed = 1.5",
+            "seed: expected an integer from 0 to 2147483647, got",
+        ),
+        (
+            "voxel_mm = 1",
+            "voxel_mm = 1\naxes = [[1, 0]]",
+            "axes: expected 2 rows, the directions of the",
+        ),
+        (
+            "voxel_mm = 1",
+            "voxel_mm = 1\naxes = [[1, 0], [1]]",
+            "axes: row 2: expected a list of 2 numbers",
+        ),
+        (
+            "voxel_mm = 1",
+            "voxel_mm = 1\naxes = [[1, 1], [2, 2]]",
+            "axes: the directions .* do not span 2-D",
+        ),
+        (
+            "{ intensity = 10, label = 0 }",
+            "10",
+            "background: expected a table, got 10; for example",
+        ),
+        (
+            "{ intensity = 10, label = 0 }",
+            "{ label = 0 }",
+            "background: missing intensity; intensity",
+        ),
+        (
+            "label = 0",
+            "label = -1",
+            "background: label: expected an integer from 0 to 2147483647, got -1",
+        ),
+        (
+            "[[shape]]",
+            "[shape]",
+            "shape: expected tables, got .*; start each shape with \\[\\[shape\\]\\]",
+        ),
+        (
+            '"ellipsoid"',
+            '"sphere"',
+            "shape 1: kind: expected one of ellipsoid, box, layer, got 'sphere'",
+        ),
+        (
+            'kind = "ellipsoid"',
+            'kind = "layer"',
+            "shape 1: layer: missing normal, offset_mm, thickness_mm;",
+        ),
         ("radii_mm", "radius_mm", "shape 1: ellipsoid: missing radii_mm; kind, intensity"),
-        ("label = 1", "label = 1\ncolor = 1", "shape 1: ellipsoid: unknown 'color'; the keys allowed here"),
-        ("[0, 0]", "[0, 0, 0]", "shape 1: center_mm: expected a list of 2 numbers, all finite, got \\[0"),
-        ("radii_mm = 5", "radii_mm = -5", "shape 1: radii_mm: expected lengths above 0 mm, got \\[-5.0"),
-        ("= 1\n", "= 1\nrotation_deg = [1, 2, 3]\n", "shape 1: rotation_deg: expected a finite number, got"),
-        ("radii_mm = 5", 'name = "a\\nb"\nradii_mm = 0', "shape 1 'a.nb': radii_mm: expected lengths above"),
+        (
+            "label = 1",
+            "label = 1\ncolor = 1",
+            "shape 1: ellipsoid: unknown 'color'; the keys allowed here",
+        ),
+        (
+            "[0, 0]",
+            "[0, 0, 0]",
+            "shape 1: center_mm: expected a list of 2 numbers, all finite, got \\[0",
+        ),
+        (
+            "radii_mm = 5",
+            "radii_mm = -5",
+            "shape 1: radii_mm: expected lengths above 0 mm, got \\[-5.0",
+        ),
+        (
+            "= 1\n",
+            "= 1\nrotation_deg = [1, 2, 3]\n",
+            "shape 1: rotation_deg: expected a finite number, got",
+        ),
+        (
+            "radii_mm = 5",
+            'name = "a\\nb"\nradii_mm = 0',
+            "shape 1 'a.nb': radii_mm: expected lengths above",
+        ),
     ],
 )
 def test_messages_of_a_file(old, new, message, made, tmp_path):
     text = HEAD_2D + DISC
     # From the back where the change is one to the shape, from the front where it is one to the top.
-    head, separator, tail = text.rpartition(old) if message.startswith("shape") else text.partition(old)
+    head, separator, tail = (
+        text.rpartition(old) if message.startswith("shape") else text.partition(old)
+    )
     assert separator, f"{old!r} is not in the file"
     with pytest.raises(InputError, match=message) as caught:
         made(head + new + tail)
@@ -452,12 +609,22 @@ def test_messages_of_a_file(old, new, message, made, tmp_path):
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"normal": [0, 0], "offset_mm": 0, "thickness_mm": 1}, "normal: expected a direction, got all"),
-        ({"normal": [0, 1], "offset_mm": 0, "thickness_mm": 0}, "thickness_mm: expected lengths above 0"),
-        ({"normal": [0, 1], "offset_mm": "nan", "thickness_mm": 1}, "offset_mm: expected a finite number"),
+        (
+            {"normal": [0, 0], "offset_mm": 0, "thickness_mm": 1},
+            "normal: expected a direction, got all",
+        ),
+        (
+            {"normal": [0, 1], "offset_mm": 0, "thickness_mm": 0},
+            "thickness_mm: expected lengths above 0",
+        ),
+        (
+            {"normal": [0, 1], "offset_mm": "nan", "thickness_mm": 1},
+            "offset_mm: expected a finite number",
+        ),
         (
             {"normal": [0, 1], "offset_mm": 0, "thickness_mm": 1, "rotation_deg": 5},
-            "layer: unknown 'rotation_deg'; the keys allowed here are kind, intensity, label, normal",
+            "layer: unknown 'rotation_deg'; the keys allowed here are kind, intensity, label, "
+            "normal",
         ),
     ],
 )
@@ -467,7 +634,9 @@ def test_messages_of_a_layer(values, message, made):
 
 
 def test_message_of_a_rotation_in_3d(made):
-    with pytest.raises(InputError, match="shape 1: rotation_deg: expected a list of 3 numbers, all finite"):
+    with pytest.raises(
+        InputError, match="shape 1: rotation_deg: expected a list of 3 numbers, all finite"
+    ):
         made(HEAD_3D + shape_text("box", center_mm=[0, 0, 0], size_mm=1, rotation_deg=30))
 
 
@@ -475,12 +644,15 @@ def test_message_of_an_unknown_name_lists_the_known():
     with pytest.raises(InputError) as caught:
         load_phantom("spere")
     assert str(caught.value) == (
-        f"phantom 'spere': no such phantom; use one of {', '.join(SHIPPED)}, or the path of a .toml file"
+        f"phantom 'spere': no such phantom; use one of {', '.join(SHIPPED)}, or the path of a "
+        ".toml file"
     )
 
 
 def test_messages_of_a_file_that_cannot_be_read(tmp_path):
-    with pytest.raises(InputError, match=r"nothing.toml: no such file; .* or use one of the names constant"):
+    with pytest.raises(
+        InputError, match=r"nothing.toml: no such file; .* or use one of the names constant"
+    ):
         load_phantom(tmp_path / "nothing.toml")
     with pytest.raises(InputError, match=r"expected a \S+( \S+)*, got a folder"):
         load_phantom(tmp_path)
@@ -493,9 +665,18 @@ def test_messages_of_a_file_that_cannot_be_read(tmp_path):
     ("options", "message"),
     [
         ({"voxel_mm": "1"}, "voxel_mm: expected a number or a list of 3, all finite, got '1'"),
-        ({"voxel_mm": 65}, "voxel_mm: expected voxels no larger than the box of \\[64.0, 64.0, 64.0\\] mm"),
-        ({"voxel_mm": 0.001}, "voxel_mm: expected at most 2\\*\\*36 voxels, got 64000 x 64000 x 64000 of"),
-        ({"voxel_mm": 1e-308}, "voxel_mm: expected at most 2\\*\\*36 voxels, got inf x inf x inf of"),
+        (
+            {"voxel_mm": 65},
+            "voxel_mm: expected voxels no larger than the box of \\[64.0, 64.0, 64.0\\] mm",
+        ),
+        (
+            {"voxel_mm": 0.001},
+            "voxel_mm: expected at most 2\\*\\*36 voxels, got 64000 x 64000 x 64000 of",
+        ),
+        (
+            {"voxel_mm": 1e-308},
+            "voxel_mm: expected at most 2\\*\\*36 voxels, got inf x inf x inf of",
+        ),
         ({"blur_mm": -1}, "blur_mm: expected a finite number, 0 or more, got -1"),
         ({"seed": -1}, "seed: expected an integer from 0 to 2147483647, got -1"),
         ({"supersample": 0}, "supersample: expected an integer from 1 to 64, got 0"),
@@ -509,7 +690,10 @@ def test_messages_of_rendering(options, message):
 @pytest.mark.parametrize(
     ("points", "message"),
     [
-        ([0.0, 0.0], "points: expected shape \\(..., 3\\), got \\(2,\\); give 3 world coordinates in mm"),
+        (
+            [0.0, 0.0],
+            "points: expected shape \\(..., 3\\), got \\(2,\\); give 3 world coordinates in mm",
+        ),
         ([0.0, 0.0, math.nan], "points: some are NaN or infinite; remove those points"),
     ],
 )
@@ -542,7 +726,9 @@ def test_a_blur_wider_than_the_box_is_refused():
         phantom.image(voxel_mm=8, blur_mm=1e20)
 
 
-@pytest.mark.parametrize("options", [{}, {"blur_mm": 1.5, "noise_sd": 2.0, "seed": 3}], ids=["plain", "noisy"])
+@pytest.mark.parametrize(
+    "options", [{}, {"blur_mm": 1.5, "noise_sd": 2.0, "seed": 3}], ids=["plain", "noisy"]
+)
 @pytest.mark.parametrize("name", ["layered_oblique", "two_spheres", "fig2_2d"])
 def test_voxels_are_the_same_in_whatever_boxes(name, options):
     """Also of a box before the last one, which the stream of noise has to go back for."""
@@ -552,7 +738,8 @@ def test_voxels_are_the_same_in_whatever_boxes(name, options):
     assert voxels.shape == whole.shape
     middle = [size // 3 for size in whole.shape]
     low, high = (
-        tuple(slice(*each) for each in ends) for ends in zip(*(((0, m), (m, None)) for m in middle), strict=True)
+        tuple(slice(*each) for each in ends)
+        for ends in zip(*(((0, m), (m, None)) for m in middle), strict=True)
     )
     for box in (high, low, (low[0], *high[1:]), high):
         np.testing.assert_array_equal(voxels[box].astype(whole.dtype), whole[box])
@@ -560,7 +747,9 @@ def test_voxels_are_the_same_in_whatever_boxes(name, options):
 
 def test_noise_of_more_planes_than_fit_is_refused(monkeypatch):
     voxels = load_phantom("sphere").voxels(2, noise_sd=1.0)
-    monkeypatch.setattr(tetopt.contents.phantom, "check_memory", lambda n_bytes, *_: 1 / (n_bytes < 8 * 32**3))
+    monkeypatch.setattr(
+        tetopt.contents.phantom, "check_memory", lambda n_bytes, *_: 1 / (n_bytes < 8 * 32**3)
+    )
     voxels[slice(0, 16), slice(0, 1), slice(0, 1)]
     with pytest.raises(ZeroDivisionError):
         voxels[slice(0, 32), slice(0, 1), slice(0, 1)]

@@ -31,15 +31,22 @@ def test_sums_above_1_are_told():
 
 def test_bytes_are_taken_as_such():
     image = tetopt.Image(np.zeros((2, 2)))
-    with pytest.warns(UserWarning, match="grey: whole numbers up to 204 are read as probabilities times 255"):
-        moved = tetopt.resample_tissue(tetopt.Image(np.array([[0.0, 51.0], [204.0, 3.0]])), image, "grey")
+    with pytest.warns(
+        UserWarning, match="grey: whole numbers up to 204 are read as probabilities times 255"
+    ):
+        moved = tetopt.resample_tissue(
+            tetopt.Image(np.array([[0.0, 51.0], [204.0, 3.0]])), image, "grey"
+        )
     np.testing.assert_allclose(moved.data, [[0.0, 0.2], [0.8, 3.0 / 255.0]], rtol=1e-6)
 
 
 @pytest.mark.parametrize("high", [100.0, 2.0, 256.0, 200.5, 1.01])
 def test_other_scales_are_refused(high):
     image = tetopt.Image(np.array([[0.0, high]]))
-    with pytest.raises(InputError, match=f"c1: expected probabilities from 0 to 1, got 0 to {high:g}; first divide by"):
+    with pytest.raises(
+        InputError,
+        match=f"c1: expected probabilities from 0 to 1, got 0 to {high:g}; first divide by",
+    ):
         tetopt.resample_tissue(image, image, "c1")
 
 
@@ -62,12 +69,18 @@ def test_refused(scales, match):
         tetopt.tissue_labels([tetopt.Image(scale * np.eye(4)) for scale in scales])
 
 
-@pytest.mark.parametrize("other", [tetopt.Image(np.zeros((3, 4))), tetopt.Image(np.eye(4), np.diag([1.0, 1.1, 1.0]))])
+@pytest.mark.parametrize(
+    "other", [tetopt.Image(np.zeros((3, 4))), tetopt.Image(np.eye(4), np.diag([1.0, 1.1, 1.0]))]
+)
 def test_tissues_of_another_shape_or_place_are_refused(other):
-    with pytest.raises(InputError, match="tissues, number 2: expected the voxels of the first; see"):
+    with pytest.raises(
+        InputError, match="tissues, number 2: expected the voxels of the first; see"
+    ):
         tetopt.tissue_labels([tetopt.Image(np.eye(4)), other])
 
 
 def test_a_tissue_that_is_nowhere_the_most_probable_is_named():
-    with pytest.warns(UserWarning, match="label 3 is not the most probable in any voxel: no cell gets it"):
+    with pytest.warns(
+        UserWarning, match="label 3 is not the most probable in any voxel: no cell gets it"
+    ):
         tetopt.tissue_labels(images(np.eye(3), 1.0 - np.eye(3), 0.1 * np.eye(3)))

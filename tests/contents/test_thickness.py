@@ -1,4 +1,6 @@
-"""The local thickness of labels: slabs, shells and balls of known size, in voxels of several shapes."""
+"""The local thickness of labels: slabs, shells and balls of known size, in voxels of several
+shapes.
+"""
 
 import numpy as np
 import pytest
@@ -49,22 +51,43 @@ def test_near_the_surface_of_a_ball_it_is_as_thick_as_in_the_middle():
 
 def test_a_way_that_leaves_the_grid_or_the_region_has_no_angle():
     """Sums of two ways may be rounded to below one that leaves the grid: nothing is read there."""
-    partition, levels = np.zeros((4, 5, 6), dtype=np.int16), np.indices((4, 5, 6))[:1].astype(np.float32)
+    partition, levels = (
+        np.zeros((4, 5, 6), dtype=np.int16),
+        np.indices((4, 5, 6))[:1].astype(np.float32),
+    )
     partition[:, :, 5], partition[3] = -1, 1
-    labels = _Labels(partition, levels, np.zeros(2, dtype=np.int64), np.zeros((0, 1, 1, 1), dtype=np.uint16))
-    for step, expected in (((0, -1, 0), 1.0), ((0, 0, 1), 1.0), ((1, 0, 0), 1.0), ((1, 1, 0), 0.8**0.5)):
+    labels = _Labels(
+        partition, levels, np.zeros(2, dtype=np.int64), np.zeros((0, 1, 1, 1), dtype=np.uint16)
+    )
+    for step, expected in (
+        ((0, -1, 0), 1.0),
+        ((0, 0, 1), 1.0),
+        ((1, 0, 0), 1.0),
+        ((1, 1, 0), 0.8**0.5),
+    ):
         edges = np.array([2.0, 1.0, 1.0])
         found = _cosine(labels, (1, 2, 3), (0, np.array(step)), np.linalg.norm(step * edges), edges)
         assert found == pytest.approx(expected)
 
 
-@pytest.mark.parametrize(("shape", "spacing"), [((14, 12, 13), (1.0, 1.0, 1.0)), ((10, 9, 12), (1.0, 1.2, 2.0))])
-def test_chords_at_the_sides_of_the_grid_are_the_shortest_that_end_inside(shape, spacing, monkeypatch):
-    """A way that leaves the grid ends no chord: with its bound in place of it, rounding once made it the shortest."""
+@pytest.mark.parametrize(
+    ("shape", "spacing"), [((14, 12, 13), (1.0, 1.0, 1.0)), ((10, 9, 12), (1.0, 1.2, 2.0))]
+)
+def test_chords_at_the_sides_of_the_grid_are_the_shortest_that_end_inside(
+    shape, spacing, monkeypatch
+):
+    """A way that leaves the grid ends no chord: with its bound in place of it, rounding once
+    made it the shortest.
+    """
     field = gaussian_filter(np.random.default_rng(1).normal(size=(3, *shape)), (0.0, 1.5, 1.5, 1.5))
     members = memberships(Image(field.argmax(axis=0).astype(float), np.diag([*spacing, 1.0])))
     (steps, lengths), edges = thickness_module._rays(np.array(spacing))
-    labels = _Labels(members.partition.astype(np.int16), members.levels, members.channel, np.empty((0,) * 4, np.uint16))
+    labels = _Labels(
+        members.partition.astype(np.int16),
+        members.levels,
+        members.channel,
+        np.empty((0,) * 4, np.uint16),
+    )
     monkeypatch.setattr(thickness_module, "_spread_balls", lambda *_: None)
     chords = local_thickness(members, np.array(spacing), 8.0)
     for place in np.ndindex(shape):
@@ -109,7 +132,9 @@ def test_triangles_and_divided_slices():
     y = np.indices((30, 30))[1]
     is_in = (y >= 10) & (y < 14)
     assert np.median(thickness_of(is_in)[is_in]) == pytest.approx(4.0, abs=0.05)
-    thick_slices = Image((np.indices((24, 24, 6))[0] // 6 == 1).astype(float), np.diag([1.0, 1.0, 5.0, 1.0]))
+    thick_slices = Image(
+        (np.indices((24, 24, 6))[0] // 6 == 1).astype(float), np.diag([1.0, 1.0, 5.0, 1.0])
+    )
     factors = supersampling(thick_slices.spacing)
     fine = finer(thick_slices, factors)
     thickness = local_thickness(memberships(thick_slices, factors), fine.spacing, MOST)

@@ -62,7 +62,8 @@ def test_E_G_is_eq_1_as_printed(seed, n):
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_E_G_is_the_interpolation_error_of_the_paraboloid(n):
-    """Eq. (1) is an integral: the mean over random points of the linear interpolant of x^2 minus x^2.
+    """Eq. (1) is an integral: the mean over random points of the linear interpolant of x^2 minus
+    x^2.
 
     2e5 points of one cell, seeded; the standard error is a few thousandths.
     """
@@ -71,7 +72,9 @@ def test_E_G_is_the_interpolation_error_of_the_paraboloid(n):
     weights = rng.dirichlet(np.ones(n + 1), 200_000)
     x = weights @ points[cells[0]]
     error = weights @ (points[cells[0]] ** 2).sum(axis=1) - (x**2).sum(axis=1)
-    assert cell_E_G(points, cells)[0] == pytest.approx(volumes(points, cells)[0] * error.mean(), rel=5e-3)
+    assert cell_E_G(points, cells)[0] == pytest.approx(
+        volumes(points, cells)[0] * error.mean(), rel=5e-3
+    )
 
 
 # Laws
@@ -82,7 +85,9 @@ def test_E_G_scales_and_does_not_see_motions(seed, n):
     rng, points, cells = random_mesh(seed, n)
     scale = np.exp(rng.uniform(-3, 3))
     moved = scale * points @ random_rotation(rng, n).T + rng.uniform(-10, 10, n)
-    np.testing.assert_allclose(cell_E_G(moved, cells), scale ** (n + 2) * cell_E_G(points, cells), rtol=1e-10)
+    np.testing.assert_allclose(
+        cell_E_G(moved, cells), scale ** (n + 2) * cell_E_G(points, cells), rtol=1e-10
+    )
 
 
 @pytest.mark.parametrize("mesh", ALL_SMALL)
@@ -104,7 +109,9 @@ def test_E_G_of_flat_cells_is_0(kind):
 
 
 def corners_of(points, cell):
-    """As the kernel takes them: (4, 3), a triangle in coordinates 1 and 2, the rest of the array never read."""
+    """As the kernel takes them: (4, 3), a triangle in coordinates 1 and 2, the rest of the array
+    never read.
+    """
     n = points.shape[1]
     corners = np.full((4, 3), np.nan)
     corners[: n + 1, 3 - n :] = points[cell]
@@ -120,4 +127,6 @@ def test_volume_and_E_G_of_one_cell(seed, n):
         measured = volume_and_E_G(corners_of(points, cell), n + 1)
         assert measured == pytest.approx((v, energy), rel=1e-8)
         assert measured == pytest.approx(naive.volume_and_E_G(points[cell]), rel=1e-9)
-        assert volume_and_E_G(corners_of(points, cell[::-1]), n + 1) == pytest.approx(measured, rel=1e-9)
+        assert volume_and_E_G(corners_of(points, cell[::-1]), n + 1) == pytest.approx(
+            measured, rel=1e-9
+        )

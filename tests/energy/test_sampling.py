@@ -1,4 +1,6 @@
-"""Voxels to cells: the contract to the last voxel, against rational arithmetic, and what follows from it."""
+"""Voxels to cells: the contract to the last voxel, against rational arithmetic, and what follows
+from it.
+"""
 
 from itertools import permutations
 
@@ -59,7 +61,9 @@ def random_case(seed, n, *, is_snapped):
 
 @pytest.mark.parametrize("size", [1, 2, 5, 8])
 def test_centres_on_the_diagonal_of_a_square_go_up(size):
-    """TWO_TRIANGLES over the box, cell 0 where j > i: shifted by (eps^2, eps), centres with j = i join it."""
+    """TWO_TRIANGLES over the box, cell 0 where j > i: shifted by (eps^2, eps), centres with j =
+    i join it.
+    """
     image = Image(np.zeros((size, size)))
     mesh = placed(image, TWO_TRIANGLES[0] * size - 0.5, TWO_TRIANGLES[1])
     i, j = np.indices((size, size))
@@ -67,18 +71,25 @@ def test_centres_on_the_diagonal_of_a_square_go_up(size):
 
 
 def test_centres_on_the_walls_of_a_cube_s_six_cells():
-    """The cell of axes (a, b, c) holds x_a > x_b > x_c; among equal indices the shift makes the last axis largest."""
+    """The cell of axes (a, b, c) holds x_a > x_b > x_c; among equal indices the shift makes the
+    last axis largest.
+    """
     image = Image(np.zeros((5, 5, 5)))
     mesh = placed(image, *split_box(np.random.default_rng(0), (5, 5, 5), 0))
     number = {axes: cell for cell, axes in enumerate(permutations(range(3)))}
     owner = cell_of_voxel(image, mesh)
     for voxel, cell in np.ndenumerate(owner):
-        assert cell == number[tuple(sorted(range(3), key=lambda axis: (voxel[axis], axis), reverse=True))]
+        assert (
+            cell
+            == number[tuple(sorted(range(3), key=lambda axis: (voxel[axis], axis), reverse=True))]
+        )
 
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_a_centre_on_a_node_goes_to_one_of_its_cells(n):
-    """One voxel, one block, its middle node on the centre: the cell on the positive side of the last axis."""
+    """One voxel, one block, its middle node on the centre: the cell on the positive side of the
+    last axis.
+    """
     image = Image(np.zeros((1,) * n))
     mesh = lattice_mesh(image, blocks=(1,) * n)
     counts = cell_moments(image, mesh).n_voxels
@@ -107,7 +118,9 @@ def test_owners_on_random_meshes_are_the_twin_s(seed, n):
 
 @pytest.mark.parametrize("shape", [(3, 90), (90, 4), (40, 50), (14, 12, 16), (2, 3, 90)])
 def test_owners_with_ties_that_floats_get_wrong_are_the_twin_s(shape):
-    """Nodes on centres far apart: lines and planes of slopes like 7/49 pass through other centres."""
+    """Nodes on centres far apart: lines and planes of slopes like 7/49 pass through other
+    centres.
+    """
     rng = np.random.default_rng(2)
     image = Image(np.zeros(shape))
     mesh = placed(image, *split_box(rng, shape, 5 if len(shape) == 3 else 12, 1))
@@ -117,7 +130,9 @@ def test_owners_with_ties_that_floats_get_wrong_are_the_twin_s(shape):
 @pytest.mark.parametrize(("i", "j"), [(50, 14), (14, 50), (50, 28), (49, 21), (6, 9)])
 @pytest.mark.parametrize("n", [2, 3])
 def test_owners_on_a_line_between_centres_are_the_twin_s(n, i, j):
-    """Two triangles, or the base of two tetrahedra, on the line (0, 0) to (i, j). In floats 25 * (14 / 50) > 7."""
+    """Two triangles, or the base of two tetrahedra, on the line (0, 0) to (i, j). In floats 25 *
+    (14 / 50) > 7.
+    """
     image = Image(np.zeros((i + 1, j + 1, 3)[:n]))
     corners = np.array([[0.0, 0], [i, j], [0, j], [i, 0]])
     if n == 2:
@@ -130,7 +145,9 @@ def test_owners_on_a_line_between_centres_are_the_twin_s(n, i, j):
 
 @given(seeds, dimensions)
 def test_owners_near_a_tie_are_the_twin_s(seed, n):
-    """Inner nodes a few ticks off the halves, as far as no cell turns over: floats cannot tell, integers must."""
+    """Inner nodes a few ticks off the halves, as far as no cell turns over: floats cannot tell,
+    integers must.
+    """
     rng = np.random.default_rng(seed)
     image = Image(np.zeros((4,) * n))
     index, cells = split_box(rng, image.shape, 5)
@@ -147,7 +164,9 @@ def test_owners_near_a_tie_are_the_twin_s(seed, n):
 
 @given(seeds, dimensions)
 def test_owners_in_cells_far_larger_than_the_image_are_the_twin_s(seed, n):
-    """A mesh that reaches up to 800,000 voxels around: few bits, facets almost parallel to rows, and still exact."""
+    """A mesh that reaches up to 800,000 voxels around: few bits, facets almost parallel to rows,
+    and still exact.
+    """
     rng = np.random.default_rng(seed)
     image = random_image(rng, (5, 4, 3)[:n])
     reach = 10.0 ** rng.uniform(2, 5.9)
@@ -179,7 +198,9 @@ def test_orientations_are_exact(seed, n):
 
 
 def test_orientations_of_volumes_of_one_unit():
-    """p, q and r = p + q span the same plane with 2^28 as with 1; one tick off it is seen, by its sign."""
+    """p, q and r = p + q span the same plane with 2^28 as with 1; one tick off it is seen, by
+    its sign.
+    """
     m = 2**28
     ticks = np.array([[-m, -m, -m], [m, m - 1, m], [m, m, m - 1], [m, m, m], [m - 1, m, m]])
     cells = np.array(list(permutations(range(5), 4)))
@@ -198,7 +219,9 @@ def test_counts_and_sums_are_the_image_s(seed, n, is_snapped):
     owner = cell_of_voxel(image, mesh)
     assert moments.n_voxels.sum() == image.data.size
     assert (owner >= 0).all()
-    np.testing.assert_array_equal(np.bincount(owner.ravel(), minlength=len(mesh.cells)), moments.n_voxels)
+    np.testing.assert_array_equal(
+        np.bincount(owner.ravel(), minlength=len(mesh.cells)), moments.n_voxels
+    )
     data = image.data.astype(np.float64)
     assert moments.n_voxels @ moments.mean == pytest.approx(data.sum(), rel=1e-12)
     squares = moments.n_voxels @ (moments.variance + moments.mean**2)
@@ -242,7 +265,9 @@ def test_moment_sums_are_the_twin_s(seed, n, is_snapped):
 
 @pytest.mark.parametrize("high", [1, 46340, 92681, 92682, 3_000_001, 2.0**40, 0.5, 1e-30])
 def test_moment_sums_of_all_sizes_of_numbers(high):
-    """0 and `high` in random places: whole numbers whose sums of squares fit 31 bits, and not, and fractions."""
+    """0 and `high` in random places: whole numbers whose sums of squares fit 31 bits, and not,
+    and fractions.
+    """
     rng = np.random.default_rng(0)
     shape = (3, 4, 5)
     image = Image(np.where(rng.random(shape) < 0.5, 0, high))
@@ -278,7 +303,9 @@ def test_moments_are_numpy_s_over_each_cell_s_voxels(seed, n, is_snapped):
 
 @pytest.mark.parametrize(("offset", "contrast"), [(1e8, 1.0), (-1e8, 1.0), (0.4, 1e-6)])
 def test_variance_of_a_small_contrast_on_a_large_mean(offset, contrast):
-    """Two values in turn, a 1e-8th or a millionth apart: sums of h^2 would lose most digits of the variance."""
+    """Two values in turn, a 1e-8th or a millionth apart: sums of h^2 would lose most digits of
+    the variance.
+    """
     image = Image(offset + contrast * (np.indices((8, 8)).sum(axis=0) % 2))
     mesh = lattice_mesh(image, blocks=(1, 1))
     owner = cell_of_voxel(image, mesh)
@@ -293,7 +320,13 @@ def test_a_cell_without_voxel_centre_takes_the_nearest_voxel_s_value():
     data = np.array([[1.0, 2.0], [4.0, 8.0]])
     image = Image(data)
     tiny = np.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.1]])
-    for centre, value in [((0.2, 0.3), 1), ((0.2, 0.6), 2), ((0.8, 0.4), 4), ((1.4, 1.3), 8), ((7.0, -3.0), 4)]:
+    for centre, value in [
+        ((0.2, 0.3), 1),
+        ((0.2, 0.6), 2),
+        ((0.8, 0.4), 4),
+        ((1.4, 1.3), 8),
+        ((7.0, -3.0), 4),
+    ]:
         mesh = Mesh(tiny + centre, [[0, 1, 2]])
         count, mean, variance = (column.item() for column in cell_moments(image, mesh))
         assert (count, mean, variance) == (0, value, 0)
@@ -333,8 +366,11 @@ def test_a_mesh_partly_outside_counts_what_is_inside(seed, n):
     owner = cell_of_voxel(image, mesh)
     np.testing.assert_array_equal(owner, naive.cell_of_voxel(image, mesh))
     moments = cell_moments(image, mesh)
-    np.testing.assert_array_equal(moments.n_voxels, np.bincount(owner[owner >= 0], minlength=len(cells)))
-    # The box is shifted by halves, so its walls may run through centres: those in [low, high) are inside.
+    np.testing.assert_array_equal(
+        moments.n_voxels, np.bincount(owner[owner >= 0], minlength=len(cells))
+    )
+    # The box is shifted by halves, so its walls may run through centres: those in [low, high) are
+    # inside.
     is_inside = np.ones(image.shape, dtype=bool)
     for axis, centres in enumerate(np.indices(image.shape)):
         low, high = shift[axis] - 0.5, shift[axis] - 0.5 + (5, 4, 4)[axis]
@@ -361,13 +397,15 @@ def test_the_order_of_nodes_and_corners_changes_no_owner(seed, n):
     rng = np.random.default_rng(seed)
     image, mesh = random_case(seed, n, is_snapped=True)
     nodes = rng.permutation(len(mesh.points))
-    turned = np.roll(mesh.cells, 1, axis=1) if n == 2 else mesh.cells[:, [1, 2, 0, 3]]  # even permutations
+    # even permutations
+    turned = np.roll(mesh.cells, 1, axis=1) if n == 2 else mesh.cells[:, [1, 2, 0, 3]]
     other = Mesh(mesh.points[nodes], np.argsort(nodes)[turned])
     np.testing.assert_array_equal(cell_of_voxel(image, other), cell_of_voxel(image, mesh))
     ours, theirs = cell_moments(image, mesh), cell_moments(image, other)
     np.testing.assert_array_equal(ours.n_voxels, theirs.n_voxels)
     np.testing.assert_allclose(ours.variance, theirs.variance, rtol=1e-10, atol=1e-9)
-    # The centroid of an empty cell may lie half way between voxels, give or take the order of its sum.
+    # The centroid of an empty cell may lie half way between voxels, give or take the order of its
+    # sum.
     is_full = ours.n_voxels > 0
     np.testing.assert_allclose(ours.mean[is_full], theirs.mean[is_full], rtol=1e-13)
 
@@ -455,7 +493,9 @@ def test_cells_flat_or_inverted_at_the_grid_s_resolution_are_refused(function, h
     """A height of 1e-9 voxel is 0 ticks: positive in the world, flat in the grid."""
     image = Image(np.zeros((4, 4)), np.diag([hand, 1.0, 1.0]))
     flat = Mesh([[0, 0], [2, 0], [1, 1], [1, -1e-9]], [[0, 1, 2], [0, 3, 1]])
-    with pytest.raises(InputError, match=r"1 cells are flat or inverted to within a millionth .* such as \[1\]"):
+    with pytest.raises(
+        InputError, match=r"1 cells are flat or inverted to within a millionth .* such as \[1\]"
+    ):
         function(image, flat)
 
 
@@ -492,9 +532,15 @@ def test_owners_on_lattices_are_the_twin_s(shape, kind, blocks):
 @pytest.mark.parametrize(("n", "kind"), [(2, "criss-cross"), (3, "bcc"), (3, "five-tet")])
 @pytest.mark.parametrize("seed", range(3))
 def test_counts_on_jittered_lattices(n, kind, seed):
-    """Hundreds of cells, oblique voxels of unequal edges, interior nodes moved by up to a tenth of a block."""
+    """Hundreds of cells, oblique voxels of unequal edges, interior nodes moved by up to a tenth
+    of a block.
+    """
     rng = np.random.default_rng(seed)
-    shape = tuple(int(s * SMALL) for s in (40, 36, 50))[:n] if n == 2 else tuple(int(s * SMALL) for s in (20, 18, 26))
+    shape = (
+        tuple(int(s * SMALL) for s in (40, 36, 50))[:n]
+        if n == 2
+        else tuple(int(s * SMALL) for s in (20, 18, 26))
+    )
     blocks = (6, 5) if n == 2 else (3, 3, 4)
     image = random_image(rng, shape, random_affine(rng, n))
     mesh = lattice_mesh(image, kind, blocks=blocks)

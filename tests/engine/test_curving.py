@@ -1,4 +1,6 @@
-"""Mid-edge nodes on smooth levels: nearer to the true surface, no cell folded, nothing else moved."""
+"""Mid-edge nodes on smooth levels: nearer to the true surface, no cell folded, nothing else
+moved.
+"""
 
 import numpy as np
 import pytest
@@ -25,10 +27,14 @@ def straight(mesh):
 
 
 def off_the_sphere(mesh, rows, radius=SPHERE_MM):
-    """The mean distance of quadratic facets (K, 2) from a sphere (a circle) around the origin, mm."""
+    """The mean distance of quadratic facets (K, 2) from a sphere (a circle) around the origin,
+    mm.
+    """
     nodes, cells = quadratic(mesh.points, mesh.cells, mesh.midpoints)
     places, weights = curved_rule(mesh.ndim - 1)
-    on_facets = np.einsum("qa,kai->kqi", shape_values(places, 2), nodes[quadratic_facet_nodes(cells, rows)])
+    on_facets = np.einsum(
+        "qa,kai->kqi", shape_values(places, 2), nodes[quadratic_facet_nodes(cells, rows)]
+    )
     return (np.abs(np.linalg.norm(on_facets, axis=2) - radius) @ weights).mean()
 
 
@@ -50,7 +56,9 @@ def sphere():
 
 
 def test_a_labelled_sphere_is_round(sphere):
-    """Straight edges are 0.33 mm off in the mean and lose 5 % of the volume; curved ones 0.04 mm, and win 0.1 %."""
+    """Straight edges are 0.33 mm off in the mean and lose 5 % of the volume; curved ones 0.04
+    mm, and win 0.1 %.
+    """
     result, content = sphere
     mesh, labels, curving = result.mesh, result.labels, result.curving
     rows = interface(mesh, labels)
@@ -71,11 +79,15 @@ def test_only_edges_on_the_interface_are_curved(sphere):
     mesh, labels = sphere[0].mesh, sphere[0].labels
     edges, number = numbered_edges(mesh.cells)
     off = np.linalg.norm(mesh.midpoints - mesh.points[edges].mean(axis=1), axis=1)
-    n_labels = sum(np.bincount(number[labels == label].ravel(), minlength=len(edges)) > 0 for label in (0, 1))
+    n_labels = sum(
+        np.bincount(number[labels == label].ravel(), minlength=len(edges)) > 0 for label in (0, 1)
+    )
     assert (n_labels == 2).sum() == sphere[0].curving.n_edges
     assert (off[n_labels < 2] == 0.0).all()
     assert off.max() == pytest.approx(sphere[0].curving.farthest)
-    assert (off <= MOST_BENT * np.linalg.norm(np.diff(mesh.points[edges], axis=1)[:, 0], axis=1)).all()
+    assert (
+        off <= MOST_BENT * np.linalg.norm(np.diff(mesh.points[edges], axis=1)[:, 0], axis=1)
+    ).all()
 
 
 def test_edges_of_cells_that_would_fold_go_part_of_the_way(sphere, monkeypatch):
@@ -90,7 +102,9 @@ def test_edges_of_cells_that_would_fold_go_part_of_the_way(sphere, monkeypatch):
 
 
 def test_edges_whose_ends_are_off_the_level_stay_straight(monkeypatch):
-    """A lattice does not follow its labels: the level is near many edges, but they do not begin and end there."""
+    """A lattice does not follow its labels: the level is near many edges, but they do not begin
+    and end there.
+    """
     labels = tetopt.load_phantom("disc_2d").label_image(voxel_mm=2)
     content = tetopt.content(labels, labels)
     lattice = tetopt.lattice_mesh(labels, nodes=400)
@@ -111,12 +125,16 @@ def test_edges_on_a_side_of_a_sheared_box_stay_there():
     index, middles = half.to_index(mesh.points), half.to_index(mesh.midpoints)
     edges = numbered_edges(mesh.cells)[0]
     on_side = (np.abs(index[edges, 0] + 0.5) < 1e-9).all(axis=1)
-    assert (np.abs(middles[on_side] - index[edges[on_side]].mean(axis=1)) > 0.05).any(axis=1).sum() > 5
+    assert (np.abs(middles[on_side] - index[edges[on_side]].mean(axis=1)) > 0.05).any(
+        axis=1
+    ).sum() > 5
     np.testing.assert_allclose(middles[on_side, 0], -0.5, atol=1e-12)
 
 
 def test_a_mask_and_its_box():
-    """Half of a sphere, a mask of fractions, cut off by the box: its surface is curved, its sides stay flat."""
+    """Half of a sphere, a mask of fractions, cut off by the box: its surface is curved, its
+    sides stay flat.
+    """
     image = tetopt.load_phantom("sphere").image(voxel_mm=2)
     half = tetopt.Image((image.data[16:] - 20.0) / 80.0, image.affine @ _shifted(16))
     result = tetopt.mesh_image(tetopt.content(half, mask=half), 1500, order=2)
@@ -124,7 +142,9 @@ def test_a_mask_and_its_box():
     rows = boundary_rows(mesh)
     is_flat = (np.abs(mesh.points[facet_triples(mesh.cells, rows)][..., 0]) < 1e-6).all(axis=1)
     assert 20 < is_flat.sum() < 0.5 * len(rows)
-    assert off_the_sphere(mesh, rows[~is_flat]) < 0.45 * off_the_sphere(straight(mesh), rows[~is_flat])
+    assert off_the_sphere(mesh, rows[~is_flat]) < 0.45 * off_the_sphere(
+        straight(mesh), rows[~is_flat]
+    )
     edges = numbered_edges(mesh.cells)[0]
     on_side = (np.abs(mesh.points[edges][..., 0]) < 1e-6).all(axis=1)
     np.testing.assert_allclose(mesh.midpoints[on_side, 0], 0.0, atol=1e-9)

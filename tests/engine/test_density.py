@@ -1,4 +1,6 @@
-"""Splits and collapses: each leaves a mesh, measured as if afresh, and changes E by what was said."""
+"""Splits and collapses: each leaves a mesh, measured as if afresh, and changes E by what was
+said.
+"""
 
 import naive
 import numpy as np
@@ -91,7 +93,9 @@ def test_worth_is_what_E_falls_by(n, is_fixed):
                     continue
                 nobody = np.empty(0, dtype=np.int64)
                 none = EdgeMoves(everyone, np.full(N, -1), np.full(N, -np.inf))
-                made = make_exchanges(room, stars, splits, none, np.array([node]), nobody, (1, 1, 0.0), is_dirty)
+                made = make_exchanges(
+                    room, stars, splits, none, np.array([node]), nobody, (1, 1, 0.0), is_dirty
+                )
                 assert made == (1, 0)
                 expected = splits.gain[node]
                 was_on, is_frozen = was_frozen[[node, splits.other[node]]], room.complex.is_frozen
@@ -109,7 +113,8 @@ def test_worth_is_what_E_falls_by(n, is_fixed):
                 expected = collapses.gain[node]
                 engine.state = room
                 assert not (engine.cells == node).any()
-                engine.complex.ticks[node] = engine.complex.ticks[N - 1]  # out of the mesh: numbered away
+                # out of the mesh: numbered away
+                engine.complex.ticks[node] = engine.complex.ticks[N - 1]
                 engine.complex.cells[engine.complex.cells == N - 1] = node
                 engine.change(ticks=engine.complex.ticks[: N - 1])
             count += 1
@@ -119,16 +124,22 @@ def test_worth_is_what_E_falls_by(n, is_fixed):
 
 
 def test_splits_make_no_edge_shorter_than_asked():
-    """Of every node's best split, the halves and the edges to the other corners; some splits are refused for it."""
+    """Of every node's best split, the halves and the edges to the other corners; some splits are
+    refused for it.
+    """
     engine = random_case(5, 3)
     engine.sweep()
     N = len(engine.complex.ticks)
     stars, room = node_stars(engine.state), roomy(engine.state, N, 200)
     points, cells = engine.mesh.points, engine.mesh.cells
-    shortest = 0.45 * float(np.median(np.linalg.norm(points[cells[:, 0]] - points[cells[:, 1]], axis=1)))
+    shortest = 0.45 * float(
+        np.median(np.linalg.norm(points[cells[:, 0]] - points[cells[:, 1]], axis=1))
+    )
     made = []
     for limit in (0.0, shortest):
-        split = best_splits(room, stars, np.ones(N, dtype=bool), no_limits(N)._replace(shortest=limit)).other
+        split = best_splits(
+            room, stars, np.ones(N, dtype=bool), no_limits(N)._replace(shortest=limit)
+        ).other
         lengths = []
         for a in np.flatnonzero(split >= 0):
             star = cells[(cells == a).any(axis=1) & (cells == split[a]).any(axis=1)]
@@ -142,7 +153,9 @@ def test_splits_make_no_edge_shorter_than_asked():
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_edges_too_long_for_their_targets_are_split_first(n):
-    """The nodes that have one are the twin's; their splits come before all others, and raise E if they have to."""
+    """The nodes that have one are the twin's; their splits come before all others, and raise E
+    if they have to.
+    """
     engine = random_case(5, n)
     engine.sweep()
     N = len(engine.complex.ticks)
@@ -156,11 +169,15 @@ def test_edges_too_long_for_their_targets_are_split_first(n):
     assert not too_long(engine.state, np.full(N, np.inf)).any()
     stars, room = node_stars(engine.state), roomy(engine.state, N, 200)
     limits = no_limits(N)._replace(target=target)
-    plain, sized = (best_splits(room, stars, np.ones(N, dtype=bool), each) for each in (no_limits(N), limits))
+    plain, sized = (
+        best_splits(room, stars, np.ones(N, dtype=bool), each) for each in (no_limits(N), limits)
+    )
     is_long = np.zeros(N, dtype=bool)
     for a in np.flatnonzero(sized.other >= 0):
         b = sized.other[a]
-        is_long[a] = np.linalg.norm(points[a] - points[b]) > 2.0**0.5 * (target[a] + target[b]) / 2.0
+        is_long[a] = (
+            np.linalg.norm(points[a] - points[b]) > 2.0**0.5 * (target[a] + target[b]) / 2.0
+        )
         if not is_long[a]:
             assert (sized.other[a], sized.gain[a]) == (plain.other[a], plain.gain[a])
     assert is_long.any()
@@ -202,7 +219,9 @@ def test_collapses_are_the_best_of_all_neighbours(is_bounded):
             if (new_edges > np.maximum(np.minimum(longest[near], longest[b]), old)).any():
                 refused += 1
                 continue
-            new = np.where(cells == a, b, cells)[~((cells == a).any(axis=1) & (cells == b).any(axis=1))]
+            new = np.where(cells == a, b, cells)[
+                ~((cells == a).any(axis=1) & (cells == b).any(axis=1))
+            ]
             volume = np.linalg.det(engine.mesh.points[new[:, 1:]] - engine.mesh.points[new[:, :1]])
             if (volume <= 1e-6).any() or abs(volume.sum() / size - 1) > 1e-9:
                 continue
@@ -210,7 +229,9 @@ def test_collapses_are_the_best_of_all_neighbours(is_bounded):
             if (is_frozen[a, :3] & ~(is_frozen[b, :3] & (ticks[a] == ticks[b]))).any():
                 continue
             E_G, squares = energies(engine.fresh(new))
-            best = min(best, engine.objective.geometry * E_G + engine.objective.image * squares - engine.E)
+            best = min(
+                best, engine.objective.geometry * E_G + engine.objective.image * squares - engine.E
+            )
         if best < np.inf:
             joined += 1
             assert -collapses.gain[a] == pytest.approx(best, rel=1e-6, abs=1e-9)
@@ -223,7 +244,9 @@ def test_collapses_are_the_best_of_all_neighbours(is_bounded):
 @settings(max_examples=10, deadline=None)
 @given(seeds, st.booleans())
 def test_mending_by_nodes(seed, turned):
-    """Nodes taken out and put in at the worst cells: fewer flat cells, none worse, and a mesh still."""
+    """Nodes taken out and put in at the worst cells: fewer flat cells, none worse, and a mesh
+    still.
+    """
     engine = assumed_case(seed, 3, OBLIQUE if turned else None)
     target = -np.cos(np.radians(20.0))
     for _ in range(3):
@@ -242,7 +265,9 @@ def test_mending_by_nodes(seed, turned):
 
 @pytest.mark.full
 def test_nodes_go_where_the_image_is():
-    """A ball in a large box, exchanged at the same number of nodes: more of them near its surface, and less E_D."""
+    """A ball in a large box, exchanged at the same number of nodes: more of them near its
+    surface, and less E_D.
+    """
     index = np.stack(np.meshgrid(*[np.arange(32)] * 3, indexing="ij"), -1)
     image = tetopt.Image(100.0 * (((index - 20) ** 2).sum(-1) < 49))
     E_D, nodes_near = {}, {}
@@ -281,7 +306,9 @@ def test_a_part_of_the_box_stays_what_it_is(part, boundary):
     centre = whole.points[whole.cells].mean(axis=1)
     kept = centre[:, 0] < 11.5 if part == "half" else ~(centre > 11.5).all(axis=1)
     start = part_of(whole, kept)
-    result = tetopt.optimize(image, start, k_D=0.75, nodes=3 * len(start.points), boundary=boundary, iterations=6)
+    result = tetopt.optimize(
+        image, start, k_D=0.75, nodes=3 * len(start.points), boundary=boundary, iterations=6
+    )
     assert len(result.mesh.points) > 1.5 * len(start.points)
     assert tetopt.check_mesh(result.mesh) == []
     assert volumes(result.mesh.points, result.mesh.cells).sum() == pytest.approx(
@@ -301,6 +328,8 @@ def test_numbers_of_nodes_that_are_none(nodes):
 def test_far_more_nodes():
     """From 35 nodes towards 8000: doubled at most at each exchange, none of them wrong."""
     image = tetopt.Image(np.random.default_rng(1).normal(size=(20, 20, 20)))
-    result = tetopt.optimize(image, tetopt.lattice_mesh(image, blocks=(2, 2, 2)), k_D=0.9, nodes=8000, iterations=6)
+    result = tetopt.optimize(
+        image, tetopt.lattice_mesh(image, blocks=(2, 2, 2)), k_D=0.9, nodes=8000, iterations=6
+    )
     assert 50 < len(result.mesh.points) < 8000
     assert tetopt.check_mesh(result.mesh, image) == []

@@ -1,4 +1,6 @@
-"""Runs that are stopped, wherever they ask: mesh, labels and voxels belong together, and all measures take them."""
+"""Runs that are stopped, wherever they ask: mesh, labels and voxels belong together, and all
+measures take them.
+"""
 
 from pathlib import Path
 
@@ -24,7 +26,9 @@ def target(n, *parts):
     """A ball with what is named: labels (ball, core, rest), mask, second contrast."""
     image = ball((14,) * n if n == 3 else (24, 20))
     h = image.data
-    index = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, s) for s in image.shape], indexing="ij"), -1)
+    index = np.stack(
+        np.meshgrid(*[np.linspace(-1.0, 1.0, s) for s in image.shape], indexing="ij"), -1
+    )
     radius = np.linalg.norm(index, axis=-1)
     of = lambda values: tetopt.Image(1.0 * values, image.affine)  # noqa: E731
     labels = of((radius < 0.7) + (radius < 0.4)) if "labels" in parts else None
@@ -80,7 +84,9 @@ def assert_sound(result, image, labels, mask, order=1):
     check_unfolded(mesh)
     owner = tetopt.cell_of_voxel(image, mesh)
     moments = tetopt.cell_moments(image, mesh)
-    np.testing.assert_array_equal(np.bincount(owner.ravel() + 1, minlength=len(mesh.cells) + 1)[1:], moments.n_voxels)
+    np.testing.assert_array_equal(
+        np.bincount(owner.ravel() + 1, minlength=len(mesh.cells) + 1)[1:], moments.n_voxels
+    )
     assert overlap_of(image, mesh) is None
     assert last.n_voxels == (owner >= 0).sum()
     if mask is None and labels is None:
@@ -88,7 +94,9 @@ def assert_sound(result, image, labels, mask, order=1):
     assert tetopt.quality(mesh.points, mesh.cells).n_cells == len(mesh.cells)
     fields = tetopt.cell_fields(mesh, image)
     if labels is not None:  # at whatever iteration it ended
-        problems = manifold_problems(mesh, result.labels) + ([] if mask is None else manifold_problems(mesh))
+        problems = manifold_problems(mesh, result.labels) + (
+            [] if mask is None else manifold_problems(mesh)
+        )
         assert bool(problems) == ("manifold" in result.violated)
         assert set(result.labels.tolist()) <= set(labels.data.astype(int).ravel().tolist())
         fields["label"] = result.labels
@@ -102,7 +110,9 @@ def assert_sound(result, image, labels, mask, order=1):
 
 
 def assert_sound_however_stopped(run, asks, *parts):
-    """Stopped at each of the numbers of asks; a search may then give what an earlier run of it came to."""
+    """Stopped at each of the numbers of asks; a search may then give what an earlier run of it
+    came to.
+    """
     for k in asks:
         result = run(Asked(k))
         assert result.ended == "stopped" or k > asks[0]
@@ -120,7 +130,9 @@ def test_a_stopped_run_is_sound(kind):
     (image, labels, mask, _), options = KINDS[kind]
     n = asks_of(lambda stop: meshed(kind, stop))
     asks = sorted({round(k) for k in np.linspace(1, n, SPREAD)})
-    assert_sound_however_stopped(lambda stop: meshed(kind, stop), asks, image, labels, mask, options.get("order", 1))
+    assert_sound_however_stopped(
+        lambda stop: meshed(kind, stop), asks, image, labels, mask, options.get("order", 1)
+    )
 
 
 @pytest.mark.slow
@@ -129,7 +141,12 @@ def test_a_run_stopped_anywhere_is_sound(kind):
     (image, labels, mask, _), options = KINDS[kind]
     n = asks_of(lambda stop: meshed(kind, stop))
     assert_sound_however_stopped(
-        lambda stop: meshed(kind, stop), range(1, n + 1), image, labels, mask, options.get("order", 1)
+        lambda stop: meshed(kind, stop),
+        range(1, n + 1),
+        image,
+        labels,
+        mask,
+        options.get("order", 1),
     )
 
 
@@ -159,7 +176,9 @@ def test_parts_stopped_anywhere_are_sound(tmp_path):
 
 
 def test_cells_are_lifted_no_longer_than_a_run_has_time():
-    """A question in each round, and for some cells at a time; once over, the round's splits are the last moves."""
+    """A question in each round, and for some cells at a time; once over, the round's splits are
+    the last moves.
+    """
     image = target(3)[0]
     mesh = tetopt.Mesh(*delaunay_box(np.random.default_rng(0), image.shape, 150))
     of = lambda: Engine(image, mesh)  # noqa: E731
@@ -177,7 +196,9 @@ def test_cells_are_lifted_no_longer_than_a_run_has_time():
 
 
 def test_lifting_skips_only_what_would_fail_again(monkeypatch):
-    """An angle out of reach: without the marks all is tried again, many times over, and the same comes of it."""
+    """An angle out of reach: without the marks all is tried again, many times over, and the same
+    comes of it.
+    """
     marked, every = (random_case(3, 3) for _ in range(2))
     lifted = marked.repair(40.0)
     tried, displace = [], tetopt.engine.repair._displace

@@ -18,7 +18,14 @@ from tetopt.energy.discretization import cell_E_D
 from tetopt.energy.geometric import cell_E_G
 from tetopt.energy.sampling import from_ticks
 from tetopt.engine import flips, loop
-from tetopt.engine.complex import build, cell_squares, cosine_up_to_limit, energies, node_stars, remeasure
+from tetopt.engine.complex import (
+    build,
+    cell_squares,
+    cosine_up_to_limit,
+    energies,
+    node_stars,
+    remeasure,
+)
 from tetopt.engine.fast import Run
 from tetopt.engine.repair import n_cells_below
 from tetopt.engine.smooth import _add_image_gradient, _add_shape_gradient, gradient
@@ -33,17 +40,22 @@ dimensions = st.sampled_from([2, 3])
 def smooth_image(shape, affine=None):
     """A sum of waves long against a voxel."""
     index = np.stack(np.meshgrid(*[np.arange(s) / s for s in shape], indexing="ij"), -1)
-    data = np.sin(4.0 * index[..., 0] + 1.0) * np.cos(3.0 * index[..., -1]) + 0.7 * np.sin(5.0 * index.sum(-1))
+    data = np.sin(4.0 * index[..., 0] + 1.0) * np.cos(3.0 * index[..., -1]) + 0.7 * np.sin(
+        5.0 * index.sum(-1)
+    )
     return tetopt.Image(100.0 * data, affine)
 
 
 def test_cells_that_are_surely_above_a_minimum_dihedral_angle():
-    """The bound by the shape measure never lets one through that is below, and lets most regular ones through."""
+    """The bound by the shape measure never lets one through that is below, and lets most regular
+    ones through.
+    """
     rng = np.random.default_rng(4)
     corners = rng.normal(size=(800, 4, 3))
     corners[:400] = [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]] + 0.5 * corners[:400]
     corners[200:300, :, 0] *= 0.2  # flat ones
-    half = np.radians(rng.uniform(1.0, 70.0, 200)) / 2.0  # and the very ones that the bound is sharp for
+    # and the very ones that the bound is sharp for
+    half = np.radians(rng.uniform(1.0, 70.0, 200)) / 2.0
     edge = 0.5 * np.sqrt(1.0 + np.sin(half) ** 2)
     zero = np.zeros_like(half)
     ends = np.stack([np.stack([zero, zero, s * edge], 1) for s in (1, -1)], 1)
@@ -51,23 +63,38 @@ def test_cells_that_are_surely_above_a_minimum_dihedral_angle():
     corners = np.concatenate([corners, np.concatenate([ends, others], axis=1)])
     mirrored = np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0
     corners[mirrored] = corners[mirrored][:, [1, 0, 2, 3]]
-    angles = dihedral_angles(corners.reshape(-1, 3), np.arange(4 * len(corners)).reshape(-1, 4)).min(axis=1)
+    angles = dihedral_angles(
+        corners.reshape(-1, 3), np.arange(4 * len(corners)).reshape(-1, 4)
+    ).min(axis=1)
     objective = random_case(1, 3).objective
     for min_dihedral in (5.0, 12.0, 40.0):
         cosine, safe = angle_limit_of(min_dihedral)
-        cosines = np.array([cosine_up_to_limit(x, objective._replace(angle_limit=cosine, safe=safe)) for x in corners])
+        cosines = np.array(
+            [
+                cosine_up_to_limit(x, objective._replace(angle_limit=cosine, safe=safe))
+                for x in corners
+            ]
+        )
         assert (angles[cosines >= cosine] >= min_dihedral * (1 - 1e-12)).all()
-        np.testing.assert_allclose(cosines[cosines < cosine], -np.cos(np.radians(angles[cosines < cosine])), atol=1e-9)
+        np.testing.assert_allclose(
+            cosines[cosines < cosine], -np.cos(np.radians(angles[cosines < cosine])), atol=1e-9
+        )
     objective = objective._replace(angle_limit=-0.97, safe=angle_limit_of(12.0)[1])
-    assert (np.array([cosine_up_to_limit(x, objective) for x in corners[:160]]) == -0.97).mean() > 0.5
+    assert (
+        np.array([cosine_up_to_limit(x, objective) for x in corners[:160]]) == -0.97
+    ).mean() > 0.5
 
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_squares_of_cells(n):
-    """E_D of each cell; and by hand, of no voxel, one, three (1, 2 and 6) and a rounding below 0."""
+    """E_D of each cell; and by hand, of no voxel, one, three (1, 2 and 6) and a rounding below
+    0.
+    """
     engine = random_case(5, n)
     squares = cell_squares(engine.state) * engine.image.voxel_volume
-    np.testing.assert_allclose(squares, cell_E_D(engine.image, engine.mesh), rtol=1e-9, atol=1e-9 * squares.max())
+    np.testing.assert_allclose(
+        squares, cell_E_D(engine.image, engine.mesh), rtol=1e-9, atol=1e-9 * squares.max()
+    )
     engine.complex.sums[:4] = [[0.0, 0, 0], [1, 5, 25], [3, 9, 41], [2, 2, 2 - 1e-15]]
     assert cell_squares(engine.state)[:4].tolist() == [0, 0, 14, 0]
 
@@ -85,7 +112,9 @@ def test_shape_gradient(n, power):
 
     def energy(points):
         v_E_G = cell_E_G(points, mesh.cells)
-        v = np.abs(np.linalg.det(points[mesh.cells][:, 1:] - points[mesh.cells][:, :1])) / (2.0 if n == 2 else 6.0)
+        v = np.abs(np.linalg.det(points[mesh.cells][:, 1:] - points[mesh.cells][:, :1])) / (
+            2.0 if n == 2 else 6.0
+        )
         S = v_E_G * (n + 1) * (n + 2) / v
         eta = S / (4 * np.sqrt(3) * v) if n == 2 else S / (12 * (3 * v) ** (2 / 3))
         return engine.objective.geometry * float((v_E_G * eta ** (power - 1)).sum())
@@ -97,7 +126,9 @@ def test_shape_gradient(n, power):
                 moved = mesh.points.copy()
                 moved[node, d] += sign * 1e-5
                 ends.append(energy(moved))
-            assert shape[node, 3 - n + d] == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-5, abs=1e-9)
+            assert shape[node, 3 - n + d] == pytest.approx(
+                (ends[0] - ends[1]) / 2e-5, rel=1e-5, abs=1e-9
+            )
     if power == 1.0:
         expected = engine.objective.geometry * naive.E_G_gradient(mesh.points, mesh.cells)
         np.testing.assert_allclose(shape[:, 3 - n :], expected, rtol=1e-6, atol=1e-12)
@@ -109,7 +140,8 @@ def test_shape_curvature(n, is_graded):
     """Against central differences of the gradient."""
     engine = random_case(5, n, OBLIQUE if n == 3 else None, 2.2)
     state = engine.state._replace(objective=engine.objective._replace(is_graded=is_graded))
-    stars, matrix = node_stars(state), state.objective.matrix * 2.0**-state.objective.bits  # mm per tick
+    # mm per tick
+    stars, matrix = node_stars(state), state.objective.matrix * 2.0**-state.objective.bits
     step = int(1e-4 / np.abs(matrix).max())
 
     def derivatives(node):
@@ -129,12 +161,16 @@ def test_shape_curvature(n, is_graded):
             state.complex.ticks[node] = here
             expected[axis] = (ends[0] - ends[1]) / (2 * step)  # per tick along the axis
         got = (matrix.T @ H)[3 - n :, 3 - n :]
-        np.testing.assert_allclose(got, expected[3 - n :, 3 - n :], rtol=1e-5, atol=1e-7 * np.abs(expected).max())
+        np.testing.assert_allclose(
+            got, expected[3 - n :, 3 - n :], rtol=1e-5, atol=1e-7 * np.abs(expected).max()
+        )
 
 
 @pytest.mark.full
 def test_image_curvature_at_a_step():
-    """Where the image steps across a facet that is nearly there already, E_D bends; in a uniform image it does not."""
+    """Where the image steps across a facet that is nearly there already, E_D bends; in a uniform
+    image it does not.
+    """
     data = np.where(np.arange(40)[:, None, None] > 20, 100.0, 20.0) * np.ones((40, 36, 32))
     image = tetopt.Image(data)
     mesh = tetopt.lattice_mesh(image, blocks=(2, 2, 2))
@@ -154,15 +190,20 @@ def test_image_curvature_at_a_step():
 def test_image_gradient_on_smooth_images(n, turned):
     """The face integrals against central differences of the sampled E_D, at some of the nodes.
 
-    The differences are taken over many voxels, so that the sampling's own noise averages out; what is left of it, and
-    of the third derivative, is the band: 3e-3 of the largest derivative in 2-D, 8e-3 in 3-D, whose volumes are smaller.
+    The differences are taken over many voxels, so that the sampling's own noise averages out; what
+    is left of it, and of the third derivative, is the band: 3e-3 of the largest derivative in 2-D,
+    8e-3 in 3-D, whose volumes are smaller.
     """
-    shape, blocks, reach = ((2400, 2000), (3, 3), 16.0) if n == 2 else ((200, 180, 190), (3, 3, 3), 8.0)
+    shape, blocks, reach = (
+        ((2400, 2000), (3, 3), 16.0) if n == 2 else ((200, 180, 190), (3, 3, 3), 8.0)
+    )
     image = smooth_image(shape, None if not turned else np.diag([1.0, -0.5, 2.0, 1.0]))
     mesh = tetopt.lattice_mesh(image, blocks=blocks)
     engine = Engine(image, mesh, 0.5)
     _, image_gradient = gradient(engine.state, node_stars(engine.state))
-    inner = np.flatnonzero(~engine.complex.is_frozen[:, 3 - n : 3].any(axis=1))[:: 3 if n == 2 else 6]
+    inner = np.flatnonzero(~engine.complex.is_frozen[:, 3 - n : 3].any(axis=1))[
+        :: 3 if n == 2 else 6
+    ]
     expected = np.zeros((len(inner), n))
     for row, node in enumerate(inner):
         for d in range(n):
@@ -182,9 +223,13 @@ def test_image_gradient_on_smooth_images(n, turned):
 
 
 @settings(max_examples=15, deadline=None)
-@given(seeds, dimensions, st.sampled_from([0.0, 0.3, 0.9]), st.sampled_from([1.0, 3.0]), st.booleans())
+@given(
+    seeds, dimensions, st.sampled_from([0.0, 0.3, 0.9]), st.sampled_from([1.0, 3.0]), st.booleans()
+)
 def test_thousands_of_moves_leave_a_mesh(seed, n, k_D, power, turned):
-    """Sweeps, flips and repairs of random meshes over noise: E falls by what was said, and everything stays sound."""
+    """Sweeps, flips and repairs of random meshes over noise: E falls by what was said, and
+    everything stays sound.
+    """
     affine = OBLIQUE if turned and n == 3 else None
     engine = assumed_case(seed, n, affine, power, k_D)
     E = engine.E
@@ -216,8 +261,9 @@ def test_thousands_of_moves_leave_a_mesh(seed, n, k_D, power, turned):
 def test_flips_at_k_D_0_tend_to_delaunay(n):
     """The lifted surface's interpolation error is E_G, least for Delaunay.
 
-    In 2-D flips reach that from any mesh (Lawson 1972). In 3-D they may stop short of it, but not if they start, as in
-    an optimisation, from Delaunay's cells with the nodes moved: by a quarter of their distance here.
+    In 2-D flips reach that from any mesh (Lawson 1972). In 3-D they may stop short of it, but not
+    if they start, as in an optimisation, from Delaunay's cells with the nodes moved: by a quarter
+    of their distance here.
     """
     rng = np.random.default_rng(2)
     shape = (30, 30, 30)[:n]
@@ -253,7 +299,10 @@ def test_a_flip_is_worth_what_it_says():
     best = int(np.argmax(gain))
     E = engine.E
     work = flips.cavity(room, engine.complex.fluxes.shape[2])
-    assert flips.make_moves(np.array([best]), move, np.zeros(room, dtype=bool), engine.state, work) == 1
+    assert (
+        flips.make_moves(np.array([best]), move, np.zeros(room, dtype=bool), engine.state, work)
+        == 1
+    )
     assert E - engine.E == pytest.approx(gain[best], rel=1e-9)
     engine.assert_sound()
 
@@ -265,7 +314,9 @@ def test_a_flip_is_worth_what_it_says():
 @pytest.mark.parametrize("k_D", [0.0, 0.3])
 @pytest.mark.parametrize("boundary", ["slide", "fixed"])
 def test_mappings(name, k_D, boundary):
-    """A mesh of the box with every voxel; E falls but where cells were lifted; the history is of the mesh."""
+    """A mesh of the box with every voxel; E falls but where cells were lifted; the history is of
+    the mesh.
+    """
     image, blocks = CASES[name]
     mesh = tetopt.lattice_mesh(image, blocks=blocks)
     result = tetopt.optimize(image, mesh, k_D=k_D, iterations=8, boundary=boundary)
@@ -274,7 +325,9 @@ def test_mappings(name, k_D, boundary):
     E = np.array([row.E for row in result.history])
     assert (np.diff(E) <= 1e-12).all()
     assert E[-1] < E[0]
-    assert tetopt.E_D(image, result.mesh) == pytest.approx(result.history[-1].E_D, rel=1e-9, abs=1e-6)
+    assert tetopt.E_D(image, result.mesh) == pytest.approx(
+        result.history[-1].E_D, rel=1e-9, abs=1e-6
+    )
     assert len(result.mesh.cells) == result.history[-1].n_cells
     if boundary == "fixed":
         outer = np.unique(boundary_facets(mesh.cells))
@@ -311,7 +364,9 @@ def test_same_bits_for_any_number_of_threads():
 
 @pytest.mark.full
 def test_the_minimum_dihedral_angle():
-    """Higher ones are reached too, up to what a coarse ball allows; without one, worse cells are left."""
+    """Higher ones are reached too, up to what a coarse ball allows; without one, worse cells are
+    left.
+    """
     image, _ = CASES["3-D"]
     mesh = tetopt.lattice_mesh(image, nodes=250)
     worst = {}
@@ -323,7 +378,9 @@ def test_the_minimum_dihedral_angle():
 
 
 def squashed(image, blocks):
-    """A lattice some of whose cells have been pressed flat: angles of about 2 degrees, at inner nodes."""
+    """A lattice some of whose cells have been pressed flat: angles of about 2 degrees, at inner
+    nodes.
+    """
     mesh = tetopt.lattice_mesh(image, blocks=blocks)
     points = mesh.points.copy()
     index = image.to_index(points)
@@ -354,7 +411,8 @@ def test_flips_leave_nothing_to_gain():
     assert engine.flip() == 0
     image, blocks = CASES["3-D"]
     run = Run(plain(image), tetopt.lattice_mesh(image, blocks=blocks), 0.5)
-    for _ in range(4):  # looked for only around the nodes that moved, little is left for a look at all of them
+    # looked for only around the nodes that moved, little is left for a look at all of them
+    for _ in range(4):
         run.sweep()
         run.flip()
     assert flips.flip(run.state)[1] <= 2
@@ -375,7 +433,11 @@ def test_removing_an_edge_takes_the_best_triangulation():
     engine = random_case(23, 3)
     work = flips.cavity(0, 3)
     ring, around = work.ring, work.around
-    cells, across, is_all = engine.complex.cells, engine.complex.across, np.ones(len(engine.cells), dtype=bool)
+    cells, across, is_all = (
+        engine.complex.cells,
+        engine.complex.across,
+        np.ones(len(engine.cells), dtype=bool),
+    )
     edges = gained = 0
     for cell in range(0, len(engine.cells), 6):
         for i, j in flips.TET_EDGES:
@@ -402,7 +464,9 @@ def test_removing_an_edge_takes_the_best_triangulation():
 
 
 def energy_of(engine, tets):
-    """Energies of tetrahedra given by their corners, from the library's numpy functions; infinite if inverted."""
+    """Energies of tetrahedra given by their corners, from the library's numpy functions;
+    infinite if inverted.
+    """
     points = engine.image.to_world(from_ticks(engine.complex.ticks, engine.grid, 3))
     corners = points[tets]
     v = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6.0
@@ -423,7 +487,9 @@ def energy_of(engine, tets):
 
 
 def test_edges_with_many_cells_are_left_alone():
-    """Twelve tetrahedra around one edge, closed and open: no polygon, and nothing written past its room."""
+    """Twelve tetrahedra around one edge, closed and open: no polygon, and nothing written past
+    its room.
+    """
     for is_open in (False, True):
         angles = np.linspace(0.0, np.pi if is_open else 2.0 * np.pi, 13)
         rim = np.column_stack([3.0 * np.cos(angles), 3.0 * np.sin(angles), np.zeros(13)])
@@ -431,13 +497,22 @@ def test_edges_with_many_cells_are_left_alone():
         points = np.vstack([[[0, 0, -3.0], [0, 0, 3.0]], rim]) + 5.0
         n = len(rim)
         cells = np.array([[0, 1, 2 + k, 2 + (k + 1) % n] for k in range(12)])
-        engine = Engine(tetopt.Image(np.arange(1000.0).reshape(10, 10, 10)), tetopt.Mesh(points, cells))
+        engine = Engine(
+            tetopt.Image(np.arange(1000.0).reshape(10, 10, 10)), tetopt.Mesh(points, cells)
+        )
         room = np.full(flips.POLYGON_CORNERS + 5, -7)
         ring, around = room[: flips.POLYGON_CORNERS], np.full(flips.POLYGON_CORNERS, -7)
         for cell in range(12):
             for i, j in flips.TET_EDGES:
                 m, _ = flips.ring_of_edge(
-                    ring, around, engine.complex.cells, engine.complex.across, cell, i, j, np.zeros(0, dtype=bool)
+                    ring,
+                    around,
+                    engine.complex.cells,
+                    engine.complex.across,
+                    cell,
+                    i,
+                    j,
+                    np.zeros(0, dtype=bool),
                 )
                 is_axis = set(engine.complex.cells[cell, [i, j]].tolist()) == {0, 1}
                 assert m == 0 if is_axis else m in (2, 3)
@@ -448,9 +523,14 @@ def test_refuses_flat_and_folded_starts():
     image, blocks = CASES["3-D"]
     mesh = tetopt.lattice_mesh(image, blocks=blocks)
     a, b, c, d = mesh.cells[0]
-    points = np.vstack([mesh.points, mesh.points[[a, b, c]].mean(axis=0) * (1 - 1e-7) + 1e-7 * mesh.points[d]])
+    points = np.vstack(
+        [mesh.points, mesh.points[[a, b, c]].mean(axis=0) * (1 - 1e-7) + 1e-7 * mesh.points[d]]
+    )
     e = len(mesh.points)
-    flat = tetopt.Mesh(points, np.vstack([mesh.cells[1:], [[a, b, c, e], [a, b, e, d], [a, e, c, d], [e, b, c, d]]]))
+    flat = tetopt.Mesh(
+        points,
+        np.vstack([mesh.cells[1:], [[a, b, c, e], [a, b, e, d], [a, e, c, d], [e, b, c, d]]]),
+    )
     with pytest.raises(tetopt.InputError, match=r"too flat|flat or inverted"):
         tetopt.optimize(image, flat, iterations=1)
     folded = mesh.points.copy()
@@ -465,13 +545,18 @@ def test_refuses_flat_and_folded_starts():
             tetopt.optimize(image, tetopt.Mesh(folded, cells), iterations=1)
 
 
-@pytest.mark.parametrize(("rise", "ended"), [(0.0, "converged"), (1e-5, "converged"), (0.01, "risen")])
+@pytest.mark.parametrize(
+    ("rise", "ended"), [(0.0, "converged"), (1e-5, "converged"), (0.01, "risen")]
+)
 def test_a_run_whose_energy_rises_has_not_converged(rise, ended, monkeypatch):
     """As it may where interfaces follow their surfaces."""
     image, blocks = CASES["3-D"]
     energies_seen = itertools.count()
     monkeypatch.setattr(Run, "E", lambda _: 1.0 + rise * next(energies_seen))
-    assert tetopt.optimize(image, tetopt.lattice_mesh(image, blocks=blocks), iterations=4).ended == ended
+    assert (
+        tetopt.optimize(image, tetopt.lattice_mesh(image, blocks=blocks), iterations=4).ended
+        == ended
+    )
 
 
 def test_stops_and_tells_why():
@@ -508,7 +593,9 @@ def test_refuses(options, words):
 
 
 def test_run_measures_what_it_has():
-    """After iterations with lifts and flips, the run's complex is what a fresh measurement finds."""
+    """After iterations with lifts and flips, the run's complex is what a fresh measurement
+    finds.
+    """
     image, blocks = CASES["oblique"]
     run = Run(plain(image), tetopt.lattice_mesh(image, blocks=blocks), 0.5)
     for _ in range(3):
@@ -519,6 +606,8 @@ def test_run_measures_what_it_has():
     run.sweep()
     run.flip()
     now, n_cells = run.state.complex, run.n_cells
-    fresh = build(now.cells[:n_cells], now.ticks, now.is_frozen, run.state.objective, run.state.sides).complex
+    fresh = build(
+        now.cells[:n_cells], now.ticks, now.is_frozen, run.state.objective, run.state.sides
+    ).complex
     np.testing.assert_array_equal(now.sums[:n_cells], fresh.sums[:n_cells])
     np.testing.assert_array_equal(now.across[:n_cells], fresh.across[:n_cells])

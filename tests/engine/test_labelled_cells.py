@@ -74,7 +74,9 @@ def meeting_labels(state):
     """The labels around each node, plainly."""
     n_cells = int(state.complex.n_cells[0])
     around = [set() for _ in state.complex.ticks]
-    for cell, label in zip(state.complex.cells[:n_cells], state.complex.labels[:n_cells], strict=True):
+    for cell, label in zip(
+        state.complex.cells[:n_cells], state.complex.labels[:n_cells], strict=True
+    ):
         for node in cell:
             around[node].add(int(label))
     return [labels if len(labels) > 1 else set() for labels in around]
@@ -97,7 +99,9 @@ def attracted(state):
 
 def exchanged(state):
     n_nodes = len(state.complex.ticks)
-    return exchange(state, n_nodes - 30, 60, Limits(1.0, np.full(n_nodes, 1e3), 0.0, np.full(n_nodes, np.inf))).state
+    return exchange(
+        state, n_nodes - 30, 60, Limits(1.0, np.full(n_nodes, 1e3), 0.0, np.full(n_nodes, np.inf))
+    ).state
 
 
 MOVES = {
@@ -111,39 +115,60 @@ MOVES = {
 
 @pytest.mark.parametrize("name", CASES)
 def test_every_move_keeps_labels_topology_and_sums(labelled_state, name):
-    """Euler numbers and manifoldness of every label, which labels meet at a node, and all sums measured afresh."""
+    """Euler numbers and manifoldness of every label, which labels meet at a node, and all sums
+    measured afresh.
+    """
     state, target, grid = labelled_state(name)
     state = MOVES["attract"](state)
     before = topology(state, target, grid)
     for move in ("sweep", "flip", "exchange", "attract", "sweep", "exchange", "flip", "repair"):
         n_cells = int(state.complex.n_cells[0])
-        old = state.complex.cells[:n_cells].copy(), state.complex.labels[:n_cells].copy(), state.complex.ticks.copy()
+        old = (
+            state.complex.cells[:n_cells].copy(),
+            state.complex.labels[:n_cells].copy(),
+            state.complex.ticks.copy(),
+        )
         state = MOVES[move](state)
         n_cells = int(state.complex.n_cells[0])
         new = state.complex.cells[:n_cells], state.complex.labels[:n_cells], state.complex.ticks
         if move in ("sweep", "flip", "exchange"):
-            assert any(a.shape != b.shape or (a != b).any() for a, b in zip(old, new, strict=True)), move
+            assert any(
+                a.shape != b.shape or (a != b).any() for a, b in zip(old, new, strict=True)
+            ), move
         assert topology(state, target, grid) == before, move
         assert stated_labels(state) == meeting_labels(state), move
         sums, E_shape = state.complex.sums[:n_cells].copy(), state.complex.E_shape[:n_cells].copy()
         remeasure(state)
-        np.testing.assert_allclose(state.complex.sums[:n_cells], sums, atol=1e-6 * np.abs(sums).max(), err_msg=move)
-        np.testing.assert_allclose(state.complex.E_shape[:n_cells], E_shape, rtol=1e-9, err_msg=move)
+        np.testing.assert_allclose(
+            state.complex.sums[:n_cells], sums, atol=1e-6 * np.abs(sums).max(), err_msg=move
+        )
+        np.testing.assert_allclose(
+            state.complex.E_shape[:n_cells], E_shape, rtol=1e-9, err_msg=move
+        )
 
 
 @pytest.mark.parametrize("has_mask", [False, True])
 @pytest.mark.parametrize("has_labels", [False, True])
 def test_splits_are_the_best_of_all_edges(has_mask, has_labels):
-    """Of each node: none of its other edges would have gained more, though few are evaluated in full."""
+    """Of each node: none of its other edges would have gained more, though few are evaluated in
+    full.
+    """
     image = CASES["balls"]
-    target = content(image, image if has_labels else None, tetopt.Image(image.data > 0.0) if has_mask else None)
+    target = content(
+        image, image if has_labels else None, tetopt.Image(image.data > 0.0) if has_mask else None
+    )
     mesh = tetopt.octree_mesh(target, 200)
     state = state_of(target, mesh, channel_grid(target, mesh.points), 0.85, is_graded=True)
     if has_labels:
         state = with_labels(state, target, target.smooth, mesh)
     N, stars = len(state.complex.ticks), node_stars(state)
     room, x = roomy(state, N, 0), np.empty((4, 3))
-    splits = best_splits(room, stars, np.ones(N, dtype=bool), Limits(0.0, np.full(N, np.inf), 0.0, np.full(N, np.inf)))
+    splits = best_splits(
+        room,
+        stars,
+        np.ones(N, dtype=bool),
+        Limits(0.0, np.full(N, np.inf), 0.0, np.full(N, np.inf)),
+    )
     energy = state.objective.geometry * state.complex.E_shape[: len(mesh.cells)]
     energy = energy + state.objective.image * cell_squares(state)
     n_fitted = 0
@@ -156,21 +181,33 @@ def test_splits_are_the_best_of_all_edges(has_mask, has_labels):
             if _put_middle(room, stars, a, b, N + a)
         ]
         assert splits.gain[a] == pytest.approx(max(gains, default=-np.inf), rel=1e-9)
-        n_fitted += splits.gain[a] > energy[around[(mesh.cells[around] == splits.other[a]).any(axis=1)]].sum()
-    assert (n_fitted > 5) == has_mask  # whose misfit falls by more than the energy of the cells around
+        n_fitted += (
+            splits.gain[a]
+            > energy[around[(mesh.cells[around] == splits.other[a]).any(axis=1)]].sum()
+        )
+    # whose misfit falls by more than the energy of the cells around
+    assert (n_fitted > 5) == has_mask
 
 
 def lengths(state, target, grid):
-    """Edges (a, b), their lengths, and the mean length of each node's edges, as many times as they have cells."""
+    """Edges (a, b), their lengths, and the mean length of each node's edges, as many times as
+    they have cells.
+    """
     mesh = parts(state, target, grid)[0]
     pairs = np.concatenate([mesh.cells[:, [k, m]] for k in range(4) for m in range(k)])
     length = np.linalg.norm(mesh.points[pairs[:, 0]] - mesh.points[pairs[:, 1]], axis=1)
-    return pairs, length, np.bincount(pairs.ravel(), np.repeat(length, 2)) / np.bincount(pairs.ravel())
+    return (
+        pairs,
+        length,
+        np.bincount(pairs.ravel(), np.repeat(length, 2)) / np.bincount(pairs.ravel()),
+    )
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_nodes_do_not_meet_on_the_way_to_a_surface(labelled_state, name):
-    """No edge becomes shorter than about a third of those around it; means change while neighbours move."""
+    """No edge becomes shorter than about a third of those around it; means change while
+    neighbours move.
+    """
     state, target, grid = labelled_state(name, 700)
     pairs, before, mean = lengths(state, target, grid)
     assert (before > 0.45 * mean[pairs].min(axis=1)).all()
@@ -186,7 +223,11 @@ def test_energy_falls_with_labels(labelled_state):
 
     def E():
         E_G, squares = energies(state)
-        return state.objective.geometry * E_G + state.objective.image * squares + interface_energy(state)
+        return (
+            state.objective.geometry * E_G
+            + state.objective.image * squares
+            + interface_energy(state)
+        )
 
     last = E()
     for move in ("sweep", "flip", "sweep", "flip"):
@@ -203,7 +244,9 @@ def test_squares_count_voxels_of_other_labels(labelled_state):
     own, there = state.complex.labels[owner], target.memberships.partition.ravel()
     value = target.smooth.own_value.astype(float) ** 2
     cost = np.where(own != there, value[own] + value[there], 0.0)
-    np.testing.assert_allclose(cell_squares(state), np.bincount(owner, cost, len(mesh.cells)), rtol=1e-9, atol=1e-6)
+    np.testing.assert_allclose(
+        cell_squares(state), np.bincount(owner, cost, len(mesh.cells)), rtol=1e-9, atol=1e-6
+    )
     assert cost.sum() > 0.0
 
 
@@ -219,11 +262,16 @@ def test_interface_energy_is_the_area_between_labels(labelled_state):
     total = 0.0
     for one, other in inner[labels[inner[:, 0]] != labels[inner[:, 1]]]:
         a, b, c = mesh.points[np.intersect1d(mesh.cells[one], mesh.cells[other])]
-        total += (value[labels[one]] + value[labels[other]]) * 0.5 * np.linalg.norm(np.cross(b - a, c - a))
+        total += (
+            (value[labels[one]] + value[labels[other]])
+            * 0.5
+            * np.linalg.norm(np.cross(b - a, c - a))
+        )
     assert interface_energy(state) == pytest.approx(state.objective.tension * total, rel=1e-12)
     stars = node_stars(state)
     each = sum(star_tension(state, stars, node) for node in range(len(mesh.points)))
-    assert each == pytest.approx(3.0 * interface_energy(state), rel=1e-12)  # each facet has three nodes
+    # each facet has three nodes
+    assert each == pytest.approx(3.0 * interface_energy(state), rel=1e-12)
 
 
 @pytest.mark.kernel
@@ -246,7 +294,9 @@ def balls():
     return tetopt.mesh_image(content(CASES["balls"], labels=CASES["balls"], weights=[0.0]), 1500)
 
 
-FACET_PLACES = np.array([[1, 1, 1], [2, 2, 0], [0, 2, 2], [2, 0, 2], [4, 1, 1], [1, 4, 1], [1, 1, 4]])
+FACET_PLACES = np.array(
+    [[1, 1, 1], [2, 2, 0], [0, 2, 2], [2, 0, 2], [4, 1, 1], [1, 4, 1], [1, 1, 4]]
+)
 FACET_PLACES = FACET_PLACES / FACET_PLACES.sum(axis=1, keepdims=True)
 
 
@@ -264,8 +314,12 @@ def test_balls(balls):
     for pair, centre, radius in (((0, 2), 15.5, 11.5), ((2, 5), np.array([17.6, 15.5, 14.2]), 5.0)):
         is_between = (shared.cells >= 0).all(axis=1) & (np.sort(labels, axis=1) == pair).all(axis=1)
         corners = balls.mesh.points[shared.nodes[is_between]]
-        # Over the facets, as nodes lie off the surface by what these cut off: by .14 voxel on the small ball.
-        off = np.abs(np.linalg.norm(np.einsum("pk,fkd->fpd", FACET_PLACES, corners) - centre, axis=2) - radius)
+        # Over the facets, as nodes lie off the surface by what these cut off: by .14 voxel on the
+        # small ball.
+        off = np.abs(
+            np.linalg.norm(np.einsum("pk,fkd->fpd", FACET_PLACES, corners) - centre, axis=2)
+            - radius
+        )
         assert off.mean() < 0.08
         assert np.quantile(off, 0.95) < 0.2
         assert off.max() < 0.4
@@ -300,7 +354,9 @@ def test_E_of_the_history_is_comparable_throughout():
     first = result.history[0]
     assert result.labels is not None
     for row in result.history:
-        assert row.E == pytest.approx(combined(row.E_G, row.E_D, first.E_G, first.E_D, GRADED_K_D), rel=1e-9)
+        assert row.E == pytest.approx(
+            combined(row.E_G, row.E_D, first.E_G, first.E_D, GRADED_K_D), rel=1e-9
+        )
 
 
 def test_nodes_of_three_labels_lie_on_their_curve(labelled_state):
@@ -313,7 +369,8 @@ def test_nodes_of_three_labels_lie_on_their_curve(labelled_state):
     is_curve = state.complex.meeting[:, 2] >= 0
     assert is_curve.sum() > 5
     at = state.complex.ticks[is_curve] * 2.0**-state.objective.bits
-    assert np.abs(at[:, :2] - 9.5).max() < 0.8  # levels are smooth: the edge of a quarter is rounded off
+    # levels are smooth: the edge of a quarter is rounded off
+    assert np.abs(at[:, :2] - 9.5).max() < 0.8
     normal = np.zeros((7, 3))
     for node in np.flatnonzero(is_curve):
         assert constraint_values(normal, state, node) == 2
@@ -321,7 +378,9 @@ def test_nodes_of_three_labels_lie_on_their_curve(labelled_state):
 
 @pytest.mark.full
 def test_thick_slices_do_not_show():
-    """A ball on slices four times as thick as voxels: no fold between slices, and half of the steps' area is gone."""
+    """A ball on slices four times as thick as voxels: no fold between slices, and half of the
+    steps' area is gone.
+    """
     fine = ball_in_ball(32)
     data = np.where(fine.data > 0.0, 1.0, 0.0)[:, :, 1::3]
     thick = tetopt.Image(data, np.diag([1.0, 1.0, 3.0, 1.0]))
@@ -332,7 +391,9 @@ def test_thick_slices_do_not_show():
     row = label_interfaces(thick, result.mesh, result.labels)[1]
     assert row.folded < 0.08
     assert row.area == pytest.approx(4.0 * np.pi * 11.5**2, rel=0.08)
-    rough = tetopt.mesh_image(content(thick, labels=thick, weights=[0.0], smooth_interfaces=0.0), 1200, iterations=8)
+    rough = tetopt.mesh_image(
+        content(thick, labels=thick, weights=[0.0], smooth_interfaces=0.0), 1200, iterations=8
+    )
     assert rough.labels is None
     before = label_interfaces(thick, rough.mesh, tetopt.cell_labels(thick, rough.mesh))[1]
     assert before.folded > 4.0 * row.folded
@@ -360,13 +421,18 @@ def patches(seed, n, count):
 
 
 def test_collapses_keep_labels_as_small_as_a_cell(labelled_state):
-    """Where labels are as small as cells: no cell between two interfaces goes with a node, nor one of five labels."""
+    """Where labels are as small as cells: no cell between two interfaces goes with a node, nor
+    one of five labels.
+    """
     image = patches(27, 14, 6)
     target = content(image, labels=image, weights=[0.0])
     mesh = tetopt.octree_mesh(target, 300)
     grid = channel_grid(target, mesh.points)
     state = with_labels(
-        with_min_dihedral(state_of(target, mesh, grid, 0.85, is_graded=True), 12.0), target, target.smooth, mesh
+        with_min_dihedral(state_of(target, mesh, grid, 0.85, is_graded=True), 12.0),
+        target,
+        target.smooth,
+        mesh,
     )
     before = None
     for move in ("attract", "sweep", "flip", "exchange"):
@@ -379,12 +445,16 @@ def test_collapses_keep_labels_as_small_as_a_cell(labelled_state):
 
 @pytest.mark.full
 def test_uniform_meshes_go_on_with_labels():
-    """The energy that falls is another one once cells have labels, and higher: that is not yet the end."""
+    """The energy that falls is another one once cells have labels, and higher: that is not yet
+    the end.
+    """
     at = np.stack(np.meshgrid(*[np.arange(40) - 19.5] * 2, indexing="ij"), axis=-1)
     disc = tetopt.Image((np.linalg.norm(at, axis=-1) < 12.0).astype(float))
     result = tetopt.mesh_image(content(disc, labels=disc, weights=[0.0]), 200, mode="uniform")
     assert result.history[-1].iteration > 3
-    few = tetopt.mesh_image(content(disc, labels=disc, weights=[0.0]), 200, mode="uniform", tolerance=0.9)
+    few = tetopt.mesh_image(
+        content(disc, labels=disc, weights=[0.0]), 200, mode="uniform", tolerance=0.9
+    )
     assert few.labels is not None
 
 

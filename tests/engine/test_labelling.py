@@ -1,4 +1,6 @@
-"""Labels of cells: energy, fragments, manifold interfaces, and which cells may change without changing topology."""
+"""Labels of cells: energy, fragments, manifold interfaces, and which cells may change without
+changing topology.
+"""
 
 from typing import NamedTuple
 
@@ -56,7 +58,11 @@ def solved(points, cells, labels, n_labels=2, components=None, weight=None, coun
     return Labelling(
         labels,
         int((labels != counts.toarray().argmax(axis=1)).sum()),
-        int(labelling._nonmanifold(labelling._dual(points, cells, across, Contents(counts), weight), labels)[1].sum()),
+        int(
+            labelling._nonmanifold(
+                labelling._dual(points, cells, across, Contents(counts), weight), labels
+            )[1].sum()
+        ),
         np.bincount(components_of(across, labels)[1], minlength=n_labels).tolist(),
         np.setdiff1d(counts.indices[counts.data > 0.0], labels).tolist(),
     )
@@ -75,7 +81,9 @@ def box(n, count, seed):
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_keeps_topology_as_its_twin(n):
-    """On random labels: the twin's answer; where it is yes neither Euler numbers nor components change."""
+    """On random labels: the twin's answer; where it is yes neither Euler numbers nor components
+    change.
+    """
     rng, n_kept, n_asked = np.random.default_rng(7), 0, 0
     for seed in range(2):
         points, cells = box(n, 25, seed) if seed % 2 else lattice(n, 2)
@@ -87,7 +95,9 @@ def test_keeps_topology_as_its_twin(n):
             labels = np.where(rng.random(len(cells)) < 0.1, rng.integers(0, 3, len(cells)), labels)
             for cell in rng.choice(len(cells), 12):
                 for label in {0, 1, 2} - {int(labels[cell])}:
-                    keeps = keeps_topology(cells, across, labels, star.start, star.cells, cell, label)
+                    keeps = keeps_topology(
+                        cells, across, labels, star.start, star.cells, cell, label
+                    )
                     assert keeps == naive.keeps_topology(cells, labels, cell, label)
                     n_asked, n_kept = n_asked + 1, n_kept + keeps
                     if keeps:
@@ -101,7 +111,9 @@ def assert_same_topology(cells, labels, cell, label):
     after[cell] = label
     across = across_of(cells, int(cells.max()) + 1)
     for one in (labels[cell], label):
-        assert naive.euler(naive.faces_of(cells[labels == one])) == naive.euler(naive.faces_of(cells[after == one]))
+        assert naive.euler(naive.faces_of(cells[labels == one])) == naive.euler(
+            naive.faces_of(cells[after == one])
+        )
         n_pieces = [(components_of(across, of)[1] == one).sum() for of in (labels, after)]
         assert n_pieces[0] == n_pieces[1]
         assert naive.pinched(cells, after, one) == naive.pinched(cells, labels, one)
@@ -116,19 +128,28 @@ def test_what_is_not_manifold_as_the_twin(n):
         counts = whole(labels, 4, volumes(points, cells))
         dual = labelling._dual(points, cells, across_of(cells, len(points)), Contents(counts), None)
         faces, is_two = labelling._nonmanifold(dual, labels)
-        bad = {frozenset(int(i) for i in face if i >= 0): two for face, two in zip(faces, is_two, strict=True)}
-        assert bad == {face: len(there) == 2 for face, there in naive.nonmanifold(cells, labels).items()}
+        bad = {
+            frozenset(int(i) for i in face if i >= 0): two
+            for face, two in zip(faces, is_two, strict=True)
+        }
+        assert bad == {
+            face: len(there) == 2 for face, there in naive.nonmanifold(cells, labels).items()
+        }
         assert len(bad) > 1
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("n", [2, 3])
 def test_moves_lower_the_energy(n):
-    """By cells of random content: each time cells settle it falls, and no move of one cell is left that lowers it."""
+    """By cells of random content: each time cells settle it falls, and no move of one cell is
+    left that lowers it.
+    """
     rng = np.random.default_rng(5)
     points, cells = box(n, 40, 1)
     voxels = rng.random((len(cells), 3)) * volumes(points, cells)[:, None]
-    dual = labelling._dual(points, cells, across_of(cells, len(points)), Contents(csr_array(voxels)), 0.2)
+    dual = labelling._dual(
+        points, cells, across_of(cells, len(points)), Contents(csr_array(voxels)), 0.2
+    )
     labels = voxels.argmax(axis=1)
     voxels *= volumes(points, cells).sum() / voxels.sum()
 
@@ -150,7 +171,9 @@ def test_moves_lower_the_energy(n):
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_faults_that_are_skipped_are_none(monkeypatch, n):
-    """The same labels whether or not sound nodes, and those where nothing changed, are skipped, for random content."""
+    """The same labels whether or not sound nodes, and those where nothing changed, are skipped,
+    for random content.
+    """
     mend, n_skipped = labelling._mend, 0
 
     def without_marks(*arguments):
@@ -167,7 +190,9 @@ def test_faults_that_are_skipped_are_none(monkeypatch, n):
         own = solved(points, cells, None, 3, counts=counts, weight=0.05)
         with monkeypatch.context() as patched:
             patched.setattr(labelling, "_mend", without_marks)
-            np.testing.assert_array_equal(solved(points, cells, None, 3, counts=counts, weight=0.05).labels, own.labels)
+            np.testing.assert_array_equal(
+                solved(points, cells, None, 3, counts=counts, weight=0.05).labels, own.labels
+            )
     assert n_skipped > 0
 
 
@@ -176,7 +201,9 @@ def test_a_bridge_is_the_cheapest():
     """Between two components of a label, by the energy of each cell that it takes."""
     points, cells = box(3, 8, 4)
     voxels = np.random.default_rng(9).random((len(cells), 3)) * volumes(points, cells)[:, None]
-    dual = labelling._dual(points, cells, across_of(cells, len(points)), Contents(csr_array(voxels)), 0.1)
+    dual = labelling._dual(
+        points, cells, across_of(cells, len(points)), Contents(csr_array(voxels)), 0.1
+    )
     voxels *= volumes(points, cells).sum() / voxels.sum()
     labels = voxels.argmax(axis=1)
     number, of_component = components_of(dual.across, labels)
@@ -184,10 +211,15 @@ def test_a_bridge_is_the_cheapest():
     energy = naive.labelling_energy(voxels, dual.tension, cells, labels)
     n_bridges = 0
     for component, label in enumerate(of_component):
-        sources, ends = np.flatnonzero(number == component), np.flatnonzero((labels == label) & (number != component))
+        sources, ends = (
+            np.flatnonzero(number == component),
+            np.flatnonzero((labels == label) & (number != component)),
+        )
         if len(ends) == 0 or len(sources) > 4:
             continue
-        changed = [np.where(np.arange(len(cells)) == cell, label, labels) for cell in range(len(cells))]
+        changed = [
+            np.where(np.arange(len(cells)) == cell, label, labels) for cell in range(len(cells))
+        ]
         costs = [naive.labelling_energy(voxels, dual.tension, cells, of) - energy for of in changed]
         costs = np.maximum(costs, 0.0)
         least = naive.cheapest_way(cells, costs, set(sources.tolist()), set(ends.tolist()))
@@ -220,7 +252,9 @@ def ball(n_blocks=7, radius=7.5, seed=None):
 
 @pytest.mark.parametrize("seed", [None, 0, 1])
 def test_a_ball_is_one_component_with_a_manifold_surface(seed):
-    """Noise or not: one component, the Euler number of a ball and of its surface, and most of its volume."""
+    """Noise or not: one component, the Euler number of a ball and of its surface, and most of
+    its volume.
+    """
     mesh, image, counts = ball(seed=seed)
     result = solved(mesh.points, mesh.cells, None, counts=counts)
     inside = mesh.cells[result.labels == 1]
@@ -232,7 +266,9 @@ def test_a_ball_is_one_component_with_a_manifold_surface(seed):
 
 
 def test_tension_takes_half_of_a_label_at_most():
-    """A ball smaller than three times the tension in radius would wither away; here it and its noise would."""
+    """A ball smaller than three times the tension in radius would wither away; here it and its
+    noise would.
+    """
     mesh, image, counts = ball(11, 3.0, seed=0)
     result = solved(mesh.points, mesh.cells, None, counts=counts, weight=5.0)
     assert result.n_moved > 200
@@ -251,11 +287,15 @@ def test_a_disc_in_the_plane():
     assert result.components == [1, 1]
     assert result.n_nonmanifold == 0
     assert naive.nonmanifold(mesh.cells, result.labels) == {}
-    assert volumes(mesh.points, mesh.cells[result.labels == 1]).sum() == pytest.approx(image.data.sum(), rel=0.1)
+    assert volumes(mesh.points, mesh.cells[result.labels == 1]).sum() == pytest.approx(
+        image.data.sum(), rel=0.1
+    )
 
 
 def two_balls(gap):
-    """A lattice with a large and a small ball, each cell full of one label but for a fraction `gap` along a line."""
+    """A lattice with a large and a small ball, each cell full of one label but for a fraction
+    `gap` along a line.
+    """
     mesh, image, counts = ball(radius=5.0)
     centre, full = mesh.points[mesh.cells].mean(axis=1), counts.toarray()
     is_small = np.linalg.norm(centre - 3.0, axis=1) < 4.0
@@ -266,12 +306,18 @@ def two_balls(gap):
 
 
 def test_fragments_go_and_components_stay():
-    """Two balls are two components where voxels have two; the smaller goes where they have one, or a speck besides."""
+    """Two balls are two components where voxels have two; the smaller goes where they have one,
+    or a speck besides.
+    """
     mesh, counts, is_small, (large, small) = two_balls(0.0)
     ends = {}
     for name, sizes in (("two", [large, small]), ("one", [large]), ("speck", [large, small // 4])):
         ends[name] = solved(
-            mesh.points, mesh.cells, None, counts=counts, components=[np.array([9000]), np.array(sizes)]
+            mesh.points,
+            mesh.cells,
+            None,
+            counts=counts,
+            components=[np.array([9000]), np.array(sizes)],
         )
     assert ends["two"].components == [1, 2]
     assert ends["one"].components == ends["speck"].components == [1, 1]
@@ -280,10 +326,18 @@ def test_fragments_go_and_components_stay():
 
 
 def test_what_hangs_together_in_the_voxels_is_bridged():
-    """Between the balls nearly half of the voxels have the label: they are linked, where voxels have one component."""
+    """Between the balls nearly half of the voxels have the label: they are linked, where voxels
+    have one component.
+    """
     mesh, counts, is_small, (large, small) = two_balls(0.45)
     for sizes, n_pieces in (([large, small], 2), ([large + small], 1)):
-        result = solved(mesh.points, mesh.cells, None, counts=counts, components=[np.array([9000]), np.array(sizes)])
+        result = solved(
+            mesh.points,
+            mesh.cells,
+            None,
+            counts=counts,
+            components=[np.array([9000]), np.array(sizes)],
+        )
         assert result.components == [1, n_pieces]
         assert result.n_nonmanifold == 0
         assert (result.labels[is_small] == 1).mean() > 0.5
@@ -297,7 +351,13 @@ def test_cubes_that_touch_at_an_edge_or_a_corner_are_linked_or_parted():
     for other in ((2, 2, 1), (2, 2, 2)):
         labels = ((cube == 1).all(axis=1) | (cube == other).all(axis=1)).astype(np.int64)
         assert len(naive.nonmanifold(mesh.cells, labels)) > 0
-        result = solved(mesh.points, mesh.cells, labels, components=[np.array([60]), np.array([1, 1])], weight=1e-6)
+        result = solved(
+            mesh.points,
+            mesh.cells,
+            labels,
+            components=[np.array([60]), np.array([1, 1])],
+            weight=1e-6,
+        )
         assert naive.nonmanifold(mesh.cells, result.labels) == {}
         assert result.n_nonmanifold == 0
         assert 0 < result.n_moved < 10
@@ -312,13 +372,19 @@ def test_two_cells_mend_what_one_cell_or_a_fan_does_not(seed):
     contents = Contents(whole(labels, 2, volumes(points, cells)))
     by_one, dual = labels.copy(), labelling._dual(points, cells, across, contents, None)
     labelling._mend_pairs(dual, by_one, np.array([[dual.size.min()] * 2, [np.inf] * 2]), labels < 0)
-    by_two = unpinched(points, cells, across, contents, labels, np.full(2, volumes(points, cells).sum()))
+    by_two = unpinched(
+        points, cells, across, contents, labels, np.full(2, volumes(points, cells).sum())
+    )
     assert len(naive.nonmanifold(cells, by_one)) > len(naive.nonmanifold(cells, by_two)) == 0
 
 
-@pytest.mark.parametrize(("share", "n_voxels", "is_kept"), [(0.35, 1.0, True), (0.25, 1.0, False), (0.35, 0.6, False)])
+@pytest.mark.parametrize(
+    ("share", "n_voxels", "is_kept"), [(0.35, 1.0, True), (0.25, 1.0, False), (0.35, 0.6, False)]
+)
 def test_a_piece_of_a_label_gets_the_cell_that_it_fits(share, n_voxels, is_kept):
-    """One that fills a third of a cell, but not one that fills a quarter, or is far smaller than the cell."""
+    """One that fills a third of a cell, but not one that fills a quarter, or is far smaller than
+    the cell.
+    """
     points, cells = lattice(3, 5)
     size, labels = volumes(points, cells), (points[cells].mean(axis=1)[:, 0] < 1.5).astype(np.int64)
     full = whole(labels, 2, size).toarray()
@@ -327,11 +393,15 @@ def test_a_piece_of_a_label_gets_the_cell_that_it_fits(share, n_voxels, is_kept)
     held = np.append(share, np.full(4, (n_voxels - share) / 4)) * size[piece]
     pieces = csr_array((held, (np.zeros(5, dtype=int), piece - np.arange(5))), (1, len(cells)))
     contents = Contents(csr_array(full), None, pieces, np.array([1]))
-    made = labelled(points, cells, across_of(cells, len(points)), contents, [np.array([1])] * 2, weight=1e-9)
+    made = labelled(
+        points, cells, across_of(cells, len(points)), contents, [np.array([1])] * 2, weight=1e-9
+    )
     assert (made[piece] == 1) == is_kept
     assert (made != labels).sum() == is_kept
     twice = Contents(csr_array(full), None, vstack([pieces, pieces]).tocsr(), np.array([1, 1]))
-    again = labelled(points, cells, across_of(cells, len(points)), twice, [np.array([1])] * 2, weight=1e-9)
+    again = labelled(
+        points, cells, across_of(cells, len(points)), twice, [np.array([1])] * 2, weight=1e-9
+    )
     assert again.tolist() == made.tolist()
     assert naive.nonmanifold(cells, made) == {}
 
@@ -344,7 +414,14 @@ def test_a_label_with_next_to_nothing_of_its_volume_goes_from_finished_cells(aim
     labels[np.argmin(size)] = 1
     assert size.min() < 0.1 * size.mean()
     volume = np.array([size.sum(), aim * size.min()])
-    made = unpinched(points, cells, across_of(cells, len(points)), Contents(whole(labels, 2, size)), labels, volume)
+    made = unpinched(
+        points,
+        cells,
+        across_of(cells, len(points)),
+        Contents(whole(labels, 2, size)),
+        labels,
+        volume,
+    )
     assert (made == labels).all() == is_kept
     assert unfit_labels(labels, size, volume).tolist() == [False, not is_kept]
 
@@ -361,7 +438,9 @@ def test_a_label_of_one_cell_stays_and_one_without_is_lost():
 
 
 def test_no_label_goes_for_a_bridge():
-    """Three triangles in a row: the way between the outer ones is the only cell of another label, and stays so."""
+    """Three triangles in a row: the way between the outer ones is the only cell of another
+    label, and stays so.
+    """
     points = np.array([[0.0, 0.0], [2.0, 0.0], [1.0, 1.5], [3.0, 1.5], [4.0, 0.0]])
     cells = np.array([[0, 1, 2], [1, 3, 2], [1, 4, 3]])
     counts = csr_array([[1.0, 0.0], [0.08, 0.1], [1.0, 0.0]])
@@ -377,13 +456,18 @@ def test_components_of_voxels():
 
 
 def test_pieces_of_labels_are_large_components_but_the_largest():
-    """Of 64, 50, 49 and 75 voxels of one label: those of 64 and 50. One component of another label is none."""
+    """Of 64, 50, 49 and 75 voxels of one label: those of 64 and 50. One component of another
+    label is none.
+    """
     partition = np.zeros((12, 12, 12), dtype=np.int64)
-    partition[:4, :4, :4] = partition[5:10, 5:10, 5:7] = partition[:3, :5, 6:11] = partition[11, :7, :7] = 1
+    partition[:4, :4, :4] = partition[5:10, 5:10, 5:7] = partition[:3, :5, 6:11] = partition[
+        11, :7, :7
+    ] = 1
     partition[:, 11] = 2
     pieces = label_voxels(partition, np.ones(3), 3).pieces
     number = np.arange(partition.size).reshape(partition.shape)
     assert pieces.label.tolist() == [1, 1]
     for k, box in enumerate((np.s_[:4, :4, :4], np.s_[5:10, 5:10, 5:7])):
         assert pieces.voxels[pieces.piece == k].tolist() == number[box].ravel().tolist()
-    assert label_voxels(partition, np.ones(3), 3, parts=2).pieces.label.tolist() == []  # of 32 and 25 whole voxels
+    # of 32 and 25 whole voxels
+    assert label_voxels(partition, np.ones(3), 3, parts=2).pieces.label.tolist() == []

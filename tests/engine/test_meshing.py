@@ -34,7 +34,9 @@ def test_graded():
 
 @pytest.mark.full
 def test_threads_of_python_mesh_at_once():
-    """Each to the bits of a run alone; what nobody catches (`sys.unraisablehook`) stays the user's to see."""
+    """Each to the bits of a run alone; what nobody catches (`sys.unraisablehook`) stays the
+    user's to see.
+    """
     hook, nodes = sys.unraisablehook, [150, 200, 150, 200]
     begin = threading.Barrier(len(nodes))
 
@@ -52,7 +54,9 @@ def test_threads_of_python_mesh_at_once():
 @pytest.mark.parametrize("mask", [None, MASK])
 def test_uniform(mask):
     image = IMAGE if mask is None else tetopt.content(IMAGE, mask=mask)
-    result = tetopt.mesh_image(image, 150, mode="uniform", kind="five-tet", iterations=2, shape_power=2.0)
+    result = tetopt.mesh_image(
+        image, 150, mode="uniform", kind="five-tet", iterations=2, shape_power=2.0
+    )
     region = None if mask is None else image.region
     initial = lattice_within(IMAGE if mask is None else image.image, region, "five-tet", nodes=150)
     assert_same(result, tetopt.optimize(image, initial, k_D=0.2, iterations=2, shape_power=2.0))
@@ -61,7 +65,9 @@ def test_uniform(mask):
 @pytest.mark.full
 @pytest.mark.parametrize("n", [2, 3])
 def test_nodes_of_order_2_are_counted_in_all(n):
-    """Corners and midpoints together; the same run as with these corners and this longest edge from the start."""
+    """Corners and midpoints together; the same run as with these corners and this longest edge
+    from the start.
+    """
     image = IMAGE if n == 3 else tetopt.Image(IMAGE.data[15].copy(), np.diag([4.0, 4.0, 1.0]))
     nodes = 900 if n == 3 else 300
     result = tetopt.mesh_image(image, nodes, order=2, iterations=16)
@@ -89,7 +95,9 @@ def test_a_lattice_for_order_2():
     ],
 )
 def test_no_run_is_repeated(options, n_runs):
-    """Where limits on sizes, or the steps of lattices, make the same mesh of another number, within a mask as well."""
+    """Where limits on sizes, or the steps of lattices, make the same mesh of another number,
+    within a mask as well.
+    """
     seen = []
     image = tetopt.content(IMAGE, mask=MASK) if "target_error" in options else IMAGE
 
@@ -103,21 +111,26 @@ def test_no_run_is_repeated(options, n_runs):
 
 
 def test_longest_edge_of_order_2():
-    """1.15 times that of a uniform mesh with the corners; a longest edge that is asked for stays."""
+    """1.15 times that of a uniform mesh with the corners; a longest edge that is asked for
+    stays.
+    """
     content = plain(IMAGE)
     uniform = tetopt.Sizes(coarsest=1.0).longest_edge(IMAGE, round(1000 / 7.2))
     assert sizes_of_order(content, 1000, None, 2).longest == pytest.approx(1.15 * uniform)
     assert sizes_of_order(content, 1000, None, 2).gradation == 0.5
     assert sizes_of_order(content, 1000, tetopt.Sizes(longest=9.0), 2).longest == 9.0
     assert sizes_of_order(content, 1000, None, 1) is None
-    stated = sizes_of_order(content, 1000, tetopt.Sizes(gradation=1.0, coarsest=1.4), 2)  # those of order 1, asked for
+    # those of order 1, asked for
+    stated = sizes_of_order(content, 1000, tetopt.Sizes(gradation=1.0, coarsest=1.4), 2)
     assert stated.gradation == 1.0
     assert stated.longest == pytest.approx(1.4 * uniform)
     with pytest.raises(tetopt.InputError, match="expected order 1 or 2, got 3"):
         tetopt.mesh_image(IMAGE, 100, order=3)
 
 
-@pytest.mark.parametrize(("order", "nodes_max", "n_runs"), [(1, 150, 1), (1, 260, 2), (2, 400, 2), (2, 950, 2)])
+@pytest.mark.parametrize(
+    ("order", "nodes_max", "n_runs"), [(1, 150, 1), (1, 260, 2), (2, 400, 2), (2, 950, 2)]
+)
 def test_a_search_ends_at_the_most_nodes(order, nodes_max, n_runs):
     """With their mesh, and the error that it leaves, if the target takes more; no run has more."""
     x, y = np.indices((120, 100))
@@ -134,7 +147,9 @@ def test_a_search_ends_at_the_most_nodes(order, nodes_max, n_runs):
     assert abs(counts[-1] / nodes_max - 1.0) <= (0.01 if order == 2 else 0.0)
     assert counts == sorted(counts)
     assert search.result.fraction > 0.001
-    assert search.result.violated["error"].startswith(f"{search.result.fraction:.4g} of the image's variance is")
+    assert search.result.violated["error"].startswith(
+        f"{search.result.fraction:.4g} of the image's variance is"
+    )
     if order == 1:
         assert_same(search.result, tetopt.mesh_image(image, nodes_max, iterations=3))
 
@@ -176,14 +191,23 @@ def test_a_search_by_attempts():
     [
         ({"mode": "coarse"}, "expected mode graded, uniform, paper, start, got 'coarse'"),
         ({"nodes": 100, "kind": "bcc"}, "takes nodes, target_error, nodes_max, sizes, not kind"),
-        ({"nodes": 100, "mode": "uniform", "sizes": tetopt.Sizes()}, "takes nodes, spacing, kind, not sizes"),
+        (
+            {"nodes": 100, "mode": "uniform", "sizes": tetopt.Sizes()},
+            "takes nodes, spacing, kind, not sizes",
+        ),
         ({"nodes": 100, "start": tetopt.lattice_mesh(IMAGE, nodes=60)}, "takes start, not nodes"),
         ({"mode": "paper", "nodes": 100, "spacing": 5.0}, "give only one of nodes and spacing"),
         ({"mode": "start"}, "requires a mesh to start from"),
         ({"nodes": 100, "nodes_max": 200}, "nodes_max needs target_error"),
         ({"nodes_max": 200}, "nodes_max needs target_error"),
-        ({"target_error": 0.2, "nodes_max": 8}, "nodes_max: expected a whole number, 9 or more in 3-D, got 8"),
-        ({"target_error": 0.2, "nodes_max": 64, "order": 2}, "nodes_max: expected a whole number, 65 or more in 3-D"),
+        (
+            {"target_error": 0.2, "nodes_max": 8},
+            "nodes_max: expected a whole number, 9 or more in 3-D, got 8",
+        ),
+        (
+            {"target_error": 0.2, "nodes_max": 64, "order": 2},
+            "nodes_max: expected a whole number, 65 or more in 3-D",
+        ),
         (
             {"target_error": 0.2, "nodes_max": 500, "sizes": tetopt.Sizes(edge_size=9.0)},
             r"nodes_max: sizes require about \d+ nodes, got 500; allow as many, or larger cells",
@@ -208,7 +232,9 @@ def test_contradictions(arguments, words):
     ],
 )
 def test_an_argument_of_another_name_is_named(arguments, words):
-    with pytest.raises(TypeError, match=f"^mesh_image.* got an unexpected keyword argument {words}"):
+    with pytest.raises(
+        TypeError, match=f"^mesh_image.* got an unexpected keyword argument {words}"
+    ):
         tetopt.mesh_image(tetopt.Image(np.zeros((8, 8, 8))), **arguments)
 
 
@@ -218,7 +244,9 @@ def test_the_paper_takes_one_image():
 
 
 def test_the_rate_of_an_image_is_that_of_its_runs():
-    """The error of this image falls with nodes^-0.4: two runs above the target tell the number that meets it."""
+    """The error of this image falls with nodes^-0.4: two runs above the target tell the number
+    that meets it.
+    """
     image, target = tetopt.Image(np.zeros((200, 200, 200))), 0.02
     error = {n: 3.0 * n**-0.4 for n in (1500, 5000)}
     aim = 0.925 * target

@@ -18,7 +18,9 @@ from tetopt.start.carve import part_of
 
 
 def violated(target, result, min_dihedral=0.0, start=None):
-    return checked(result, plain(target), min_dihedral, result.mesh if start is None else start).violated
+    return checked(
+        result, plain(target), min_dihedral, result.mesh if start is None else start
+    ).violated
 
 
 def violated_request(image, result, target_error, is_filled):
@@ -40,15 +42,20 @@ def test_the_minimum_dihedral_angle(whole):
     image, result = whole
     words = violated(image, result, 60.0)
     assert list(words) == ["min_dihedral"]
-    angles = tetopt.geometry.simplex.dihedral_angles(result.mesh.points, result.mesh.cells).min(axis=1)
+    angles = tetopt.geometry.simplex.dihedral_angles(result.mesh.points, result.mesh.cells).min(
+        axis=1
+    )
     assert words["min_dihedral"].startswith(
         f"{(angles < 60.0).sum()} of {len(angles)} cells have a dihedral angle below 60 degrees"
     )
     unmoved = result._replace(history=result.history[:1])
     # The floor holds for meshes without iterations, too.
     assert list(violated(image, unmoved, 60.0)) == ["min_dihedral"]
-    # No mesh of tetrahedra has all angles so large: the run itself says so. Of few nodes, since it tries them all.
-    assert list(tetopt.mesh_image(image, 60, iterations=2, min_dihedral=65.0).violated) == ["min_dihedral"]
+    # No mesh of tetrahedra has all angles so large: the run itself says so. Of few nodes, since it
+    # tries them all.
+    assert list(tetopt.mesh_image(image, 60, iterations=2, min_dihedral=65.0).violated) == [
+        "min_dihedral"
+    ]
 
 
 def test_the_box_and_the_cover(whole):
@@ -71,7 +78,9 @@ def test_the_error(whole):
     assert violated_request(image, result, 1.01 * fraction, True) == {}
     assert list(violated_request(image, result, 0.99 * fraction, True)) == ["error"]
     short = tetopt.mesh_image(image, target_error=0.3, iterations=3, k_D=0.0)
-    assert ("error" in short.violated) == (short.history[-1].E_D > 0.3 * plain(image).variance * image.volume)
+    assert ("error" in short.violated) == (
+        short.history[-1].E_D > 0.3 * plain(image).variance * image.volume
+    )
 
 
 @pytest.mark.full
@@ -109,7 +118,9 @@ def test_a_boundary_that_is_no_manifold_and_more_components_than_the_mask_has():
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("name", ["dihedral_angles", "beyond_box", "cell_of_voxel", "manifold_problems"])
+@pytest.mark.parametrize(
+    "name", ["dihedral_angles", "beyond_box", "cell_of_voxel", "manifold_problems"]
+)
 def test_a_requirement_that_cannot_be_checked_is_violated_and_the_mesh_is_there(name, monkeypatch):
     def fail(*_):
         raise MemoryError
@@ -158,7 +169,8 @@ def test_labels_without_cells():
     assert "labels" not in result.violated
     none = result._replace(labels=np.where(np.isin(result.labels, (7, 9)), 0, result.labels))
     assert violated(target, none) == {
-        "labels": "no voxel of label 7, of 200 voxels or more, lies in a cell with that label; allow more nodes, more "
+        "labels": "no voxel of label 7, of 200 voxels or more, lies in a cell with that label; "
+        "allow more nodes, more "
         "`cells_across`, or a higher `label_weight`"
     }
     elsewhere = none.labels.copy()
@@ -166,7 +178,9 @@ def test_labels_without_cells():
     assert violated(target, none._replace(labels=elsewhere)) == violated(target, none)
     assert violated(target, result._replace(labels=None)) == {}
     # Within a mask label 0 is a label like the others, and that of voxels outside does not count.
-    within = content(image, tetopt.Image(labels, image.affine), tetopt.Image(np.ones(image.shape), image.affine))
+    within = content(
+        image, tetopt.Image(labels, image.affine), tetopt.Image(np.ones(image.shape), image.affine)
+    )
     no_zero = result._replace(labels=np.where(result.labels == 0, 3, result.labels))
     assert "no voxel of label 0" in violated(target, no_zero)["labels"]
     assert "no voxel of label 0" in violated(within, no_zero)["labels"]
@@ -181,7 +195,9 @@ def test_labels_without_cells():
 @pytest.mark.parametrize("is_masked", [False, True])
 @pytest.mark.parametrize("n", [2, 3])
 def test_labels_are_judged_as_they_are_measured(n, is_masked):
-    """On the voxels of the labels, also of thick slices, in a mesh of a part of the image: the one truth of both."""
+    """On the voxels of the labels, also of thick slices, in a mesh of a part of the image: the
+    one truth of both.
+    """
     rng = np.random.default_rng(n)
     data = np.kron(rng.integers(0, 12, (3, 4, 5)[-n:]), np.ones((6, 8, 7)[-n:]))
     data[..., -1] = 19.0
@@ -200,8 +216,12 @@ def test_labels_are_judged_as_they_are_measured(n, is_masked):
     assert any(fit.components for fit in fits)
     for fit, row in zip(fits, rows, strict=True):
         assert (fit.voxels, fit.is_met) == (row.covered_voxels, row.dice > 0.0)
-        assert fit.volume_ratio == pytest.approx(row.mesh_volume / (row.covered_voxels * labels.voxel_volume))
-        assert [each.voxels for each in fit.components] == [each.voxels for each in row.lost_components]
+        assert fit.volume_ratio == pytest.approx(
+            row.mesh_volume / (row.covered_voxels * labels.voxel_volume)
+        )
+        assert [each.voxels for each in fit.components] == [
+            each.voxels for each in row.lost_components
+        ]
         for one, other in zip(fit.components, row.lost_components, strict=True):
             np.testing.assert_allclose(one.place, other.place)
             assert data[tuple(np.rint(labels.to_index(one.place)).astype(int))] == fit.label
@@ -225,7 +245,10 @@ def test_volumes_of_labels():
         changed[other[: round(n_other * len(own))]] = 1
         ratios.append(volumes(mesh.points, mesh.cells)[changed == 1].sum() / 216.0)
         said = judged(mesh, target, changed).violated.get("labels", "")
-        words = f"the volume of cells is not 0.6 to 1.5 times that of voxels: {ratios[-1]:.3g} for label 1; allow more"
+        words = (
+            f"the volume of cells is not 0.6 to 1.5 times that of voxels: {ratios[-1]:.3g} "
+            "for label 1; allow more"
+        )
         assert said.startswith(words) if not 0.6 <= ratios[-1] <= 1.5 else said == ""
     assert ratios[0] < 0.6 < ratios[1] < ratios[2] < 1.5 < ratios[3]
 
@@ -237,9 +260,13 @@ def test_components_of_a_mask_without_a_cell():
     assert "components" not in result.violated
     one = part_of(result.mesh, components(result.mesh.cells) == 0)
     number, _ = scipy.ndimage.label(mask.data > 0.5)
-    gone = number == next(k for k in (1, 2) if not ((number == k) & (tetopt.cell_of_voxel(mask, one) >= 0)).any())
+    gone = number == next(
+        k for k in (1, 2) if not ((number == k) & (tetopt.cell_of_voxel(mask, one) >= 0)).any()
+    )
     words = judged(one, target).violated["components"]
-    assert words.startswith(f"components of the mask of 50 voxels or more without a cell: {gone.sum()} voxels at (")
+    assert words.startswith(
+        f"components of the mask of 50 voxels or more without a cell: {gone.sum()} voxels at ("
+    )
     place = [float(each) for each in words.split("(")[1].split(")")[0].split(", ")]
     assert gone[tuple(np.rint(mask.to_index(place)).astype(int))]
     (row,) = tetopt.mask_fidelity(mask, one).lost_components
@@ -248,16 +275,24 @@ def test_components_of_a_mask_without_a_cell():
 
 
 def test_a_part_of_a_mask_without_cells_is_named_with_its_place():
-    """A plate that sticks out of a block, and a mesh of the block alone: what is near its cells does not count."""
+    """A plate that sticks out of a block, and a mesh of the block alone: what is near its cells
+    does not count.
+    """
     data = np.zeros((40, 16, 16))
     data[2:12, 2:12, 2:12] = 1.0
-    mask, box = tetopt.Image(data.copy()), tetopt.lattice_mesh(tetopt.Image(data), blocks=(20, 8, 8))
+    mask, box = (
+        tetopt.Image(data.copy()),
+        tetopt.lattice_mesh(tetopt.Image(data), blocks=(20, 8, 8)),
+    )
     block = part_of(box, (np.abs(centroids(box.points, box.cells) - 6.5) < 5.0).all(axis=1))
     assert "components" not in judged(block, content(mask, mask=mask)).violated
     data[12:38, 2:12, 6:8] = 1.0
     mask = tetopt.Image(data)
     words = judged(block, content(mask, mask=mask)).violated["components"]
-    found = re.match(r"parts of the mask of 50 voxels or more with no cell near: (\d+) voxels at \(([\d.]+), ", words)
+    found = re.match(
+        r"parts of the mask of 50 voxels or more with no cell near: (\d+) voxels at \(([\d.]+), ",
+        words,
+    )
     assert 400 < int(found[1]) < 520
     assert 20.0 < float(found[2]) < 30.0
 
@@ -273,7 +308,9 @@ def test_small_components_of_a_mask_may_be_lost_and_are_counted():
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("options", [{"k_D": 0.0}, {"iterations": 0}, {"iterations": 1, "stop": lambda: True}])
+@pytest.mark.parametrize(
+    "options", [{"k_D": 0.0}, {"iterations": 0}, {"iterations": 1, "stop": lambda: True}]
+)
 def test_labels_are_given_and_judged_however_few_iterations_there_are(options):
     image, mask = shaped("ball")
     labels = tetopt.Image(1.0 * (image.data > 50.0) + 1.0 * (image.data > 65.0), image.affine)
@@ -303,7 +340,9 @@ def test_the_paper_s_scheme_and_a_start_say_theirs_too(whole):
 
 
 def test_the_boundary_of_the_user_s_mesh_is_judged():
-    """Two blocks that meet in an edge alone, as in a mesh that lost cells; the check of its file says the same."""
+    """Two blocks that meet in an edge alone, as in a mesh that lost cells; the check of its file
+    says the same.
+    """
     image = tetopt.load_phantom("sphere").image(voxel_mm=4)
     lattice = tetopt.lattice_mesh(image, nodes=400)
     at = lattice.points[lattice.cells].mean(axis=1) - lattice.points.mean(axis=0)

@@ -31,7 +31,8 @@ def times_covered(image, mesh):
 
 
 def check(image, mask, mesh, min_dihedral=12.0, is_between=None):
-    """The mesh fills the mask. Nodes are off its surface by what facets cut off, so that these lie on it on average.
+    """The mesh fills the mask. Nodes are off its surface by what facets cut off, so that these lie
+    on it on average.
 
     Nodes `is_between` (N,) labels may be a tenth of a voxel off.
     """
@@ -45,23 +46,34 @@ def check(image, mask, mesh, min_dihedral=12.0, is_between=None):
     outer = np.unique(boundary_facets(mesh.cells))
     on_box = ((index == -0.5) | (index == np.array(image.shape) - 0.5)).any(axis=1)
     around = content(image, mask=mask)  # the mask's own box, on which its level is smoothed
-    off = np.abs(levels(around.region.level, around.image.to_index(mesh.points[outer[~on_box[outer]]])))
+    off = np.abs(
+        levels(around.region.level, around.image.to_index(mesh.points[outer[~on_box[outer]]]))
+    )
     facets = mesh.points[boundary_facets(mesh.cells)]
-    edge = np.linalg.norm(facets[:, 0] - facets[:, 1], axis=1).mean() / image.voxel_volume ** (1.0 / image.ndim)
-    near = np.full(len(mesh.points), MOST_OFFSET_FRACTION * edge) + (0.0 if is_between is None else 0.1 * is_between)
+    edge = np.linalg.norm(facets[:, 0] - facets[:, 1], axis=1).mean() / image.voxel_volume ** (
+        1.0 / image.ndim
+    )
+    near = np.full(len(mesh.points), MOST_OFFSET_FRACTION * edge) + (
+        0.0 if is_between is None else 0.1 * is_between
+    )
     assert np.mean(off < near[outer[~on_box[outer]]]) > 0.97
     assert off.max() < 0.7
     is_on_box = on_box[boundary_facets(mesh.cells)].all(axis=1)
     middles = facets[~is_on_box].mean(axis=1)
     of_middles = levels(around.region.level, around.image.to_index(middles)).mean()
-    corners = levels(around.region.level, around.image.to_index(facets[~is_on_box].reshape(-1, image.ndim))).mean()
-    # A quadratic function's mean over a facet is 3/4 of that at its middle and 1/4 of that at its corners; 2/3 in 2-D.
+    corners = levels(
+        around.region.level, around.image.to_index(facets[~is_on_box].reshape(-1, image.ndim))
+    ).mean()
+    # A quadratic function's mean over a facet is 3/4 of that at its middle and 1/4 of that at its
+    # corners; 2/3 in 2-D.
     share = 2.0 / 3.0 if image.ndim == 2 else 0.75
     assert abs(share * of_middles + (1.0 - share) * corners) < 0.03
 
 
 def hard_E_D(target, mesh):
-    """E_D from the voxels, one by one: squares around the cells' means, and those on the wrong side of the mask."""
+    """E_D from the voxels, one by one: squares around the cells' means, and those on the wrong
+    side of the mask.
+    """
     owner = cell_of_voxel(target.image, mesh).ravel()
     is_in = owner >= 0
     squares = 0.0
@@ -77,7 +89,14 @@ def hard_E_D(target, mesh):
 @pytest.mark.full
 @pytest.mark.parametrize(
     ("kind", "is_graded"),
-    [("ball", True), ("hole", True), ("handle", True), ("sheet", True), ("pieces", False), ("touching", False)],
+    [
+        ("ball", True),
+        ("hole", True),
+        ("handle", True),
+        ("sheet", True),
+        ("pieces", False),
+        ("touching", False),
+    ],
 )
 def test_masks(kind, is_graded):
     image, mask = shaped(kind, OBLIQUE if kind == "ball" else None)
@@ -125,7 +144,9 @@ def test_the_boundary_may_be_fixed():
     image, mask = shaped("ball")
     target = content(image, mask=mask)
     start = lattice_within(target.image, target.region, nodes=600)
-    result = tetopt.optimize(target, start, k_D=0.5, iterations=3, min_dihedral=0.0, boundary="fixed")
+    result = tetopt.optimize(
+        target, start, k_D=0.5, iterations=3, min_dihedral=0.0, boundary="fixed"
+    )
     outer = np.unique(boundary_facets(start.cells))
     np.testing.assert_allclose(result.mesh.points[outer], start.points[outer], atol=1e-5)
     assert np.abs(result.mesh.points - start.points).max() > 0.3
@@ -134,8 +155,13 @@ def test_the_boundary_may_be_fixed():
 @pytest.mark.full
 def test_what_lies_beyond_the_mask_does_not_matter():
     image, mask = shaped("ball")
-    other = tetopt.Image(np.where(mask.data > 0, image.data, 1e4 * np.random.default_rng(0).random(image.shape)))
-    meshes = [tetopt.mesh_image(content(each, mask=mask), 300, iterations=3).mesh for each in (image, other)]
+    other = tetopt.Image(
+        np.where(mask.data > 0, image.data, 1e4 * np.random.default_rng(0).random(image.shape))
+    )
+    meshes = [
+        tetopt.mesh_image(content(each, mask=mask), 300, iterations=3).mesh
+        for each in (image, other)
+    ]
     np.testing.assert_array_equal(meshes[0].points, meshes[1].points)
     np.testing.assert_array_equal(meshes[0].cells, meshes[1].cells)
 
@@ -166,7 +192,9 @@ def test_a_lift_that_lays_cells_over_one_another_is_undone(monkeypatch):
     monkeypatch.setattr(Run, "_overlapping", lambda self, state: np.ones(100, dtype=bool))
     monkeypatch.setattr(Run, "mend_surfaces", lambda self, carves, min_dihedral: 0)
     kept = tetopt.optimize(target, start, iterations=2, min_dihedral=35.0)
-    angles = [tetopt.quality(each.mesh.points, each.mesh.cells).min_dihedral for each in (lifted, kept)]
+    angles = [
+        tetopt.quality(each.mesh.points, each.mesh.cells).min_dihedral for each in (lifted, kept)
+    ]
     assert angles[1] < angles[0]
     assert all(later <= earlier for earlier, later in pairwise(row.E for row in kept.history))
     assert kept.history[-1].E_D == pytest.approx(hard_E_D(target, kept.mesh), rel=1e-9)
@@ -214,7 +242,9 @@ def test_an_interface_that_touches_itself_is_mended_by_labels_alone():
     assert manifold_problems(mesh, run.labels()) == []
     of_cell = run.state.complex.labels
     whole = [
-        n for n in range(len(mesh.points)) if len(set(of_cell[np.flatnonzero((mesh.cells == n).any(axis=1))])) == 1
+        n
+        for n in range(len(mesh.points))
+        if len(set(of_cell[np.flatnonzero((mesh.cells == n).any(axis=1))])) == 1
     ]
     n_cells = np.bincount(mesh.cells.ravel())
     node = max(whole, key=lambda n: n_cells[n])
@@ -229,7 +259,9 @@ def test_an_interface_that_touches_itself_is_mended_by_labels_alone():
 
 
 def corners(shape=(24, 24, 24)):
-    """Eight cubes of which four labels meet in an edge, eight in a point; and a label of one voxel."""
+    """Eight cubes of which four labels meet in an edge, eight in a point; and a label of one
+    voxel.
+    """
     at = grid(shape) >= 12
     labels = 1.0 + at[..., 0] + 2 * at[..., 1] + 4 * at[..., 2]
     labels[5, 5, 5] = 20
@@ -243,19 +275,24 @@ def test_labels_that_meet_in_edges_and_points():
     result = tetopt.mesh_image(target, 700, iterations=10)
     assert tetopt.check_mesh(result.mesh, labels) == []
     assert tetopt.quality(result.mesh.points, result.mesh.cells).min_dihedral >= 12.0 - 1e-9
-    assert result.history[-1].E_D == pytest.approx(hard_E_D(target, result.mesh), rel=1e-9, abs=1e-9)
+    assert result.history[-1].E_D == pytest.approx(
+        hard_E_D(target, result.mesh), rel=1e-9, abs=1e-9
+    )
     rows = {row.label: row for row in label_fidelity(labels, result.mesh, result.labels)}
     for label in range(1, 9):
         assert rows[label].dice > 0.995
         assert rows[label].components == 1
-        assert rows[label].mesh_components <= 3  # beside the edge where four meet a cell may stand alone
+        # beside the edge where four meet a cell may stand alone
+        assert rows[label].mesh_components <= 3
     assert sum(row.mesh_volume for row in rows.values()) == pytest.approx(labels.volume)
     assert rows[20].is_lost or rows[20].mesh_volume < 4.0  # one voxel among 13,824
 
 
 @pytest.mark.full
 def test_labels_and_an_image_share_the_cells():
-    """With labels cells keep to both: the image alone does not see the labels, nor they its step."""
+    """With labels cells keep to both: the image alone does not see the labels, nor they its
+    step.
+    """
     shape = (26, 26, 26)
     at = grid(shape)
     image = tetopt.Image(100.0 * (at[..., 0] > 12.3))
@@ -275,14 +312,20 @@ def test_labels_and_an_image_share_the_cells():
 def test_contrasts_of_different_scales_are_all_seen():
     """Steps along three axes, one in each contrast: cells keep to each, whatever its scale."""
     at = grid((24, 24, 24))
-    images = [tetopt.Image(scale * (at[..., d] > 7.5 + 3 * d)) for d, scale in enumerate((1.0, 1e-4, 3e4))]
+    images = [
+        tetopt.Image(scale * (at[..., d] > 7.5 + 3 * d)) for d, scale in enumerate((1.0, 1e-4, 3e4))
+    ]
     target = content(images)
     result = tetopt.mesh_image(target, 400)
     assert result.history[-1].E_D == pytest.approx(hard_E_D(target, result.mesh), rel=1e-9)
     for image in images:
-        assert tetopt.E_D(image, result.mesh) < 0.02 * np.var(image.data, dtype=float) * image.volume
+        assert (
+            tetopt.E_D(image, result.mesh) < 0.02 * np.var(image.data, dtype=float) * image.volume
+        )
     alone = tetopt.mesh_image(images[0], 400).mesh
-    assert tetopt.E_D(images[1], alone) > 0.05 * np.var(images[1].data, dtype=float) * images[1].volume
+    assert (
+        tetopt.E_D(images[1], alone) > 0.05 * np.var(images[1].data, dtype=float) * images[1].volume
+    )
 
 
 @pytest.mark.full
@@ -292,7 +335,10 @@ def test_labels_within_a_mask():
     target = content(image, labels, mask)
     result = tetopt.mesh_image(target, 600, iterations=5)
     mesh = result.mesh
-    is_between = np.isin(np.arange(len(mesh.points)), np.intersect1d(*(mesh.cells[result.labels == k] for k in (1, 2))))
+    is_between = np.isin(
+        np.arange(len(mesh.points)),
+        np.intersect1d(*(mesh.cells[result.labels == k] for k in (1, 2))),
+    )
     check(image, mask, mesh, is_between=is_between)
     of_cell = cell_labels(labels, mesh)
     assert set(of_cell) == {1, 2}
@@ -306,7 +352,8 @@ def test_an_error_wanted_within_a_mask():
     image, mask = shaped("ball")
     target = content(image, mask=mask)
     result = tetopt.mesh_image(target, target_error=0.2, iterations=6)
-    assert 0.1 < result.fraction <= 0.2  # of the variance of the voxels in cells, which quality reports, too
+    # of the variance of the voxels in cells, which quality reports, too
+    assert 0.1 < result.fraction <= 0.2
     assert result.fraction == unexplained(target, result.mesh)
 
 
@@ -320,12 +367,16 @@ def test_level_between_voxels():
         level = rng.normal(size=shape).astype(np.float32)
         at = rng.uniform(-1.0, 6.0, size=(30, 3))
         values = [level_at(level, *place) for place in at]
-        np.testing.assert_allclose(values, levels(level, np.clip(at, 0, np.array(shape) - 1.0)), atol=1e-6)
+        np.testing.assert_allclose(
+            values, levels(level, np.clip(at, 0, np.array(shape) - 1.0)), atol=1e-6
+        )
 
 
 @pytest.mark.kernel
 def test_put_on_surface():
-    """Onto a sphere: nearly the nearest point of it, along the box's faces for nodes that lie there."""
+    """Onto a sphere: nearly the nearest point of it, along the box's faces for nodes that lie
+    there.
+    """
     shape = (24, 24, 24)
     image = tetopt.Image(np.zeros(shape), OBLIQUE)
     region_level = (distance(shape, 11.0, 12.0, -3.0) - 9.0).astype(np.float32)
@@ -338,7 +389,10 @@ def test_put_on_surface():
     matrix = image.affine[:3, :3].copy()
     is_frozen = np.zeros((40, 4), dtype=bool)
     is_frozen[20:, 2] = is_frozen[:, 3] = True
-    objective, sides = objective_of(grid_, matrix, 3.0), sides_of(grid_, matrix, side_ticks(grid_), False, region_level)
+    objective, sides = (
+        objective_of(grid_, matrix, 3.0),
+        sides_of(grid_, matrix, side_ticks(grid_), False, region_level),
+    )
     state = build(np.empty((0, 4), dtype=np.int64), ticks, is_frozen, objective, sides)
     normal = np.zeros((7, 3))
     reached = np.array([put_on_surface(normal, state, k) for k in range(40)])
@@ -364,5 +418,7 @@ def test_no_facet_turns_over():
     total, covered = times_covered(image, result.mesh)
     assert total == covered
     grid_ = channel_grid(target, result.mesh.points)
-    sums = moment_sums(grid_, to_ticks(target.image.to_index(result.mesh.points), grid_), result.mesh.cells)
+    sums = moment_sums(
+        grid_, to_ticks(target.image.to_index(result.mesh.points), grid_), result.mesh.cells
+    )
     assert sums[:, 0].sum() == total

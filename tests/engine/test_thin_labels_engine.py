@@ -28,7 +28,9 @@ def contact(mesh, of_cell, a, b):
     """Area of the facets between cells of two labels."""
     across = across_of(mesh.cells, len(mesh.points))
     cell, k = np.nonzero((across >= 0) & (of_cell[:, None] == a) & (of_cell[across] == b))
-    other = np.array([np.delete(mesh.cells[c], j) for c, j in zip(cell, k, strict=True)], dtype=int).reshape(-1, 3)
+    other = np.array(
+        [np.delete(mesh.cells[c], j) for c, j in zip(cell, k, strict=True)], dtype=int
+    ).reshape(-1, 3)
     x = mesh.points[other]
     return 0.5 * np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1).sum()
 
@@ -45,9 +47,12 @@ def test_a_place_has_the_label_of_its_smallest_level():
     index = rng.uniform(0.0, 1.0, (500, 3)) * (np.array([7, 6, 8]) - 1)
     centres = np.argwhere(members.partition >= 0)
     assert np.array_equal(labels_of(members, centres.astype(float)), members.partition.ravel())
-    levels = np.array([map_coordinates(members.levels[c], index.T, order=1) for c in members.channel])
+    levels = np.array(
+        [map_coordinates(members.levels[c], index.T, order=1) for c in members.channel]
+    )
     expected = levels.argmin(axis=0)
-    # A label is looked for among those of the voxels around; by levels alone another one may be as near.
+    # A label is looked for among those of the voxels around; by levels alone another one may be as
+    # near.
     is_near = np.array(
         [
             row in members.partition[tuple(slice(int(i), int(i) + 2) for i in at)]
@@ -60,22 +65,30 @@ def test_a_place_has_the_label_of_its_smallest_level():
 
 @pytest.mark.parametrize("shape", [(9, 8), (7, 6, 8)])
 def test_cells_among_voxels_of_one_label_have_it_everywhere(shape):
-    """Labels at places in cells are those at the same places by themselves, whatever the cells are among."""
+    """Labels at places in cells are those at the same places by themselves, whatever the cells
+    are among.
+    """
     n, rng = len(shape), np.random.default_rng(6)
     members = memberships(tetopt.Image((np.indices(shape).sum(axis=0) > 9).astype(float)))
     corners = rng.uniform(-0.2, 1.0, (200, 1, n)) * shape + rng.uniform(-1.0, 1.0, (200, n + 1, n))
     cells = np.arange(200 * (n + 1)).reshape(200, n + 1)
     there = labels_at(members, corners.reshape(-1, n), cells, PART_CENTRES[n])
-    assert np.array_equal(there.ravel(), labels_of(members, (PART_CENTRES[n] @ corners).reshape(-1, n)))
+    assert np.array_equal(
+        there.ravel(), labels_of(members, (PART_CENTRES[n] @ corners).reshape(-1, n))
+    )
     assert 10 < (there != there[:, :1]).any(axis=1).sum() < 180
 
 
 def test_small_cells_are_filled_by_levels_not_by_centres():
-    """A plane that cuts small cells: what they hold of each side is the plane's, not one voxel's."""
+    """A plane that cuts small cells: what they hold of each side is the plane's, not one
+    voxel's.
+    """
     image = tetopt.Image((np.indices((8, 8, 8))[0] >= 4).astype(float) + 1.0)
     mesh = tetopt.lattice_mesh(image, spacing=1.6)
     members = memberships(image)
-    counts = cell_contents(image, members, mesh, label_voxels(members.partition, image.spacing, 2)).counts
+    counts = cell_contents(
+        image, members, mesh, label_voxels(members.partition, image.spacing, 2)
+    ).counts
     size = volumes(mesh.points, mesh.cells)
     assert counts.sum(axis=1) == pytest.approx(size)
     places = PART_CENTRES[3] @ mesh.points[mesh.cells]
@@ -86,7 +99,9 @@ def test_small_cells_are_filled_by_levels_not_by_centres():
 
 @pytest.mark.parametrize("spacing", [1.7, 5.5])
 def test_contents_of_cells_are_those_of_a_plain_count(spacing):
-    """Cells with many centres hold those, others samples, in their volume; and centres that samples hardly show."""
+    """Cells with many centres hold those, others samples, in their volume; and centres that
+    samples hardly show.
+    """
     data = np.random.default_rng(3).integers(1, 4, (12, 13, 14)).astype(float)
     data[:6], data[8, 8, 8] = 1.0, 4.0
     image = tetopt.Image(data)
@@ -104,7 +119,10 @@ def test_contents_of_cells_are_those_of_a_plain_count(spacing):
             aim[cell, label] += share[cell]
     seen = aim.sum(axis=0)
     for place, label in np.ndenumerate(members.partition):
-        if seen[label] < SAMPLED_FRACTION * (members.partition == label).sum() and is_few[owner[place]]:
+        if (
+            seen[label] < SAMPLED_FRACTION * (members.partition == label).sum()
+            and is_few[owner[place]]
+        ):
             aim[owner[place], label] += 1.0
     assert is_few.any()
     assert is_few.all() == (spacing < 2.0)
@@ -114,17 +132,23 @@ def test_contents_of_cells_are_those_of_a_plain_count(spacing):
 
 
 def test_labels_have_their_volume_in_cells_of_about_as_many_centres_as_are_counted():
-    """Some of these cells have more centres than their volume, others fewer; only the former's are counted."""
+    """Some of these cells have more centres than their volume, others fewer; only the former's
+    are counted.
+    """
     image = tetopt.Image(np.random.default_rng(1).integers(0, 2, (24, 24, 24)).astype(float))
     mesh, members = tetopt.lattice_mesh(image, spacing=5.9), memberships(image)
     n_owned = np.bincount(tetopt.cell_of_voxel(image, mesh).ravel())
     assert 0.2 < (n_owned < FEWEST_CENTRES).mean() < 0.8
-    contents = cell_contents(image, members, mesh, label_voxels(members.partition, image.spacing, 2))
+    contents = cell_contents(
+        image, members, mesh, label_voxels(members.partition, image.spacing, 2)
+    )
     assert contents.counts.sum(axis=1) == pytest.approx(mesh.cell_volumes)
 
 
 def slab(n, cubes):
-    """A lattice with a slab in it: points, cells, those across, sizes, and how much of each cell a thin label fills."""
+    """A lattice with a slab in it: points, cells, those across, sizes, and how much of each cell
+    a thin label fills.
+    """
     points, cells = lattice(n, cubes)
     middle = points[cells].mean(axis=1)
     is_slab = np.abs(middle[:, 0] - middle[:, 0].mean()) < 1.0
@@ -134,11 +158,15 @@ def slab(n, cubes):
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_a_thin_label_keeps_its_volume(n):
-    """A label that fills a third of the cells of a slab gets a third of these, or none without a bias."""
+    """A label that fills a third of the cells of a slab gets a third of these, or none without a
+    bias.
+    """
     points, cells, across, size, share = slab(n, 4)
     counts = csr_array(np.column_stack([(1.0 - share) * size, share * size]))
     kept = labelled(points, cells, across, Contents(counts), NO_COMPONENTS[:2], weight=1e-3)
-    lost = labelled(points, cells, across, Contents(counts), NO_COMPONENTS[:2], keeps_volumes=False, weight=1e-3)
+    lost = labelled(
+        points, cells, across, Contents(counts), NO_COMPONENTS[:2], keeps_volumes=False, weight=1e-3
+    )
     aim = (share * size).sum()
     assert size[kept == 1].sum() == pytest.approx(aim, rel=0.35)
     assert (lost == 1).sum() <= 1
@@ -146,7 +174,9 @@ def test_a_thin_label_keeps_its_volume(n):
 
 @pytest.mark.parametrize("fullest", [0.15, 0.25, 0.35, 0.44])
 def test_a_slab_thinner_than_cells_keeps_its_volume(fullest):
-    """A label that fills up to a sixth, or nearly half, of each of its cells: not 1.7 times what it fills."""
+    """A label that fills up to a sixth, or nearly half, of each of its cells: not 1.7 times what
+    it fills.
+    """
     points, cells, across, size, share = slab(3, 6)
     share *= fullest / share.max()
     counts = csr_array(np.column_stack([(1.0 - share) * size, share * size]))
@@ -159,7 +189,11 @@ def test_pairs_that_do_not_touch():
     partition = np.zeros((8, 6, 6), dtype=np.int64)
     partition[3:5], partition[5:] = 1, 2
     voxels = label_voxels(partition, np.ones(3), 3)
-    assert voxels.is_apart.tolist() == [[False, False, True], [False, False, False], [True, False, False]]
+    assert voxels.is_apart.tolist() == [
+        [False, False, True],
+        [False, False, False],
+        [True, False, False],
+    ]
     assert len(voxels.places) == 0
     partition[3:5, 2, 2] = 2
     voxels = label_voxels(partition, np.ones(3), 3)
@@ -174,7 +208,9 @@ def test_a_shell_of_one_cell_is_whole(thickness, percent):
     """Volume, one component, no hole, and hardly any contact of what lies within and without."""
     image = shell_image(36, thickness, 10.0)
     result = tetopt.mesh_image(
-        tetopt.content(image, image, weights=[0.0]), sizes=tetopt.Sizes(edge_size=8.0, cells_across=1), iterations=8
+        tetopt.content(image, image, weights=[0.0]),
+        sizes=tetopt.Sizes(edge_size=8.0, cells_across=1),
+        iterations=8,
     )
     volume = 4.0 / 3.0 * np.pi * ((10.0 + thickness) ** 3 - 10.0**3)
     size = volumes(result.mesh.points, result.mesh.cells)
@@ -188,7 +224,9 @@ def test_a_shell_of_one_cell_is_whole(thickness, percent):
 def meshed_label(inside, nodes, is_flat=True, order=1, keep_volumes=True):
     """The content of one label beside another, its mesh, and how well the label is met."""
     image = tetopt.Image(inside.astype(float))
-    content = tetopt.content(image, image, weights=[0.0], keep_volumes=keep_volumes)._replace(is_flat=is_flat)
+    content = tetopt.content(image, image, weights=[0.0], keep_volumes=keep_volumes)._replace(
+        is_flat=is_flat
+    )
     result = tetopt.mesh_image(content, nodes, order=order)
     return content, result, tetopt.label_fidelity(image, result.mesh, result.labels)[1]
 
@@ -196,14 +234,22 @@ def meshed_label(inside, nodes, is_flat=True, order=1, keep_volumes=True):
 def off_surface(content, result):
     """How far nodes between the two labels are off their surface, voxels."""
     n_labels = [
-        np.unique(result.labels[(result.mesh.cells == k).any(axis=1)]).size for k in range(len(result.mesh.points))
+        np.unique(result.labels[(result.mesh.cells == k).any(axis=1)]).size
+        for k in range(len(result.mesh.points))
     ]
     at = content.image.to_index(result.mesh.points[np.array(n_labels) == 2]).T
-    one, other = (map_coordinates(level, at, order=1, mode="nearest") for level in content.memberships.levels)
+    one, other = (
+        map_coordinates(level, at, order=1, mode="nearest") for level in content.memberships.levels
+    )
     return 0.5 * np.abs(one - other)
 
 
-BALL = np.linalg.norm(np.indices((40, 28, 28)) - np.array([20, 13.4, 13.4])[:, None, None, None], axis=0) < 9.0
+BALL = (
+    np.linalg.norm(
+        np.indices((40, 28, 28)) - np.array([20, 13.4, 13.4])[:, None, None, None], axis=0
+    )
+    < 9.0
+)
 
 
 def test_facets_on_a_ball_do_not_cut_it_off():
@@ -223,9 +269,9 @@ def test_facets_on_a_ball_do_not_cut_it_off():
 @pytest.mark.parametrize("nodes", [300, 1200])
 @pytest.mark.parametrize("radii", [(8.0, 8.0, 8.0), (12.0, 7.0, 6.0)])
 def test_a_round_mask_has_its_volume_at_every_size(radii, nodes):
-    x = (np.indices((32, 24, 24)) - np.array([15.6, 11.3, 11.4])[:, None, None, None]) / np.array(radii)[
-        :, None, None, None
-    ]
+    x = (np.indices((32, 24, 24)) - np.array([15.6, 11.3, 11.4])[:, None, None, None]) / np.array(
+        radii
+    )[:, None, None, None]
     mask = tetopt.Image(((x**2).sum(axis=0) < 1.0).astype(float))
     mesh = tetopt.mesh_image(tetopt.content(mask, mask=mask), nodes, iterations=10).mesh
     volume = 4.0 / 3.0 * np.pi * np.prod(radii)
@@ -233,11 +279,18 @@ def test_a_round_mask_has_its_volume_at_every_size(radii, nodes):
 
 
 def test_offsets_are_the_sagitta_of_facets():
-    """On an octahedron around a ball: a facet's mean of the distance to the surface, minus that at its corners."""
+    """On an octahedron around a ball: a facet's mean of the distance to the surface, minus that
+    at its corners.
+    """
     radius, image = 8.0, tetopt.Image(np.zeros((25, 25, 25)))
-    inside = tetopt.Image((np.linalg.norm(np.indices((25,) * 3) - 12.0, axis=0) < radius).astype(float))
+    inside = tetopt.Image(
+        (np.linalg.norm(np.indices((25,) * 3) - 12.0, axis=0) < radius).astype(float)
+    )
     content = tetopt.content(image, mask=inside)
-    level = np.linalg.norm(np.indices(content.image.shape) - 0.5 * (content.image.shape[0] - 1), axis=0) - radius
+    level = (
+        np.linalg.norm(np.indices(content.image.shape) - 0.5 * (content.image.shape[0] - 1), axis=0)
+        - radius
+    )
     content = content._replace(region=content.region._replace(level=level.astype(np.float32)))
     middle = content.image.to_world(0.5 * (np.array(content.image.shape) - 1.0))
     corners = radius * np.vstack([np.eye(3), -np.eye(3)])
@@ -270,7 +323,9 @@ def test_a_thin_rod_has_its_volume(nodes):
 
 
 def test_labels_do_not_meet_outside_a_mask():
-    """A label whose halves are linked beyond the mask only, around one that separates them within."""
+    """A label whose halves are linked beyond the mask only, around one that separates them
+    within.
+    """
     partition = np.zeros((9, 6, 6), dtype=np.int64)
     partition[4, :3] = 1
     within = np.where(np.arange(6)[:, None] < 3, partition, -1)

@@ -1,4 +1,6 @@
-"""Each program of the gallery, as it stands: it runs without a warning, leaves nothing, and prints the number below."""
+"""Each program of the gallery, as it stands: it runs without a warning, leaves nothing, and
+prints the number below.
+"""
 
 import contextlib
 import io
@@ -44,7 +46,8 @@ NUMBERS = {
     "calculix": Number("largest_stress", ".2f", "2.31"),
     "scikit_fem": Number("energy", ".2f", "17061.02"),
     "fenicsx": Number("largest_kPa", ".2f", "7.71"),
-    "improve_pytetwild": Number("remaining", ".2f", "0.30", 0.1),  # its meshes are not the same everywhere
+    # its meshes are not the same everywhere
+    "improve_pytetwild": Number("remaining", ".2f", "0.30", 0.1),
     "elastography": Number("contrast", ".2f", "3.72"),
     "own_phantom": Number("volume_mm3", ".1f", "1171.2"),
     "other_libraries": Number("volume_mm3", ".1f", "33727.4"),
@@ -64,7 +67,8 @@ LONGEST = ("nested_shells", "tissues_from_labels")  # half a minute; `make docs`
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow if name in LONGEST else ()) for name in PROGRAMS]
+    "name",
+    [pytest.param(name, marks=pytest.mark.slow if name in LONGEST else ()) for name in PROGRAMS],
 )
 def test_program(name, tmp_path, monkeypatch, opengl):
     """Run in a folder with what lies beside it, the pictures drawn off screen."""
@@ -84,17 +88,27 @@ def test_program(name, tmp_path, monkeypatch, opengl):
 
 def _run(name, folder, monkeypatch):
     """The program's names, and what it prints."""
-    beside = {path.name for path in EXAMPLES.iterdir() if path.suffix not in (".py", ".rst") and path.is_file()}
+    beside = {
+        path.name
+        for path in EXAMPLES.iterdir()
+        if path.suffix not in (".py", ".rst") and path.is_file()
+    }
     for file in beside:
         shutil.copy(EXAMPLES / file, folder)
     monkeypatch.chdir(folder)
     monkeypatch.setattr(pyvista, "OFF_SCREEN", True)
     monkeypatch.setattr(formats, "FORMATS", dict(formats.FORMATS))
     show, shown = pyvista.Plotter.show, []
-    monkeypatch.setattr(pyvista.Plotter, "show", lambda *args, **look: shown.append(show(*args, **look)))
+    monkeypatch.setattr(
+        pyvista.Plotter, "show", lambda *args, **look: shown.append(show(*args, **look))
+    )
     output = io.StringIO()
     # Without a display VTK complains of the missing one before it renders off screen.
-    with warnings.catch_warnings(), contextlib.redirect_stdout(output), pyvista.vtk_verbosity("off"):
+    with (
+        warnings.catch_warnings(),
+        contextlib.redirect_stdout(output),
+        pyvista.vtk_verbosity("off"),
+    ):
         warnings.simplefilter("error", UserWarning)
         warnings.simplefilter("error", RuntimeWarning)
         names = runpy.run_path(str(EXAMPLES / f"plot_{name}.py"))

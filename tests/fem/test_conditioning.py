@@ -1,4 +1,6 @@
-"""Eigenvalues against full matrices, iteration counts against a loop of ten lines, and how both scale."""
+"""Eigenvalues against full matrices, iteration counts against a loop of ten lines, and how both
+scale.
+"""
 
 import numpy as np
 import pytest
@@ -18,9 +20,14 @@ def system(n, blocks, *, is_bonded=True, factor=1.0, size=1.0, contrast=10.0, nu
     push = np.zeros(n)
     push[-1] = 0.1 * size
     return compression(
-        Mesh(size * mesh.points, mesh.cells), factor * young, nu, fixed_nodes=high, pushed_nodes=low,
-        displacement=push, is_bonded=is_bonded,
-    ).system  # fmt: skip
+        Mesh(size * mesh.points, mesh.cells),
+        factor * young,
+        nu,
+        fixed_nodes=high,
+        pushed_nodes=low,
+        displacement=push,
+        is_bonded=is_bonded,
+    ).system
 
 
 def plain_cg(K, b, rtol):
@@ -44,7 +51,9 @@ def plain_cg(K, b, rtol):
 
 
 @pytest.mark.parametrize("method", ["direct", "amg"])
-@pytest.mark.parametrize(("n", "blocks", "is_bonded"), [(2, (8, 7), True), (3, (3, 3, 3), False), (3, (2, 2, 3), True)])
+@pytest.mark.parametrize(
+    ("n", "blocks", "is_bonded"), [(2, (8, 7), True), (3, (3, 3, 3), False), (3, (2, 2, 3), True)]
+)
 def test_eigenvalues_are_those_of_the_full_matrix(n, blocks, is_bonded, method):
     equations = system(n, blocks, is_bonded=is_bonded)
     values = np.linalg.eigvalsh(equations.K_ff.toarray())
@@ -58,7 +67,9 @@ def test_eigenvalues_are_those_of_the_full_matrix(n, blocks, is_bonded, method):
 
 @pytest.mark.parametrize("n_free", [1, 2, 31, 32, 33, 34, 200])
 def test_known_spectrum(n_free):
-    """A diagonal matrix, from dofs so few that they are done as a full matrix to those done by Lanczos."""
+    """A diagonal matrix, from dofs so few that they are done as a full matrix to those done by
+    Lanczos.
+    """
     K = diags_array(np.arange(1.0, n_free + 1.0)).tocsr()
     assert lambda_max(K) == pytest.approx(n_free, rel=1e-12)
     assert lambda_min(K) == pytest.approx(1.0, rel=1e-12)
@@ -90,7 +101,8 @@ def test_the_same_in_every_run(method):
     np.random.seed(1)  # noqa: NPY002  neither asks nor moves the global generator
     first = conditioning(equations, method=method)
     second = conditioning(equations, method=method)
-    assert second[:3] == pytest.approx(first[:3], rel=1e-11)  # BLAS may round by where an array lies in memory
+    # BLAS may round by where an array lies in memory
+    assert second[:3] == pytest.approx(first[:3], rel=1e-11)
     assert abs(second.cg_iterations - first.cg_iterations) <= 1
     drawn = np.random.random()  # noqa: NPY002
     np.random.seed(1)  # noqa: NPY002
@@ -102,7 +114,9 @@ def test_the_same_in_every_run(method):
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_scaling(n):
-    """Moduli scale eigenvalues and not cond; sizes scale them by s^(n-2); the count knows neither."""
+    """Moduli scale eigenvalues and not cond; sizes scale them by s^(n-2); the count knows
+    neither.
+    """
     blocks = (6, 5, 4)[:n]
     base = conditioning(system(n, blocks))
     stiff = conditioning(system(n, blocks, factor=1000.0))
@@ -122,7 +136,10 @@ def test_finer_meshes_contrast_and_near_incompressibility_are_worse_conditioned(
     assert 3.5 < fine.cond / coarse.cond < 4.2
     assert fine.cg_iterations > 1.5 * coarse.cg_iterations
     assert conditioning(system(2, (10, 10), contrast=100.0, nu=0.3)).cond > 3.0 * coarse.cond
-    assert conditioning(system(3, (5, 5, 5), nu=0.499)).cond > 10.0 * conditioning(system(3, (5, 5, 5), nu=0.3)).cond
+    assert (
+        conditioning(system(3, (5, 5, 5), nu=0.499)).cond
+        > 10.0 * conditioning(system(3, (5, 5, 5), nu=0.3)).cond
+    )
 
 
 def test_a_flat_cell_raises_lambda_max():
@@ -156,7 +173,9 @@ def test_count_is_that_of_the_textbook(n, blocks, is_bonded, rtol):
 
 @pytest.mark.full
 def test_count_of_easy_systems():
-    """One step for a diagonal matrix, whatever is on it; three for three eigenvalues; none for no load."""
+    """One step for a diagonal matrix, whatever is on it; three for three eigenvalues; none for
+    no load.
+    """
     b = np.random.default_rng(0).normal(size=300)
     assert cg_iterations(diags_array(np.arange(1.0, 301.0)).tocsr(), b) == 1
     householder = np.eye(300) - 2.0 * np.outer(b, b) / (b @ b)
@@ -176,11 +195,14 @@ def test_nothing_to_solve():
     image = Image(np.zeros((2, 2, 2)))
     mesh = lattice_mesh(image, "five-tet", blocks=(1, 1, 1))
     low, high = box_faces(image, mesh)
-    pressed = compression(mesh, 1.0, 0.3, fixed_nodes=high, pushed_nodes=low, displacement=[0.0, 0.0, 0.1])
+    pressed = compression(
+        mesh, 1.0, 0.3, fixed_nodes=high, pushed_nodes=low, displacement=[0.0, 0.0, 0.1]
+    )
     with pytest.raises(InputError) as error:
         conditioning(pressed.system)
     assert str(error.value) == (
-        "conditioning: every node is fixed or pushed, so there is nothing to solve; use a finer mesh"
+        "conditioning: every node is fixed or pushed, so there is nothing to solve; use a finer "
+        "mesh"
     )
 
 
@@ -194,12 +216,14 @@ def test_unknown_method():
 def test_no_convergence_is_an_error():
     equations = system(2, (9, 8))
     with pytest.raises(
-        RuntimeError, match=r"^conditioning: conjugate gradients did not reach 1e-300 of the load in \d+ steps$"
+        RuntimeError,
+        match=r"^conditioning: conjugate gradients did not reach 1e-300 of the load in \d+ steps$",
     ):
         cg_iterations(equations.K_ff, equations.load, 1e-300)
     # As bad a preconditioner as can be: the matrix itself.
     ill = system(2, (30, 30), contrast=1e6).K_ff
     with pytest.raises(
-        RuntimeError, match=r"^conditioning: the smallest eigenvalue did not converge, because a solve did not$"
+        RuntimeError,
+        match=r"^conditioning: the smallest eigenvalue did not converge, because a solve did not$",
     ):
         lambda_min(ill, ill)

@@ -1,4 +1,6 @@
-"""Curved quadratic cells solved: patch tests, integrals, scikit-fem's numbers, and Lame's sphere."""
+"""Curved quadratic cells solved: patch tests, integrals, scikit-fem's numbers, and Lame's
+sphere.
+"""
 
 import numpy as np
 import pytest
@@ -9,7 +11,14 @@ from skfem.helpers import ddot, sym_grad, trace
 from test_solution import eighth_of_a_shell, uneven
 
 from tetopt import InputError, Mesh, solve
-from tetopt.fem.elasticity import constrained, gauss_strains, gauss_volumes, solved, stiffness, strains
+from tetopt.fem.elasticity import (
+    constrained,
+    gauss_strains,
+    gauss_volumes,
+    solved,
+    stiffness,
+    strains,
+)
 from tetopt.fem.reference import compare
 from tetopt.fem.solution import node_means, solution_fields, weight_forces
 from tetopt.geometry.quadratic import curved_rule, numbered_edges, quadratic
@@ -28,7 +37,9 @@ def nodes_and_cells(mesh):
 
 @pytest.mark.parametrize("n", N)
 def test_a_linear_displacement_is_reproduced(n):
-    """Isoparametric cells hold it exactly; with a rule that integrates their pull, inner nodes find it."""
+    """Isoparametric cells hold it exactly; with a rule that integrates their pull, inner nodes
+    find it.
+    """
     mesh = with_bent_edges(uneven(n)[0], 0.06)
     nodes, cells = nodes_and_cells(mesh)
     outer = np.unique(element_facets(cells, boundary_rows(mesh)))
@@ -36,14 +47,18 @@ def test_a_linear_displacement_is_reproduced(n):
     slope = np.random.default_rng(5).normal(size=(n, n))
     exact = nodes @ slope.T
     prescribed = np.where(is_outer[:, None], exact, 0.0)
-    u = solved(constrained(mesh, 3.0, 0.3, np.repeat(is_outer[:, None], n, axis=1), prescribed, order=2))
+    u = solved(
+        constrained(mesh, 3.0, 0.3, np.repeat(is_outer[:, None], n, axis=1), prescribed, order=2)
+    )
     assert 0.1 < (~is_outer).mean() < 0.9
     np.testing.assert_allclose(u, exact, atol=1e-11 * np.abs(exact).max())
     strain = 0.5 * (slope + slope.T)
     np.testing.assert_allclose(
         gauss_strains(mesh, u), np.broadcast_to(strain, (len(cells), *_shape(n), n, n)), atol=1e-9
     )
-    np.testing.assert_allclose(strains(mesh, u), np.broadcast_to(strain, (len(cells), n, n)), atol=1e-9)
+    np.testing.assert_allclose(
+        strains(mesh, u), np.broadcast_to(strain, (len(cells), n, n)), atol=1e-9
+    )
     at_nodes = node_means(mesh, gauss_strains(mesh, u))
     np.testing.assert_allclose(at_nodes, np.broadcast_to(strain, (len(nodes), n, n)), atol=1e-9)
 
@@ -54,8 +69,9 @@ def _shape(n):
 
 @pytest.mark.parametrize("n", N)
 def test_forces_add_up_to_volumes_and_areas(n):
-    """Weight to the curved volume, which is also the flux of x / n; a pressure all around to nothing; a traction to the
-    curved area, that of many flat facets."""
+    """Weight to the curved volume, which is also the flux of x / n; a pressure all around to
+    nothing; a traction to the curved area, that of many flat facets.
+    """
     mesh = with_bent_edges(ball_mesh(n), 0.04)
     nodes, rows = nodes_and_cells(mesh)[0], boundary_rows(mesh)
     sets = Sets({"boundary": rows}, {})
@@ -90,9 +106,14 @@ def _area(nodes, n):
 def test_energies_are_those_of_scikit_fem(n):
     mesh = with_bent_edges(uneven(n)[0], 0.05)
     nodes = nodes_and_cells(mesh)[0]
-    kind, element = ((skfem.MeshTri2, skfem.ElementTriP2), (skfem.MeshTet2, skfem.ElementTetP2))[n - 2]
-    # scikit-fem's nodes of order 2 are its facets' (edges') in its own order, found here by their ends.
-    other = kind.from_mesh((skfem.MeshTri, skfem.MeshTet)[n - 2](mesh.points.T.copy(), mesh.cells.T.copy()))
+    kind, element = ((skfem.MeshTri2, skfem.ElementTriP2), (skfem.MeshTet2, skfem.ElementTetP2))[
+        n - 2
+    ]
+    # scikit-fem's nodes of order 2 are its facets' (edges') in its own order, found here by their
+    # ends.
+    other = kind.from_mesh(
+        (skfem.MeshTri, skfem.MeshTet)[n - 2](mesh.points.T.copy(), mesh.cells.T.copy())
+    )
     basis = skfem.Basis(other, element())
     ends = np.sort(other.facets if n == 2 else other.edges, axis=0).T
     edges = numbered_edges(mesh.cells)[0]
@@ -106,7 +127,10 @@ def test_energies_are_those_of_scikit_fem(n):
     rule = points[:, 1:].T.copy(), weights / (2.0 if n == 2 else 6.0)
     basis = skfem.Basis(other, skfem.ElementVector(element()), quadrature=rule)
     young, nu = 2.0, 0.3
-    lame, mu = young * nu / ((1 + nu) * (1 - 2 * nu) if n == 3 else 1 - nu**2), young / (2 * (1 + nu))
+    lame, mu = (
+        young * nu / ((1 + nu) * (1 - 2 * nu) if n == 3 else 1 - nu**2),
+        young / (2 * (1 + nu)),
+    )
 
     @skfem.BilinearForm
     def form(u, v, w):
@@ -120,26 +144,39 @@ def test_energies_are_those_of_scikit_fem(n):
     for axis in range(n):
         theirs[_component(basis, n, axis)] = u[found, axis]
     K = stiffness(mesh, young, nu, order=2)
-    assert u.ravel() @ (K @ u.ravel()) == pytest.approx(theirs @ (form.assemble(basis) @ theirs), rel=1e-10)
+    assert u.ravel() @ (K @ u.ravel()) == pytest.approx(
+        theirs @ (form.assemble(basis) @ theirs), rel=1e-10
+    )
 
 
 def _component(basis, n, axis):
-    """Degrees of freedom of one component in the order of the nodes' numbers: corners, then edges."""
+    """Degrees of freedom of one component in the order of the nodes' numbers: corners, then
+    edges.
+    """
     of_edges = basis.facet_dofs if n == 2 else basis.edge_dofs
     return np.concatenate([basis.nodal_dofs[axis], of_edges[axis]])
 
 
 def lame_errors(is_curved, blocks):
-    """The largest error of Lame's displacement, over the largest displacement, of an eighth of a hollow sphere."""
+    """The largest error of Lame's displacement, over the largest displacement, of an eighth of a
+    hollow sphere.
+    """
     inner, outer, young, nu, pressure = 1.0, 2.0, 3.0, 0.45, 0.2
-    loads = ["move:x:0,free,free", "move:y:free,0,free", "move:z:free,free,0", f"pressure:inner:{pressure}"]
+    loads = [
+        "move:x:0,free,free",
+        "move:y:free,0,free",
+        "move:z:free,free,0",
+        f"pressure:inner:{pressure}",
+    ]
     mesh, sets = eighth_of_a_shell(inner, outer, blocks, blocks // 2)
     r = np.linalg.norm(mesh.points, axis=1)
     if is_curved:
         ends = numbered_edges(mesh.cells)[0]
         middles = mesh.points[ends].mean(axis=1)
         on_sphere = np.ptp(r[ends], axis=1) < 1e-9
-        middles[on_sphere] *= (r[ends[on_sphere, 0]] / np.linalg.norm(middles[on_sphere], axis=1))[:, None]
+        middles[on_sphere] *= (r[ends[on_sphere, 0]] / np.linalg.norm(middles[on_sphere], axis=1))[
+            :, None
+        ]
         mesh = Mesh(mesh.points, mesh.cells, middles)
     model = build_model(mesh, young=young, nu=nu, loads=loads, known_sets=sets, order=2)
     solution = solve(model)
@@ -152,8 +189,12 @@ def lame_errors(is_curved, blocks):
 
 
 def test_a_curved_hollow_sphere_is_nearer_to_lame():
-    """Straight edges: 0.135 and 0.032 off; curved ones: 0.034 and 0.009. The push is within 0.2 %."""
-    straight, curved = ([lame_errors(is_curved, blocks)[0] for blocks in (4, 8)] for is_curved in (False, True))
+    """Straight edges: 0.135 and 0.032 off; curved ones: 0.034 and 0.009. The push is within 0.2
+    %.
+    """
+    straight, curved = (
+        [lame_errors(is_curved, blocks)[0] for blocks in (4, 8)] for is_curved in (False, True)
+    )
     assert all(3.0 * ours < theirs for ours, theirs in zip(curved, straight, strict=True))
     assert curved[0] / curved[1] > 3.0
     applied = lame_errors(True, 4)[1].applied
@@ -162,17 +203,26 @@ def test_a_curved_hollow_sphere_is_nearer_to_lame():
 
 @pytest.mark.parametrize("n", N)
 def test_moduli_and_fields_of_curved_cells(n):
-    """Moduli of the parts of cells: as many as corners, spread over the rule; all alike they are one modulus."""
+    """Moduli of the parts of cells: as many as corners, spread over the rule; all alike they are
+    one modulus.
+    """
     mesh = with_bent_edges(uneven(n)[0], 0.05)
     parts = np.random.default_rng(4).uniform(1.0, 2.0, (len(mesh.cells), n + 1))
     np.testing.assert_array_equal(
         stiffness(mesh, np.full(parts.shape, 2.0), 0.3, 2).data, stiffness(mesh, 2.0, 0.3, 2).data
     )
-    stiff, soft = (stiffness(mesh, values, 0.3, 2).diagonal().sum() for values in (parts, parts.min(axis=1)))
+    stiff, soft = (
+        stiffness(mesh, values, 0.3, 2).diagonal().sum() for values in (parts, parts.min(axis=1))
+    )
     assert soft < stiff < stiffness(mesh, parts.max(axis=1), 0.3, 2).diagonal().sum()
     loads = ["traction:boundary:" + ",".join("1" * n), "spring:boundary:1"]
     model = build_model(
-        mesh, young=2.0, nu=0.3, loads=loads, order=2, known_sets=Sets({"boundary": boundary_rows(mesh)}, {})
+        mesh,
+        young=2.0,
+        nu=0.3,
+        loads=loads,
+        order=2,
+        known_sets=Sets({"boundary": boundary_rows(mesh)}, {}),
     )
     mixed = solve(model._replace(gauss_young=parts))
     assert mixed.young.shape == mixed.strain.shape[:2] == (len(mesh.cells), *_shape(n))
@@ -190,9 +240,12 @@ def test_folded_cells_and_voxel_references_are_refused():
     midpoints = mesh.points[edges].mean(axis=1)
     folded = midpoints.copy()
     folded[7] += 5.0 * (mesh.points[edges[7, 1]] - mesh.points[edges[7, 0]])
-    with pytest.raises(InputError, match=r"mesh: \d+ of \d+ quadratic cells are folded by their mid-edge nodes"):
+    with pytest.raises(
+        InputError, match=r"mesh: \d+ of \d+ quadratic cells are folded by their mid-edge nodes"
+    ):
         stiffness(Mesh(mesh.points, mesh.cells, folded), 1.0, 0.3, order=2)
-    stiffness(Mesh(mesh.points, mesh.cells, folded), 1.0, 0.3, order=1)  # which has no mid-edge nodes
+    # which has no mid-edge nodes
+    stiffness(Mesh(mesh.points, mesh.cells, folded), 1.0, 0.3, order=1)
     curved = Mesh(mesh.points, mesh.cells, midpoints)
     u = np.zeros((len(mesh.points) + len(edges), 3))
     with pytest.raises(InputError, match="compare: expected straight edges"):

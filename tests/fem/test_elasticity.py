@@ -1,4 +1,6 @@
-"""Elasticity: patch tests, closed forms, laws, the other library's answer, and what may not be solved."""
+"""Elasticity: patch tests, closed forms, laws, the other library's answer, and what may not be
+solved.
+"""
 
 import warnings
 from itertools import combinations
@@ -15,7 +17,15 @@ from skfem.helpers import ddot, sym_grad, trace
 
 from tetopt import Image, InputError, Mesh, lattice_mesh
 from tetopt.fem import elasticity
-from tetopt.fem.elasticity import box_faces, compression, constrained, multigrid, solved, stiffness, strains
+from tetopt.fem.elasticity import (
+    box_faces,
+    compression,
+    constrained,
+    multigrid,
+    solved,
+    stiffness,
+    strains,
+)
 from tetopt.fem.rigidity import check_held, rigid_modes
 from tetopt.geometry.quadratic import quadratic
 from tetopt.geometry.simplex import oriented, volumes
@@ -42,7 +52,8 @@ def distorted(mesh, rng, fraction=0.2):
     inner = np.setdiff1d(np.arange(len(points)), boundary_facets(mesh.cells))
     corners = points[mesh.cells]
     shortest = min(
-        np.linalg.norm(corners[:, a] - corners[:, b], axis=1).min() for a, b in combinations(range(corners.shape[1]), 2)
+        np.linalg.norm(corners[:, a] - corners[:, b], axis=1).min()
+        for a, b in combinations(range(corners.shape[1]), 2)
     )
     step = rng.normal(size=(len(inner), mesh.ndim))
     points[inner] += fraction * shortest * step / np.linalg.norm(step, axis=1, keepdims=True)
@@ -59,14 +70,18 @@ def squeezed(mesh, image, young, nu, strain=0.01, **options):
     """Top fixed, bottom pushed up by `strain` of the height along the last world axis."""
     low, high = box_faces(image, mesh)
     displacement = strain * (mesh.points[high].mean(axis=0) - mesh.points[low].mean(axis=0))
-    return compression(mesh, young, nu, fixed_nodes=high, pushed_nodes=low, displacement=displacement, **options)
+    return compression(
+        mesh, young, nu, fixed_nodes=high, pushed_nodes=low, displacement=displacement, **options
+    )
 
 
 # The stiffness matrix
 
 
 def textbook_stiffness(mesh, young, nu):
-    """Cell by cell v B^T C B in Voigt's notation, with B from the inverse of the matrix of corner coordinates."""
+    """Cell by cell v B^T C B in Voigt's notation, with B from the inverse of the matrix of
+    corner coordinates.
+    """
     n = mesh.ndim
     pairs = [(d, d) for d in range(n)] + list(combinations(range(n), 2))
     if n == 2:
@@ -94,7 +109,9 @@ def test_stiffness_is_the_textbook_s(case, nu):
     mesh = Mesh(*case)
     young = np.random.default_rng(1).uniform(1.0, 9.0, len(mesh.cells))
     expected = textbook_stiffness(mesh, young, nu)
-    np.testing.assert_allclose(stiffness(mesh, young, nu).toarray(), expected, atol=1e-13 * np.abs(expected).max())
+    np.testing.assert_allclose(
+        stiffness(mesh, young, nu).toarray(), expected, atol=1e-13 * np.abs(expected).max()
+    )
 
 
 @pytest.mark.parametrize("order", [1, 2])
@@ -117,9 +134,15 @@ def skfem_stiffness(mesh, young, nu, order):
     """scikit-fem's matrix with dofs node by node, and where its nodes lie."""
     n = mesh.ndim
     element = {
-        (2, 1): skfem.ElementTriP1, (3, 1): skfem.ElementTetP1, (2, 2): skfem.ElementTriP2, (3, 2): skfem.ElementTetP2
-    }[n, order]()  # fmt: skip
-    Kind, constant = {2: (skfem.MeshTri, skfem.ElementTriP0), 3: (skfem.MeshTet, skfem.ElementTetP0)}[n]
+        (2, 1): skfem.ElementTriP1,
+        (3, 1): skfem.ElementTetP1,
+        (2, 2): skfem.ElementTriP2,
+        (3, 2): skfem.ElementTetP2,
+    }[n, order]()
+    Kind, constant = {
+        2: (skfem.MeshTri, skfem.ElementTriP0),
+        3: (skfem.MeshTet, skfem.ElementTetP0),
+    }[n]
     bare = Kind(mesh.points.T.copy(), mesh.cells.T.copy())
     basis = skfem.Basis(bare, skfem.ElementVector(element), intorder=2 * order - 1 + (order == 1))
     narrowing = 1.0 - nu**2 if n == 2 else (1.0 + nu) * (1.0 - 2.0 * nu)
@@ -131,15 +154,22 @@ def skfem_stiffness(mesh, young, nu, order):
 
     K = form.assemble(basis, young=basis.with_element(constant()).interpolate(young))
     # Of a vector element the first component's dofs name the nodes; the others of a node follow it.
-    first = np.concatenate([np.atleast_2d(basis.nodal_dofs)[0], basis.edge_dofs[0] if n == 3 and order == 2 else [],
-                            basis.facet_dofs[0] if n == 2 and order == 2 else []]).astype(int)  # fmt: skip
+    first = np.concatenate(
+        [
+            np.atleast_2d(basis.nodal_dofs)[0],
+            basis.edge_dofs[0] if n == 3 and order == 2 else [],
+            basis.facet_dofs[0] if n == 2 and order == 2 else [],
+        ]
+    ).astype(int)
     dofs = (first[:, None] + np.arange(n)).ravel()
     return K.toarray()[np.ix_(dofs, dofs)], basis.doflocs[:, first].T
 
 
 @given(seeds, dimensions, st.floats(-0.9, 0.49))
 def test_stiffness_is_symmetric_and_rigid_motions_are_its_null_space(seed, n, nu):
-    """To the last bit symmetric; eigenvalues >= 0, of which exactly 3 or 6 vanish, on the rigid motions."""
+    """To the last bit symmetric; eigenvalues >= 0, of which exactly 3 or 6 vanish, on the rigid
+    motions.
+    """
     rng = np.random.default_rng(seed)
     mesh = random_mesh(rng, n)
     K = stiffness(mesh, rng.uniform(1.0, 9.0, len(mesh.cells)), nu)
@@ -153,7 +183,9 @@ def test_stiffness_is_symmetric_and_rigid_motions_are_its_null_space(seed, n, nu
     assert np.linalg.matrix_rank(modes) == r
     null = vectors[:, :r]
     np.testing.assert_allclose(null @ (null.T @ modes), modes, atol=1e-8)
-    np.testing.assert_allclose((modes[:, n:] ** 2).sum(axis=0).sum(), n * len(mesh.points) * (n - 1) / 2 * 2 / n)
+    np.testing.assert_allclose(
+        (modes[:, n:] ** 2).sum(axis=0).sum(), n * len(mesh.points) * (n - 1) / 2 * 2 / n
+    )
 
 
 def test_stiffness_adds_up():
@@ -164,11 +196,16 @@ def test_stiffness_adds_up():
     total = stiffness(mesh, one + 2.0 * two, 0.4)
     parts = stiffness(mesh, one, 0.4) + 2.0 * stiffness(mesh, two, 0.4)
     np.testing.assert_allclose(total.toarray(), parts.toarray(), atol=1e-12 * total.max())
-    pair = Mesh(np.vstack([mesh.points, mesh.points + 99.0]), np.vstack([mesh.cells, mesh.cells + len(mesh.points)]))
+    pair = Mesh(
+        np.vstack([mesh.points, mesh.points + 99.0]),
+        np.vstack([mesh.cells, mesh.cells + len(mesh.points)]),
+    )
     both = stiffness(pair, np.concatenate([one, two]), 0.4).toarray()
     size = mesh.points.size
     np.testing.assert_allclose(both[:size, :size], stiffness(mesh, one, 0.4).toarray(), rtol=1e-15)
-    np.testing.assert_allclose(both[size:, size:], stiffness(mesh, two, 0.4).toarray(), atol=1e-9 * both.max())
+    np.testing.assert_allclose(
+        both[size:, size:], stiffness(mesh, two, 0.4).toarray(), atol=1e-9 * both.max()
+    )
     assert not both[:size, size:].any()
 
 
@@ -176,16 +213,21 @@ def test_stiffness_adds_up():
 
 
 @pytest.mark.parametrize(
-    "name", ["distorted criss-cross", "split square", "distorted bcc", "distorted five-tet", "split cube"]
+    "name",
+    ["distorted criss-cross", "split square", "distorted bcc", "distorted five-tet", "split cube"],
 )
 def test_patch(name):
-    """A linear displacement of the boundary is that of every inner node; all cells have its strain, no node a force."""
+    """A linear displacement of the boundary is that of every inner node; all cells have its
+    strain, no node a force.
+    """
     rng, nu = np.random.default_rng(7), 0.45
     mesh = {
         "distorted criss-cross": lambda: distorted(block((2.0, 3.0), (4, 5))[1], rng),
         "split square": lambda: random_mesh(rng, 2, 40),
         "distorted bcc": lambda: distorted(block((2.0, 3.0, 2.0), (4, 4, 3), "bcc")[1], rng),
-        "distorted five-tet": lambda: distorted(block((2.0, 3.0, 2.0), (4, 4, 4), "five-tet")[1], rng),
+        "distorted five-tet": lambda: distorted(
+            block((2.0, 3.0, 2.0), (4, 4, 4), "five-tet")[1], rng
+        ),
         "split cube": lambda: random_mesh(rng, 3, 40),
     }[name]()
     n = mesh.ndim
@@ -212,25 +254,32 @@ def test_patch(name):
 @pytest.mark.parametrize("nu", [0.0, 0.45])
 @pytest.mark.parametrize("sides", [(2.0, 5.0), (2.0, 3.0, 5.0)])
 def test_uniform_block_between_smooth_plates(sides, nu, method):
-    """Uniaxial stress, sides free: E_strain = 1/2 E eps^2 V, the force E eps A; it widens by nu eps."""
+    """Uniaxial stress, sides free: E_strain = 1/2 E eps^2 V, the force E eps A; it widens by nu
+    eps.
+    """
     n = len(sides)
     image, mesh = block(sides, (3,) * n)
-    pressed = squeezed(distorted(mesh, np.random.default_rng(0)), image, 4.0, nu, is_bonded=False, method=method)
+    pressed = squeezed(
+        distorted(mesh, np.random.default_rng(0)), image, 4.0, nu, is_bonded=False, method=method
+    )
     assert pressed.strain_energy == pytest.approx(0.5 * 4.0 * 0.01**2 * np.prod(sides), rel=1e-9)
     expected = np.zeros(n)
     expected[-1] = 4.0 * 0.01 * np.prod(sides[:-1])
     np.testing.assert_allclose(pressed.reaction, expected, atol=1e-8 * expected[-1])
     along = np.diag([nu * 0.01] * (n - 1) + [-0.01])
     np.testing.assert_allclose(
-        strains(distorted(mesh, np.random.default_rng(0)), pressed.u), np.broadcast_to(along, (len(mesh.cells), n, n)),
+        strains(distorted(mesh, np.random.default_rng(0)), pressed.u),
+        np.broadcast_to(along, (len(mesh.cells), n, n)),
         atol=1e-10,
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize("is_bonded", [True, False])
 @pytest.mark.parametrize("sides", [(3.0, 6.0), (3.0, 2.0, 6.0)])
 def test_two_layers_in_series(sides, is_bonded):
-    """At nu = 0 the bar is a chain of springs: stress = shortening / (L_1/E_1 + L_2/E_2), bonded or not."""
+    """At nu = 0 the bar is a chain of springs: stress = shortening / (L_1/E_1 + L_2/E_2), bonded
+    or not.
+    """
     image, mesh = block(sides, (3,) * len(sides), None if len(sides) == 2 else "five-tet")
     is_top = mesh.points[mesh.cells].mean(axis=1)[:, -1] > 4.0
     pressed = squeezed(mesh, image, np.where(is_top, 2.0, 12.0), 0.0, is_bonded=is_bonded)
@@ -244,16 +293,21 @@ def test_two_layers_in_series(sides, is_bonded):
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_block_in_a_rigid_frame(n):
-    """No side may widen: E (1 - nu) / ((1 + nu)(1 - 2 nu)) replaces E in 3-D, E / (1 - nu^2) in plane stress."""
+    """No side may widen: E (1 - nu) / ((1 + nu)(1 - 2 nu)) replaces E in 3-D, E / (1 - nu^2) in
+    plane stress.
+    """
     nu = 0.4
     _, mesh = block((2.0,) * n, (3,) * n)
-    wall = (mesh.points < 1e-9) | (mesh.points > 2.0 - 1e-9)  # each wall holds the component across it
+    # each wall holds the component across it
+    wall = (mesh.points < 1e-9) | (mesh.points > 2.0 - 1e-9)
     field = np.zeros_like(mesh.points)
     field[:, -1] = -0.01 * mesh.points[:, -1]
     u = solved(constrained(mesh, 3.0, nu, wall, field))
     np.testing.assert_allclose(u, field, atol=1e-13)
     modulus = 3.0 / (1.0 - nu**2) if n == 2 else 3.0 * (1.0 - nu) / ((1.0 + nu) * (1.0 - 2.0 * nu))
-    assert cell_energies(mesh, 3.0, nu, u).sum() == pytest.approx(0.5 * modulus * 1e-4 * 2.0**n, rel=1e-12)
+    assert cell_energies(mesh, 3.0, nu, u).sum() == pytest.approx(
+        0.5 * modulus * 1e-4 * 2.0**n, rel=1e-12
+    )
 
 
 # Laws of the compression
@@ -261,16 +315,22 @@ def test_block_in_a_rigid_frame(n):
 
 @given(seeds, dimensions, st.booleans())
 def test_energies_and_forces_balance(seed, n, is_bonded):
-    """E_strain is half of force times way, and the sum over the cells; no force is left over, nor on free nodes."""
+    """E_strain is half of force times way, and the sum over the cells; no force is left over,
+    nor on free nodes.
+    """
     rng = np.random.default_rng(seed)
     image, mesh = block(tuple(rng.uniform(1.0, 5.0, n)), (2,) * n)
     mesh = distorted(mesh, rng)
     young = rng.uniform(1.0, 9.0, len(mesh.cells))
     low, high = box_faces(image, mesh)
     push = rng.normal(size=n)
-    pressed = compression(mesh, young, 0.4, fixed_nodes=high, pushed_nodes=low, displacement=push, is_bonded=is_bonded)
+    pressed = compression(
+        mesh, young, 0.4, fixed_nodes=high, pushed_nodes=low, displacement=push, is_bonded=is_bonded
+    )
     assert pressed.strain_energy == pytest.approx(0.5 * pressed.reaction @ push, rel=1e-9)
-    assert pressed.strain_energy == pytest.approx(cell_energies(mesh, young, 0.4, pressed.u).sum(), rel=1e-10)
+    assert pressed.strain_energy == pytest.approx(
+        cell_energies(mesh, young, 0.4, pressed.u).sum(), rel=1e-10
+    )
     force = (stiffness(mesh, young, 0.4) @ pressed.u.ravel()).reshape(-1, n)
     largest = np.abs(force).max()
     np.testing.assert_allclose(pressed.reaction, force[low].sum(axis=0), atol=1e-9 * largest)
@@ -291,7 +351,9 @@ def test_energies_and_forces_balance(seed, n, is_bonded):
 
 @given(seeds, dimensions, st.booleans())
 def test_rotated(seed, n, is_bonded):
-    """Rotate, compress, rotate back: the same displacement; smooth plates leave the rigid motion to choose."""
+    """Rotate, compress, rotate back: the same displacement; smooth plates leave the rigid motion
+    to choose.
+    """
     rng = np.random.default_rng(seed)
     image, mesh = block(tuple(rng.uniform(1.0, 5.0, n)), (2,) * n)
     young = rng.uniform(1.0, 9.0, len(mesh.cells))
@@ -304,16 +366,24 @@ def test_rotated(seed, n, is_bonded):
     other = compression(turned, young, 0.3, displacement=turn @ push, **options)
     np.testing.assert_allclose(other.u @ turn, plain.u, atol=1e-9 * np.abs(plain.u).max())
     assert other.strain_energy == pytest.approx(plain.strain_energy, rel=1e-10)
-    np.testing.assert_allclose(other.reaction @ turn, plain.reaction, atol=1e-9 * np.abs(plain.reaction).max())
+    np.testing.assert_allclose(
+        other.reaction @ turn, plain.reaction, atol=1e-9 * np.abs(plain.reaction).max()
+    )
 
 
 # Refinement
 
 
-# A cell's children, each node as the middle of two of the cell's: its corners cut off, and what is left; that is an
-# octahedron in 3-D, cut in four around the diagonal between the middles of 0 1 and 2 3.
+# A cell's children, each node as the middle of two of the cell's: its corners cut off, and what is
+# left; that is an octahedron in 3-D, cut in four around the diagonal between the middles of 0 1 and
+# 2 3.
 CHILDREN = {
-    2: [[(0, 0), (0, 1), (0, 2)], [(0, 1), (1, 1), (1, 2)], [(0, 2), (1, 2), (2, 2)], [(0, 1), (1, 2), (0, 2)]],
+    2: [
+        [(0, 0), (0, 1), (0, 2)],
+        [(0, 1), (1, 1), (1, 2)],
+        [(0, 2), (1, 2), (2, 2)],
+        [(0, 1), (1, 2), (0, 2)],
+    ],
     3: [[tuple(sorted((k, other))) for other in range(4)] for k in range(4)]
     + [
         [(0, 1), (2, 3), one, other]
@@ -343,10 +413,12 @@ def refined(mesh, young):
 @pytest.mark.parametrize("is_bonded", [True, False])
 @pytest.mark.parametrize("n", [2, 3])
 def test_energy_falls_to_its_limit_under_refinement(n, is_bonded):
-    """Where displacements are prescribed, E_strain is the least over all the mesh can do: nested meshes only lower it.
+    """Where displacements are prescribed, E_strain is the least over all the mesh can do: nested
+    meshes only lower it.
 
-    A stiff inclusion in a soft block, nu 0.3, of which refinement keeps the moduli. Each halving gains less than
-    0.6 of the one before (0.7 in 3-D); corners keep it from the 1/4 of smooth solutions.
+    A stiff inclusion in a soft block, nu 0.3, of which refinement keeps the moduli. Each halving
+    gains less than 0.6 of the one before (0.7 in 3-D); corners keep it from the 1/4 of smooth
+    solutions.
     """
     image, mesh = block((1.0, 1.5, 1.0)[:n], (2, 3, 2)[:n], None if n == 2 else "five-tet")
     centre = mesh.points[mesh.cells].mean(axis=1)
@@ -398,7 +470,9 @@ def test_auto_takes_multigrid_for_large_meshes(monkeypatch):
     image, mesh = block((2.0, 1.0, 3.0), (3, 3, 3))
     direct = squeezed(mesh, image, 2.0, 0.4)
     called = []
-    monkeypatch.setattr(elasticity, "multigrid", lambda system: called.append(1) or multigrid(system))
+    monkeypatch.setattr(
+        elasticity, "multigrid", lambda system: called.append(1) or multigrid(system)
+    )
     monkeypatch.setattr(elasticity, "DIRECT_DOFS", {2: 0, 3: len(direct.system.free)})
     squeezed(mesh, image, 2.0, 0.4)
     assert called == []
@@ -413,7 +487,9 @@ def test_an_unsolved_system_is_an_error(method, monkeypatch):
     monkeypatch.setattr(elasticity, "RESIDUAL_FRACTION", 1e-30)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        with pytest.raises(RuntimeError, match=r"^elasticity: not solved: the residual .* mN exceeds .* mN$"):
+        with pytest.raises(
+            RuntimeError, match=r"^elasticity: not solved: the residual .* mN exceeds .* mN$"
+        ):
             squeezed(mesh, image, 2.0, 0.4, method=method)
 
 
@@ -422,7 +498,9 @@ def test_an_unsolved_system_is_an_error(method, monkeypatch):
 
 @given(seeds, dimensions)
 def test_faces_of_any_affine(seed, n):
-    """Oblique, sheared, flipped: both faces are found, by index coordinates; the top lies higher along z (y in 2-D)."""
+    """Oblique, sheared, flipped: both faces are found, by index coordinates; the top lies higher
+    along z (y in 2-D).
+    """
     rng = np.random.default_rng(seed)
     image = Image(np.zeros(rng.integers(2, 9, n)), random_affine(rng, n))
     blocks = tuple(int(b) for b in rng.integers(1, 4, n))
@@ -431,11 +509,16 @@ def test_faces_of_any_affine(seed, n):
     directions = image.affine[:n, :n] / image.spacing
     axis = int(np.argmax(np.abs(directions[-1])))
     low, high = box_faces(image, mesh)
-    ends = [np.flatnonzero(index[:, axis] < -0.499), np.flatnonzero(index[:, axis] > image.shape[axis] - 0.501)]
+    ends = [
+        np.flatnonzero(index[:, axis] < -0.499),
+        np.flatnonzero(index[:, axis] > image.shape[axis] - 0.501),
+    ]
     assert sorted([low.tolist(), high.tolist()]) == sorted(e.tolist() for e in ends)
     assert len(low) == len(high) == np.prod([b + 1 for k, b in enumerate(blocks) if k != axis])
     shift = mesh.points[high].mean(axis=0) - mesh.points[low].mean(axis=0)
-    np.testing.assert_allclose(np.abs(shift), np.abs(image.affine[:n, axis]) * image.shape[axis], rtol=1e-9)
+    np.testing.assert_allclose(
+        np.abs(shift), np.abs(image.affine[:n, axis]) * image.shape[axis], rtol=1e-9
+    )
     assert shift[-1] > 0.0
 
 
@@ -457,7 +540,9 @@ def test_the_bottom_is_pushed_up_in_a_flipped_image():
 
 
 def test_top_is_up_even_where_the_upright_axis_leans_more_than_it_rises():
-    """Sheared: the third axis goes 0.9 to the left for every 0.4 up, and the others not up at all."""
+    """Sheared: the third axis goes 0.9 to the left for every 0.4 up, and the others not up at
+    all.
+    """
     affine = np.array([[1.0, 0, -0.9, 0], [0, 1, 0, 0], [0, 0, 0.4, 0], [0, 0, 0, 1]])
     image = Image(np.zeros((3, 3, 3)), affine)
     mesh = lattice_mesh(image, blocks=(1, 1, 1))
@@ -480,14 +565,18 @@ def test_a_node_just_off_the_face_is_not_on_it():
 
 @given(seeds, dimensions)
 def test_check_held_knows_every_singular_matrix(seed, n):
-    """Holes cut at random into a lattice, dofs held at random: refused if and only if K_ff has an eigenvalue 0."""
+    """Holes cut at random into a lattice, dofs held at random: refused if and only if K_ff has
+    an eigenvalue 0.
+    """
     rng = np.random.default_rng(seed)
     _, mesh = block((1.0,) * n, (2,) * n, None if n == 2 else "five-tet")
     cells = mesh.cells[rng.random(len(mesh.cells)) < rng.uniform(0.2, 0.9)]
     if len(cells) == 0:
         return
     used, cells = np.unique(cells, return_inverse=True)
-    mesh = Mesh(mesh.points[used] + rng.normal(size=(len(used), n)) * 0.02, cells.reshape(-1, n + 1))
+    mesh = Mesh(
+        mesh.points[used] + rng.normal(size=(len(used), n)) * 0.02, cells.reshape(-1, n + 1)
+    )
     is_prescribed = rng.random(mesh.points.shape) < rng.choice([0.1, 0.3, 0.6])
     free = np.flatnonzero(~is_prescribed.ravel())
     if len(free) == 0:
@@ -503,7 +592,9 @@ def test_check_held_knows_every_singular_matrix(seed, n):
 
 @pytest.mark.parametrize("n_triangles", [39, 250])  # as a full matrix, and sparse
 def test_the_loose_one_among_many_is_named(n_triangles):
-    """Separate triangles, each held by two corners and one by a single corner, about which it turns."""
+    """Separate triangles, each held by two corners and one by a single corner, about which it
+    turns.
+    """
     corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
     points = (corners + 3.0 * np.arange(n_triangles)[:, None, None] * [1.0, 0.0]).reshape(-1, 2)
     cells = np.arange(len(points)).reshape(-1, 3)
@@ -514,7 +605,8 @@ def test_the_loose_one_among_many_is_named(n_triangles):
     with pytest.raises(InputError) as error:
         check_held(points, cells, is_prescribed)
     assert str(error.value) == (
-        "mesh: 1 cells around cell 7 (node 21) can still rotate or slide as a whole, as too few nodes connect them; "
+        "mesh: 1 cells around cell 7 (node 21) can still rotate or slide as a whole, as too few "
+        "nodes connect them; "
         "fix more nodes or keep the largest facet-connected set"
     )
 
@@ -532,10 +624,14 @@ def test_a_tetrahedron_on_a_hinge_is_named():
         hinged = hinged[:, [0, 1, 3, 2]]
     mesh = Mesh(points, np.vstack([mesh.cells, hinged]))
     options = {"pushed_nodes": low, "displacement": [0.0, 0.0, 0.1]}
-    # Fixed at the rest's top but for the hinge's two nodes: they are free, and so is the turn about them.
+    # Fixed at the rest's top but for the hinge's two nodes: they are free, and so is the turn about
+    # them.
     with pytest.raises(InputError) as error:
         compression(mesh, 1.0, 0.3, fixed_nodes=high[2:], **options)
-    assert f"1 cells around cell {len(mesh.cells) - 1} (node {mesh.cells[-1, 0]}) can still rotate" in str(error.value)
+    assert (
+        f"1 cells around cell {len(mesh.cells) - 1} (node {mesh.cells[-1, 0]}) can still rotate"
+        in str(error.value)
+    )
     compression(mesh, 1.0, 0.3, fixed_nodes=[*high[2:], n_points], **options)
 
 
@@ -565,24 +661,53 @@ PLATE = Mesh([[0.0, 0.0], [1.0, 0.0], [1.0, 2.0], [0.0, 2.0]], [[0, 1, 2], [0, 2
     [
         (
             {"young": [1.0, 0.0]},
-            "above 0 kPa, got 1 invalid values, the first 0 in cell 1; give empty space a small modulus",
+            "above 0 kPa, got 1 invalid values, the first 0 in cell 1; give empty space a small "
+            "modulus",
         ),
-        ({"young": [np.nan, -2.5]}, "got 2 invalid values, the first nan in cell 0, -2.5 in cell 1"),
-        ({"young": [1.0, 2.0, 3.0]}, "young: expected one modulus for each of 2 cells, got shape (3,)"),
+        (
+            {"young": [np.nan, -2.5]},
+            "got 2 invalid values, the first nan in cell 0, -2.5 in cell 1",
+        ),
+        (
+            {"young": [1.0, 2.0, 3.0]},
+            "young: expected one modulus for each of 2 cells, got shape (3,)",
+        ),
         ({"young": "soft"}, "young: expected one modulus for each cell, got 'soft'"),
-        ({"nu": 0.5}, "nu: expected -1 < nu < 0.5, got 0.5; for nearly incompressible tissue use 0.45 to 0.49"),
+        (
+            {"nu": 0.5},
+            "nu: expected -1 < nu < 0.5, got 0.5; for nearly incompressible tissue use 0.45 to "
+            "0.49",
+        ),
         ({"nu": np.nan}, "nu: expected -1 < nu < 0.5, got nan"),
         ({"fixed_nodes": []}, "fixed_nodes: expected at least one node, got none"),
-        ({"fixed_nodes": [2.0, 3.0]}, "fixed_nodes: expected a list of node numbers, got float64 of shape (2,)"),
+        (
+            {"fixed_nodes": [2.0, 3.0]},
+            "fixed_nodes: expected a list of node numbers, got float64 of shape (2,)",
+        ),
         ({"pushed_nodes": [0, 4]}, "pushed_nodes: node numbers must lie in 0..3, got 0..4"),
-        ({"pushed_nodes": [0, 1, 3, 2]}, "fixed_nodes and pushed_nodes: 2 nodes are in both, the first [2, 3]"),
-        ({"displacement": [0.0, 0.0]}, "displacement: expected 2 finite numbers in mm, not all 0, got [0.0, 0.0]"),
-        ({"displacement": [0.0, np.nan]}, "displacement: expected 2 finite numbers in mm, not all 0, got [0.0, nan]"),
+        (
+            {"pushed_nodes": [0, 1, 3, 2]},
+            "fixed_nodes and pushed_nodes: 2 nodes are in both, the first [2, 3]",
+        ),
+        (
+            {"displacement": [0.0, 0.0]},
+            "displacement: expected 2 finite numbers in mm, not all 0, got [0.0, 0.0]",
+        ),
+        (
+            {"displacement": [0.0, np.nan]},
+            "displacement: expected 2 finite numbers in mm, not all 0, got [0.0, nan]",
+        ),
         ({"method": "lu"}, "method: expected auto, direct or amg, got 'lu'"),
     ],
 )
 def test_messages_of_compression(changes, message):
-    options = {"fixed_nodes": [2, 3], "pushed_nodes": [0], "displacement": [0.0, 0.1], "young": [1.0, 2.0], "nu": 0.3}
+    options = {
+        "fixed_nodes": [2, 3],
+        "pushed_nodes": [0],
+        "displacement": [0.0, 0.1],
+        "young": [1.0, 2.0],
+        "nu": 0.3,
+    }
     options |= changes
     young, nu = options.pop("young"), options.pop("nu")
     assert message in message_of(lambda: compression(PLATE, young, nu, **options))
@@ -594,15 +719,20 @@ def test_messages_of_meshes_that_are_not_held():
     options = {"fixed_nodes": [2, 3], "pushed_nodes": [0, 1], "displacement": [0.0, 0.1]}
     words = message_of(lambda: compression(pieces, 1.0, 0.3, **options))
     assert words.startswith(
-        "mesh: 2 components have no node that is fixed, displaced or on a spring; the first has 2 cells"
+        "mesh: 2 components have no node that is fixed, displaced or on a spring; the first has "
+        "2 cells"
     )
     words = message_of(lambda: compression(Mesh(points, PLATE.cells), 1.0, 0.3, **options))
     assert words.startswith("mesh: 8 nodes belong to no cell, the first [4, 5, 6, 7, 8]")
     nothing = np.zeros((4, 2))
-    assert "it can move freely" in message_of(lambda: constrained(PLATE, 1.0, 0.3, nothing > 1, nothing))
+    assert "it can move freely" in message_of(
+        lambda: constrained(PLATE, 1.0, 0.3, nothing > 1, nothing)
+    )
     # One fixed and one pushed node, smooth plates: it turns until they are apart by the way.
     options |= {"fixed_nodes": [2], "pushed_nodes": [1], "is_bonded": False}
-    assert "can still rotate or slide as a whole" in message_of(lambda: compression(PLATE, 1.0, 0.3, **options))
+    assert "can still rotate or slide as a whole" in message_of(
+        lambda: compression(PLATE, 1.0, 0.3, **options)
+    )
 
 
 def test_messages_of_constrained():
@@ -616,7 +746,9 @@ def test_messages_of_constrained():
         (is_held[:, 0], values, "is_prescribed: expected shape (4, 2), one row per node, got (4,)"),
         (is_held, values[:3], "prescribed: expected shape (4, 2), one row per node, got (3, 2)"),
     ):
-        assert words in message_of(lambda *given: constrained(PLATE, 1.0, 0.3, *given), chosen, prescribed)
+        assert words in message_of(
+            lambda *given: constrained(PLATE, 1.0, 0.3, *given), chosen, prescribed
+        )
 
 
 def test_messages_of_box_faces():
@@ -624,13 +756,16 @@ def test_messages_of_box_faces():
     assert "same dimension, got a 2-D mesh and a 3-D image" in message_of(box_faces, image, PLATE)
     words = message_of(box_faces, image, Mesh(0.5 * mesh.points, mesh.cells))
     assert words.startswith(
-        "mesh: no node lies on the image's face at index 0.5 of axis 2; the mesh extends from -0.5 to 0"
+        "mesh: no node lies on the image's face at index 0.5 of axis 2; the mesh extends from "
+        "-0.5 to 0"
     )
 
 
 def test_one_modulus_for_all():
     mesh = random_mesh(np.random.default_rng(2), 2)
-    assert (stiffness(mesh, 3.0, 0.3) != stiffness(mesh, np.full(len(mesh.cells), 3.0), 0.3)).nnz == 0
+    assert (
+        stiffness(mesh, 3.0, 0.3) != stiffness(mesh, np.full(len(mesh.cells), 3.0), 0.3)
+    ).nnz == 0
 
 
 @given(seeds, dimensions)
@@ -639,7 +774,9 @@ def test_strains_of_a_linear_field(seed, n):
     mesh = random_mesh(rng, n)
     slope = rng.normal(size=(n, n))
     strain = strains(mesh, mesh.points @ slope.T)
-    np.testing.assert_allclose(strain, np.broadcast_to(0.5 * (slope + slope.T), strain.shape), atol=1e-9)
+    np.testing.assert_allclose(
+        strain, np.broadcast_to(0.5 * (slope + slope.T), strain.shape), atol=1e-9
+    )
     np.testing.assert_array_equal(strain, strain.transpose(0, 2, 1))
 
 
@@ -666,13 +803,17 @@ def test_pure_shear_of_one_block(n):
     pressed = compression(mesh, 5.0, 0.25, fixed_nodes=high, pushed_nodes=low, displacement=push)
     assert len(pressed.system.free) == 0
     height, volume = mesh.points[:, -1].max(), volumes(mesh.points, mesh.cells).sum()
-    assert pressed.strain_energy == pytest.approx(0.5 * 2.0 * (0.1 / height) ** 2 * volume, rel=1e-13)
+    assert pressed.strain_energy == pytest.approx(
+        0.5 * 2.0 * (0.1 / height) ** 2 * volume, rel=1e-13
+    )
 
 
 @pytest.mark.parametrize("is_bonded", [True, False])
 @pytest.mark.parametrize("n", [2, 3])
 def test_scaling(n, is_bonded):
-    """Energy is linear in the moduli, quadratic in the push; a mesh s times as large at equal strain has s^n of it."""
+    """Energy is linear in the moduli, quadratic in the push; a mesh s times as large at equal
+    strain has s^n of it.
+    """
     rng = np.random.default_rng(4)
     image, mesh = block((1.0, 2.0, 3.0)[:n], (2,) * n)
     young = rng.uniform(1.0, 9.0, len(mesh.cells))
@@ -682,7 +823,13 @@ def test_scaling(n, is_bonded):
     def energy(size=1.0, factor=1.0, push=push):
         scaled = Mesh(size * mesh.points, mesh.cells)
         return compression(
-            scaled, factor * young, 0.45, fixed_nodes=high, pushed_nodes=low, displacement=push, is_bonded=is_bonded
+            scaled,
+            factor * young,
+            0.45,
+            fixed_nodes=high,
+            pushed_nodes=low,
+            displacement=push,
+            is_bonded=is_bonded,
         ).strain_energy
 
     base = energy()
@@ -693,7 +840,9 @@ def test_scaling(n, is_bonded):
 
 
 def test_holding_more_and_stiffening_take_more_energy():
-    """Smooth plates allow all that bonded ones do; a stiffer cell anywhere costs; nu narrows what is free."""
+    """Smooth plates allow all that bonded ones do; a stiffer cell anywhere costs; nu narrows
+    what is free.
+    """
     rng = np.random.default_rng(9)
     image, mesh = block((2.0, 3.0, 2.5), (3, 3, 3))
     young = rng.uniform(1.0, 9.0, len(mesh.cells))
@@ -703,7 +852,10 @@ def test_holding_more_and_stiffening_take_more_energy():
         stiffer = young.copy()
         stiffer[cell] *= 2.0
         assert squeezed(mesh, image, stiffer, 0.4).strain_energy > bonded * (1.0 + 1e-6)
-    # Voigt and Reuss: between smooth plates the energy lies between those of equal stress and equal strain.
+    # Voigt and Reuss: between smooth plates the energy lies between those of equal stress and equal
+    # strain.
     v = volumes(mesh.points, mesh.cells) / 15.0
-    smooth = squeezed(mesh, image, young, 0.0, is_bonded=False).strain_energy / (0.5 * 0.01**2 * 15.0)
+    smooth = squeezed(mesh, image, young, 0.0, is_bonded=False).strain_energy / (
+        0.5 * 0.01**2 * 15.0
+    )
     assert 1.0 / (v / young).sum() < smooth < (v * young).sum()

@@ -7,14 +7,25 @@ from threadpoolctl import threadpool_limits
 
 import tetopt
 from tetopt.fem import elasticity
-from tetopt.fem.hexahedra import element_stiffness, free_stiffness, solve_between_plates, stiffness_product
+from tetopt.fem.hexahedra import (
+    element_stiffness,
+    free_stiffness,
+    solve_between_plates,
+    stiffness_product,
+)
 from tetopt.geometry.box import upright_axis
 
 STRAIGHT = np.diag([1.5, 0.7, 0.9])
 SHEARED = np.array([[1.5, 0.3, -0.2], [0.1, 2.0, 0.4], [0.2, -0.3, 0.8]])
 TURNED = SHEARED[[2, 0, 1]]  # its upright axis is the second
 # One voxel thick across and along the plates, with the longest axis first, in the middle, last.
-SHAPES = [((3, 2, 5), SHEARED), ((5, 3, 4), TURNED), ((2, 7, 3), STRAIGHT), ((4, 1, 3), SHEARED), ((6, 5, 1), STRAIGHT)]
+SHAPES = [
+    ((3, 2, 5), SHEARED),
+    ((5, 3, 4), TURNED),
+    ((2, 7, 3), STRAIGHT),
+    ((4, 1, 3), SHEARED),
+    ((6, 5, 1), STRAIGHT),
+]
 SHAPES += [((5, 6), SHEARED[:2, :2]), ((7, 4), STRAIGHT[:2, :2][::-1]), ((1, 3), SHEARED[:2, :2])]
 
 
@@ -37,10 +48,14 @@ def nodes_of(modulus):
 def test_product_matrix_and_solution_are_those_of_the_dense_matrix(shape, linear, nu):
     """The matrix is symmetric to the last bit, and the plates keep their displacements."""
     modulus = modulus_of(shape, linear)
-    dense = naive.grid_stiffness(shape, modulus.data, element_stiffness(modulus.affine[:-1, :-1], nu))
+    dense = naive.grid_stiffness(
+        shape, modulus.data, element_stiffness(modulus.affine[:-1, :-1], nu)
+    )
     u, is_free = nodes_of(modulus)
     free = np.flatnonzero(is_free)
-    np.testing.assert_allclose(stiffness_product(modulus, nu, u).ravel(), dense @ u.ravel(), atol=1e-12)
+    np.testing.assert_allclose(
+        stiffness_product(modulus, nu, u).ravel(), dense @ u.ravel(), atol=1e-12
+    )
     K = free_stiffness(modulus, nu).toarray()
     np.testing.assert_allclose(K, dense[np.ix_(free, free)], atol=1e-13)
     np.testing.assert_array_equal(K, K.T)
@@ -54,10 +69,14 @@ def test_product_matrix_and_solution_are_those_of_the_dense_matrix(shape, linear
 
 @pytest.mark.parametrize(("shape", "linear"), [((3, 5, 4), STRAIGHT), ((5, 6), STRAIGHT[:2, :2])])
 def test_patch(shape, linear):
-    """One modulus, and plates that move as a linear field of uniaxial stress does: the solution is that field."""
+    """One modulus, and plates that move as a linear field of uniaxial stress does: the solution
+    is that field.
+    """
     n, nu = len(shape), 0.3
     modulus = modulus_of(shape, linear, contrast=1.0)
-    exact = modulus.to_world(np.stack(np.indices([s + 1 for s in shape]), axis=-1).reshape(-1, n).astype(float))
+    exact = modulus.to_world(
+        np.stack(np.indices([s + 1 for s in shape]), axis=-1).reshape(-1, n).astype(float)
+    )
     exact = (exact * [*(-0.01 * nu,) * (n - 1), 0.01]).reshape(*(s + 1 for s in shape), n)
     u = np.where(nodes_of(modulus)[1], 0.0, exact)
     solve_between_plates(modulus, nu, u)

@@ -1,4 +1,6 @@
-"""The voxel grid's solution: against scikit-fem, against closed forms, and against fine tetrahedral meshes."""
+"""The voxel grid's solution: against scikit-fem, against closed forms, and against fine
+tetrahedral meshes.
+"""
 
 from itertools import product
 
@@ -51,13 +53,17 @@ def test_element_against_scikit_fem(nu):
     ours = element_stiffness(SHEARED, nu)
     dof = basis.nodal_dofs  # (3, 8)
     for a, b in product(range(8), repeat=2):
-        np.testing.assert_allclose(ours[order[a], order[b]], K[np.ix_(dof[:, a], dof[:, b])], atol=1e-12)
+        np.testing.assert_allclose(
+            ours[order[a], order[b]], K[np.ix_(dof[:, a], dof[:, b])], atol=1e-12
+        )
 
 
 @pytest.mark.parametrize("flip", [1.0, -1.0])
 @pytest.mark.parametrize("n", [2, 3])
 def test_bar_without_sideways_strain(n, flip):
-    """nu = 0: u is linear along the push, E_strain = 1/2 E strain^2 V; the top rests, whichever way the axis runs."""
+    """nu = 0: u is linear along the push, E_strain = 1/2 E strain^2 V; the top rests, whichever
+    way the axis runs.
+    """
     linear = np.diag([1.5, 2.0, 0.5][3 - n :])
     linear[-1, -1] *= flip
     image = tetopt.Image(np.full((4, 3, 5)[:n], 7.0), affine_of(linear, 3.0))
@@ -71,7 +77,9 @@ def test_bar_without_sideways_strain(n, flip):
     assert exact.own_error.strain_energy < 1e-9
     assert exact.own_error.displacement is None
     assert exact.n_dofs == np.prod(np.array(image.shape) + 1) * n
-    index = np.stack(np.meshgrid(*map(np.arange, image.shape), indexing="ij"), axis=-1).reshape(-1, n)
+    index = np.stack(np.meshgrid(*map(np.arange, image.shape), indexing="ij"), axis=-1).reshape(
+        -1, n
+    )
     along = image.to_world(index.astype(float))[:, -1]
     top = along.max() + 0.5 * abs(linear[-1, -1])
     np.testing.assert_allclose(u[:, -1], 0.02 * (top - along), atol=1e-9)
@@ -79,7 +87,9 @@ def test_bar_without_sideways_strain(n, flip):
 
 @pytest.mark.full
 def test_meshes_tend_to_it():
-    """A stiff ball in soft tissue: errors of ever finer lattices fall towards the voxel grid's solution."""
+    """A stiff ball in soft tissue: errors of ever finer lattices fall towards the voxel grid's
+    solution.
+    """
     image = tetopt.load_phantom("sphere").image(voxel_mm=4.0)
     image = tetopt.Image(1.0 + image.data.astype(float) / image.data.max() * 5.0, image.affine)
     labels = tetopt.load_phantom("sphere").label_image(voxel_mm=4.0).data
@@ -90,7 +100,9 @@ def test_meshes_tend_to_it():
         bottom, top = box_faces(image, mesh)
         push = [0.0, 0.0, 0.01 * np.ptp(mesh.points[:, 2])]
         young = cell_young(image, mesh)
-        pressed = compression(mesh, young, 0.3, fixed_nodes=top, pushed_nodes=bottom, displacement=push)
+        pressed = compression(
+            mesh, young, 0.3, fixed_nodes=top, pushed_nodes=bottom, displacement=push
+        )
         errors.append(compare(exact, mesh, pressed.u, pressed.strain_energy, labels))
     energy, displacement, strain = (np.array(column) for column in zip(*errors, strict=True))
     assert np.all(np.diff(energy) < 0)
@@ -101,13 +113,17 @@ def test_meshes_tend_to_it():
 
 def linear_reference(image, slope, shift):
     """A made-up solution u = slope x + shift, against 0 for the homogeneous block."""
-    nodes = np.stack(np.meshgrid(*(np.arange(s + 1) - 0.5 for s in image.shape), indexing="ij"), axis=-1)
+    nodes = np.stack(
+        np.meshgrid(*(np.arange(s + 1) - 0.5 for s in image.shape), indexing="ij"), axis=-1
+    )
     u = image.to_world(nodes.reshape(-1, image.ndim)).reshape(nodes.shape) @ slope.T + shift
     return Reference(image, 0.3, 2.0, u, np.zeros_like(u), OwnError(0.0, None), 0)
 
 
 def test_errors_of_a_known_field():
-    """The same linear field on the mesh has no error; one scaled by 1.1 has 0.1 in displacement and strain."""
+    """The same linear field on the mesh has no error; one scaled by 1.1 has 0.1 in displacement
+    and strain.
+    """
     rng = np.random.default_rng(0)
     image = tetopt.Image(rng.uniform(1.0, 2.0, (7, 6, 5)), affine_of(SHEARED, 4.0))
     mesh = tetopt.lattice_mesh(image, nodes=60)
@@ -123,7 +139,9 @@ def test_errors_of_a_known_field():
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_errors_of_quadratic_cells(n):
-    """A quadratic field is that of cells of order 2: its error against itself is what the voxels leave out of it."""
+    """A quadratic field is that of cells of order 2: its error against itself is what the voxels
+    leave out of it.
+    """
     rng = np.random.default_rng(n)
     image = tetopt.Image(np.ones((9, 8, 7)[:n]), affine_of(SHEARED[:n, :n], 4.0))
     mesh = tetopt.lattice_mesh(image, nodes=60)
@@ -132,18 +150,23 @@ def test_errors_of_quadratic_cells(n):
     def field(x):
         return np.einsum("...i,dij,...j->...d", x, bend, x)
 
-    nodes = np.stack(np.meshgrid(*(np.arange(s + 1) - 0.5 for s in image.shape), indexing="ij"), axis=-1)
+    nodes = np.stack(
+        np.meshgrid(*(np.arange(s + 1) - 0.5 for s in image.shape), indexing="ij"), axis=-1
+    )
     exact = linear_reference(image, np.zeros((n, n)), np.zeros(n))
     exact.u[:] = field(image.to_world(nodes.reshape(-1, n))).reshape(nodes.shape)
     labels = np.zeros(image.shape)
     labels[:4] = 1
     u = field(quadratic(mesh.points, mesh.cells)[0])
     errors = compare(exact, mesh, u, 2.0, labels)
-    # The mean of a voxel's corners is above a quadratic at its centre by a constant; the slope is the same.
+    # The mean of a voxel's corners is above a quadratic at its centre by a constant; the slope is
+    # the same.
     corners = np.array(list(product((-0.5, 0.5), repeat=n))) @ SHEARED[:n, :n].T
     excess = field(corners).mean(axis=0)
     there = at_centres(image, exact.u, np.arange(image.data.size))[0]
-    assert errors.displacement == pytest.approx(np.linalg.norm(excess) / np.sqrt((there**2).sum(axis=1).mean()))
+    assert errors.displacement == pytest.approx(
+        np.linalg.norm(excess) / np.sqrt((there**2).sum(axis=1).mean())
+    )
     assert errors.interface_strain == pytest.approx(0.0, abs=1e-12)
     linear = compare(exact, mesh, field(mesh.points), 2.0, labels)
     assert linear.interface_strain > 0.1
@@ -187,7 +210,9 @@ def test_averaged_keeps_box_and_mean():
 def test_averaged_against_exact_fractions(shape):
     image = tetopt.Image(np.random.default_rng(6).normal(size=shape))
     for new in (tuple((s + 1) // 2 for s in shape), tuple(max(1, s - 2) for s in shape)):
-        np.testing.assert_allclose(averaged(image, new).data, naive.block_means(image.data, new), atol=1e-13)
+        np.testing.assert_allclose(
+            averaged(image, new).data, naive.block_means(image.data, new), atol=1e-13
+        )
 
 
 @pytest.mark.parametrize(("old", "new"), [((3, 5, 4), (7, 10, 4)), ((2, 1), (4, 3))])
@@ -195,13 +220,18 @@ def test_interpolated_against_dense_interpolation(old, new):
     u = np.random.default_rng(7).normal(size=(*(s + 1 for s in old), len(old)))
     P = [naive.interpolation(*pair) for pair in zip(new, old, strict=True)]
     axes = "abc"[: len(old)], "ijk"[: len(old)]
-    dense = np.einsum(f"{','.join(map(''.join, zip(*axes, strict=True)))},{axes[1]}d->{axes[0]}d", *P, u)
+    dense = np.einsum(
+        f"{','.join(map(''.join, zip(*axes, strict=True)))},{axes[1]}d->{axes[0]}d", *P, u
+    )
     np.testing.assert_allclose(interpolated(u, new), dense, atol=1e-14)
 
 
 def test_reference_shape_is_as_fine_as_allowed():
     """No more dofs than allowed, no finer than the image, nearly cubic."""
-    for shape, spacing, dofs in (((60, 50, 40), (1.0, 1.0, 1.0), 30_000), ((200, 180, 20), (0.5, 0.5, 5.0), 90_000)):
+    for shape, spacing, dofs in (
+        ((60, 50, 40), (1.0, 1.0, 1.0), 30_000),
+        ((200, 180, 20), (0.5, 0.5, 5.0), 90_000),
+    ):
         coarse = reference_shape(shape, np.array(spacing), dofs)
         assert 3 * np.prod(np.array(coarse) + 1) <= dofs
         assert all(c <= s for c, s in zip(coarse, shape, strict=True))
@@ -212,16 +242,24 @@ def test_reference_shape_is_as_fine_as_allowed():
 def test_nearest_takes_the_voxel_around_the_centre():
     image = tetopt.Image(np.arange(6.0).reshape(3, 2))
     fine = tetopt.Image(np.zeros((9, 4)), np.diag([1 / 3, 1 / 2, 1.0]))
-    np.testing.assert_array_equal(nearest(image, fine).data, image.data.repeat(3, axis=0).repeat(2, axis=1))
+    np.testing.assert_array_equal(
+        nearest(image, fine).data, image.data.repeat(3, axis=0).repeat(2, axis=1)
+    )
 
 
 def test_refined_is_the_same_field():
-    """Every voxel is divided evenly, so that the mean stays; the box, and what a place in it holds, are the same."""
-    image = tetopt.Image(np.random.default_rng(3).uniform(size=(5, 4, 3)), random_affine(np.random.default_rng(4), 3))
+    """Every voxel is divided evenly, so that the mean stays; the box, and what a place in it
+    holds, are the same.
+    """
+    image = tetopt.Image(
+        np.random.default_rng(3).uniform(size=(5, 4, 3)), random_affine(np.random.default_rng(4), 3)
+    )
     fine = refined(image, (11, 4, 8))
     assert fine.shape == (10, 4, 9)
     assert fine.data.mean() == pytest.approx(image.data.mean(), rel=1e-12)
-    index = np.stack(np.meshgrid(*(np.arange(s) for s in fine.shape), indexing="ij"), axis=-1).reshape(-1, 3)
+    index = np.stack(
+        np.meshgrid(*(np.arange(s) for s in fine.shape), indexing="ij"), axis=-1
+    ).reshape(-1, 3)
     of = np.rint(image.to_index(fine.to_world(index.astype(float)))).astype(int)
     np.testing.assert_array_equal(fine.data.ravel(), image.data[tuple(of.T)])
     np.testing.assert_array_equal(refined(image, image.shape).data, image.data)
@@ -229,7 +267,9 @@ def test_refined_is_the_same_field():
 
 @pytest.mark.full
 def test_own_error_is_that_of_half_the_resolution():
-    """Energy and displacement of a reference on voxels twice as long; the homogeneous block is that of one modulus."""
+    """Energy and displacement of a reference on voxels twice as long; the homogeneous block is
+    that of one modulus.
+    """
     rng = np.random.default_rng(10)
     image = tetopt.Image(rng.uniform(1.0, 10.0, (8, 7, 10)), affine_of(SHEARED, 1.0))
     exact = reference(image, 0.3)
@@ -238,9 +278,13 @@ def test_own_error_is_that_of_half_the_resolution():
     difference = np.einsum("ai,bj,ck,ijkd->abcd", *P, coarse.u) - exact.u
     even = reference(tetopt.Image(np.ones(image.shape), image.affine), 0.3).u
     np.testing.assert_array_equal(exact.u_homogeneous, even)
-    assert exact.own_error.strain_energy == pytest.approx(abs(coarse.strain_energy / exact.strain_energy - 1.0))
+    assert exact.own_error.strain_energy == pytest.approx(
+        abs(coarse.strain_energy / exact.strain_energy - 1.0)
+    )
     scale = np.linalg.norm(exact.u - even)
-    assert exact.own_error.displacement == pytest.approx(np.linalg.norm(difference) / scale, rel=1e-9)
+    assert exact.own_error.displacement == pytest.approx(
+        np.linalg.norm(difference) / scale, rel=1e-9
+    )
     assert exact.own_error.displacement > 0.01
 
 
@@ -249,14 +293,18 @@ def test_homogeneous_block_has_no_displacement_error():
     mesh = tetopt.lattice_mesh(image, nodes=40)
     bottom, top = box_faces(image, mesh)
     exact = reference(image, 0.3)
-    pressed = compression(mesh, 3.0, 0.3, fixed_nodes=top, pushed_nodes=bottom, displacement=[0.0, 0.0, 0.04])
+    pressed = compression(
+        mesh, 3.0, 0.3, fixed_nodes=top, pushed_nodes=bottom, displacement=[0.0, 0.0, 0.04]
+    )
     errors = compare(exact, mesh, pressed.u, pressed.strain_energy, np.zeros(image.shape))
     assert errors.displacement is None
     assert errors.interface_strain is None
 
 
 def test_errors_are_relative_to_what_the_image_does():
-    """Displacement over what sets it apart from the homogeneous one; strain over that near the interfaces alone."""
+    """Displacement over what sets it apart from the homogeneous one; strain over that near the
+    interfaces alone.
+    """
     rng = np.random.default_rng(4)
     image = tetopt.Image(rng.uniform(1.0, 2.0, (12, 6, 5)))
     mesh = tetopt.lattice_mesh(image, nodes=60)

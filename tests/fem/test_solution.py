@@ -1,4 +1,6 @@
-"""Models solved: closed forms, another library's answer for each kind of load, laws, and what cannot be solved."""
+"""Models solved: closed forms, another library's answer for each kind of load, laws, and what
+cannot be solved.
+"""
 
 import os
 import subprocess
@@ -15,7 +17,14 @@ from skfem.helpers import ddot, dot, sym_grad, trace
 from tetopt import Image, InputError, Mesh, lattice_mesh
 from tetopt.fem import solution as module
 from tetopt.fem.conditioning import conditioning
-from tetopt.fem.elasticity import compression, constrained, gauss_strains, multigrid, solved, strains
+from tetopt.fem.elasticity import (
+    compression,
+    constrained,
+    gauss_strains,
+    multigrid,
+    solved,
+    strains,
+)
 from tetopt.fem.solution import node_means, solution_fields, solve, von_mises
 from tetopt.geometry.quadratic import quadratic
 from tetopt.geometry.simplex import oriented, volumes
@@ -34,7 +43,9 @@ def bar(n, blocks=2, length=6.0):
     affine[:n, :n] = np.diag(sides)
     affine[:n, n] = 0.5 * sides
     image = Image(np.zeros((1,) * n), affine)
-    mesh = lattice_mesh(image, None if n == 2 else "five-tet", blocks=(blocks,) * (n - 1) + (2 * blocks,))
+    mesh = lattice_mesh(
+        image, None if n == 2 else "five-tet", blocks=(blocks,) * (n - 1) + (2 * blocks,)
+    )
     return mesh, standard_sets(mesh, box_of(image))
 
 
@@ -43,7 +54,9 @@ def nodes_of_order(mesh, order):
 
 
 def uneven(n, seed=3):
-    """A mesh of thin cells, turned in space, with the box's faces as sets, and a modulus, ratio and density a cell."""
+    """A mesh of thin cells, turned in space, with the box's faces as sets, and a modulus, ratio
+    and density a cell.
+    """
     rng = np.random.default_rng(seed)
     points, cells = split_box(rng, (3,) * n, 14, step=0.25)
     turned = np.eye(n + 1)
@@ -63,22 +76,30 @@ def uneven(n, seed=3):
 
 
 def skfem_solution(model, step=1):
-    """Displacements in the order of our nodes, by scikit-fem: its assembly, its integrals over facets and cells.
+    """Displacements in the order of our nodes, by scikit-fem: its assembly, its integrals over
+    facets and cells.
 
-    Springs are to the ground at the nodes, as those of every solver we write for, so that their matrix is lumped; all
-    other loads are integrals of shape functions.
+    Springs are to the ground at the nodes, as those of every solver we write for, so that their
+    matrix is lumped; all other loads are integrals of shape functions.
     """
     n, order, mesh = model.mesh.ndim, model.order, model._replace(order=1).to_skfem()
     element = {
-        (2, 1): skfem.ElementTriP1, (3, 1): skfem.ElementTetP1, (2, 2): skfem.ElementTriP2, (3, 2): skfem.ElementTetP2
-    }[n, order]()  # fmt: skip
+        (2, 1): skfem.ElementTriP1,
+        (3, 1): skfem.ElementTetP1,
+        (2, 2): skfem.ElementTriP2,
+        (3, 2): skfem.ElementTetP2,
+    }[n, order]()
     constant = skfem.ElementTriP0() if n == 2 else skfem.ElementTetP0()
     linear = skfem.ElementTriP1() if n == 2 else skfem.ElementTetP1()
     basis = skfem.Basis(mesh, skfem.ElementVector(element), intorder=2)
     table = model.materials
     of_cell = {"nu": table.nu[table.of_cell]}
-    of_cell["density"] = np.zeros_like(of_cell["nu"]) if table.density is None else table.density[table.of_cell]
-    fields = {name: basis.with_element(constant).interpolate(values) for name, values in of_cell.items()}
+    of_cell["density"] = (
+        np.zeros_like(of_cell["nu"]) if table.density is None else table.density[table.of_cell]
+    )
+    fields = {
+        name: basis.with_element(constant).interpolate(values) for name, values in of_cell.items()
+    }
     if model.node_young is None:
         fields["young"] = basis.with_element(constant).interpolate(table.young[table.of_cell])
     else:  # at the middle of cells of order 1, as a constant strain only sees the mean
@@ -104,21 +125,29 @@ def skfem_solution(model, step=1):
                     prescribed[chosen] = load.numbers[d]
                     dofs.append(chosen)
         elif load.kind == "pressure":
-            f += skfem.LinearForm(lambda v, w, load=load: -load.numbers[0] * dot(w.n, v)).assemble(on_set)
-        elif load.kind == "traction":
-            f += skfem.LinearForm(lambda v, w, load=load: sum(load.numbers[d] * v[d] for d in range(n))).assemble(
+            f += skfem.LinearForm(lambda v, w, load=load: -load.numbers[0] * dot(w.n, v)).assemble(
                 on_set
             )
+        elif load.kind == "traction":
+            f += skfem.LinearForm(
+                lambda v, w, load=load: sum(load.numbers[d] * v[d] for d in range(n))
+            ).assemble(on_set)
         elif load.kind == "gravity":
             weight = skfem.LinearForm(
-                lambda v, w, load=load: 1e-9 * w.density * sum(load.numbers[d] * v[d] for d in range(n))
+                lambda v, w, load=load: (
+                    1e-9 * w.density * sum(load.numbers[d] * v[d] for d in range(n))
+                )
             )
             f += weight.assemble(basis, density=fields["density"])
         else:
-            fraction = skfem.LinearForm(lambda v, w: v[0] + v[1] + (v[2] if n == 3 else 0.0)).assemble(on_set)
+            fraction = skfem.LinearForm(
+                lambda v, w: v[0] + v[1] + (v[2] if n == 3 else 0.0)
+            ).assemble(on_set)
             K.setdiag(K.diagonal() + load.numbers[0] * fraction)
     u = skfem.solve(
-        *skfem.condense(K.tocsr(), f, x=prescribed, D=np.unique(np.concatenate(dofs or [np.empty(0, int)])))
+        *skfem.condense(
+            K.tocsr(), f, x=prescribed, D=np.unique(np.concatenate(dofs or [np.empty(0, int)]))
+        )
     )
     distance, ours = cKDTree(nodes_of_order(model.mesh, model.order)).query(basis.doflocs.T)
     assert distance.max() < 1e-10
@@ -135,32 +164,55 @@ LOADS = {
     "traction": ["hold:inferior", "traction:superior:0.1,-0.2,0.3"],
     "spring": ["spring:inferior:2.5", "traction:superior:0.1,-0.2,0.3"],
     "gravity": ["hold:inferior", "gravity:0,3000,-9810"],
-    "all": ["hold:inferior", "move:superior:free,free,0.1", "pressure:left:0.3", "pressure:left:0.1",
-            "gravity:0,0,-9810", "traction:right:0,0.2,-0.1", "spring:right:2.0", "spring:anterior:0.5"],
-}  # fmt: skip
-FACES = {"left": "x_min", "right": "x_max", "posterior": "x_min", "anterior": "x_max", "inferior": "y_min",
-         "superior": "y_max"}  # fmt: skip
+    "all": [
+        "hold:inferior",
+        "move:superior:free,free,0.1",
+        "pressure:left:0.3",
+        "pressure:left:0.1",
+        "gravity:0,0,-9810",
+        "traction:right:0,0.2,-0.1",
+        "spring:right:2.0",
+        "spring:anterior:0.5",
+    ],
+}
+FACES = {
+    "left": "x_min",
+    "right": "x_max",
+    "posterior": "x_min",
+    "anterior": "x_max",
+    "inferior": "y_min",
+    "superior": "y_max",
+}
 
 
 def words_of(loads, n):
-    """Loads for a mesh of dimension n: in a plane y takes the place of z, and there are two components."""
+    """Loads for a mesh of dimension n: in a plane y takes the place of z, and there are two
+    components.
+    """
     if n == 3:
         return loads
     changed = []
     for load in loads:
         parts = [FACES.get(part, part) for part in load.split(":")]
         numbers = parts[-1].split(",")
-        changed.append(":".join([*parts[:-1], ",".join(numbers[::2] if len(numbers) == 3 else numbers)]))
+        changed.append(
+            ":".join([*parts[:-1], ",".join(numbers[::2] if len(numbers) == 3 else numbers)])
+        )
     return changed
 
 
 def model_with(mesh, sets, loads, order, **values):
-    return build_model(mesh, **values, loads=words_of(loads, mesh.ndim), known_sets=sets)._replace(order=order)
+    return build_model(mesh, **values, loads=words_of(loads, mesh.ndim), known_sets=sets)._replace(
+        order=order
+    )
 
 
 @pytest.mark.parametrize(
     ("kind", "n", "order"),
-    [*((kind, 3, 1) for kind in LOADS), *(("all", n, order) for n, order in BOTH if n + order != 4)],
+    [
+        *((kind, 3, 1) for kind in LOADS),
+        *(("all", n, order) for n, order in BOTH if n + order != 4),
+    ],
 )
 def test_each_kind_of_load_as_scikit_fem_has_it(kind, n, order):
     mesh, sets, values = uneven(n)
@@ -198,16 +250,21 @@ def test_a_bar_under_traction(n, order):
     np.testing.assert_allclose(solution.u, expected, atol=1e-12)
     stress = np.zeros((n, n))
     stress[-1, -1] = 0.5
-    np.testing.assert_allclose(solution.stress, np.broadcast_to(stress, solution.stress.shape), atol=1e-12)
+    np.testing.assert_allclose(
+        solution.stress, np.broadcast_to(stress, solution.stress.shape), atol=1e-12
+    )
     np.testing.assert_allclose(von_mises(solution.stress), 0.5, rtol=1e-12)
     area = 2.0 ** (n - 1)
     assert solution.strain_energy == pytest.approx(0.5 * 0.5 * 0.125 * area * 6.0, rel=1e-12)
-    np.testing.assert_allclose(solution.reactions[words_of(["hold:inferior"], n)[0][5:]][-1], -0.5 * area, rtol=1e-12)
+    np.testing.assert_allclose(
+        solution.reactions[words_of(["hold:inferior"], n)[0][5:]][-1], -0.5 * area, rtol=1e-12
+    )
 
 
 @pytest.mark.parametrize(("n", "order"), BOTH)
 def test_a_bar_under_its_own_weight(n, order):
-    """nu = 0: it hangs down by rho g (L z - z^2 / 2) / E, quadratic along it: exact at nodes, and all over for order 2.
+    """nu = 0: it hangs down by rho g (L z - z^2 / 2) / E, quadratic along it: exact at nodes, and
+    all over for order 2.
 
     Linear cells are exact at the nodes of meshes that are the same in every layer; ours are not.
     """
@@ -228,7 +285,9 @@ def test_a_bar_under_its_own_weight(n, order):
         energy = 0.5 * weight**2 / young * length**3 / 3.0 * 2.0 ** (n - 1)
         assert solution.strain_energy == pytest.approx(energy, rel=1e-12)
         stress = weight * (length - nodes_of_order(mesh, 2)[:, -1])
-        np.testing.assert_allclose(node_means(mesh, solution.stress)[:, -1, -1], stress, atol=1e-12 * stress.max())
+        np.testing.assert_allclose(
+            node_means(mesh, solution.stress)[:, -1, -1], stress, atol=1e-12 * stress.max()
+        )
 
 
 @pytest.mark.parametrize(("n", "order"), BOTH)
@@ -239,7 +298,9 @@ def test_a_stiff_block_on_a_bed_of_springs(n, order):
     solution = solve(model_with(mesh, sets, loads, order, young=1e5, nu=0.3))
     force = 2.0 ** (n - 1) * np.array([0.1, 0.0, -0.5])
     bed = words_of(["hold:inferior"], n)[0][5:]
-    np.testing.assert_allclose(solution.reactions[bed], -force[[0, 2] if n == 2 else slice(3)], atol=1e-8)
+    np.testing.assert_allclose(
+        solution.reactions[bed], -force[[0, 2] if n == 2 else slice(3)], atol=1e-8
+    )
     low = nodes_of_order(mesh, order)[:, -1] < 1e-9
     sunk = np.average(solution.u[low, -1], weights=spring_fractions(mesh, sets, bed, order)[low])
     assert sunk == pytest.approx(-0.25, rel=1e-4)
@@ -274,11 +335,19 @@ def test_patch_with_moduli_and_ratios_of_one_kind(n, order):
 
 @pytest.mark.parametrize(("n", "order"), BOTH)
 def test_steps_and_superposition(n, order):
-    """Loads of no step are in all; solutions add up as loads do, so do reactions; energies are those of the work."""
+    """Loads of no step are in all; solutions add up as loads do, so do reactions; energies are
+    those of the work.
+    """
     mesh, sets, values = uneven(n)
     common = ["hold:inferior", "spring:right:0.7"]
     forces = ["pressure:left:0.3", "traction:superior:0.1,0.3,-0.2", "gravity:0,500,-9810"]
-    model = model_with(mesh, sets, [*common, *(f"{k}/{words}" for k, words in enumerate(forces, 1))], order, **values)
+    model = model_with(
+        mesh,
+        sets,
+        [*common, *(f"{k}/{words}" for k, words in enumerate(forces, 1))],
+        order,
+        **values,
+    )
     steps = [solve(model, step) for step in (1, 2, 3)]
     whole = solve(model_with(mesh, sets, [*common, *forces], order, **values))
     np.testing.assert_allclose(sum(s.u for s in steps), whole.u, atol=1e-10 * np.abs(whole.u).max())
@@ -287,7 +356,9 @@ def test_steps_and_superposition(n, order):
         scale = np.abs(force).max()
         np.testing.assert_allclose(sum(s.reactions[name] for s in steps), force, atol=1e-9 * scale)
     for solution in (*steps, whole):
-        assert solution.strain_energy + solution.spring_energy == pytest.approx(solution.work, rel=1e-9)
+        assert solution.strain_energy + solution.spring_energy == pytest.approx(
+            solution.work, rel=1e-9
+        )
         assert min(solution.strain_energy, solution.spring_energy) > 0.0
         total = sum(solution.reactions.values()) + solution.applied
         assert np.abs(total).max() < 1e-9 * np.abs(list(solution.reactions.values())).max()
@@ -298,7 +369,9 @@ def test_steps_and_superposition(n, order):
 def test_the_work_of_what_is_moved(order):
     """Pushed faces: half of reaction times way; a free component has no reaction."""
     mesh, sets, values = uneven(3)
-    model = model_with(mesh, sets, ["hold:inferior", "move:superior:0.2,free,-0.1"], order, **values)
+    model = model_with(
+        mesh, sets, ["hold:inferior", "move:superior:0.2,free,-0.1"], order, **values
+    )
     solution = solve(model)
     reaction = solution.reactions["superior"]
     assert solution.work == pytest.approx(0.5 * (0.2 * reaction[0] - 0.1 * reaction[2]), rel=1e-10)
@@ -332,7 +405,9 @@ def test_units_do_not_matter():
 @pytest.mark.full
 @pytest.mark.parametrize("n", [2, 3])
 def test_quadratic_cells_converge_faster(n):
-    """A bending cantilever: of the fine quadratic solution, errors of energy fall as h^2 and, of order 2, faster."""
+    """A bending cantilever: of the fine quadratic solution, errors of energy fall as h^2 and, of
+    order 2, faster.
+    """
     loads = ["hold:inferior", "traction:superior:0.1,0,0"]
 
     def energy(blocks, order):
@@ -351,7 +426,9 @@ def test_any_number_of_free_pieces_on_springs():
     """Two bars apart, one held and one on springs alone."""
     mesh, sets = bar(2)
     n_points = len(mesh.points)
-    pair = Mesh(np.vstack([mesh.points, 50.0 + mesh.points]), np.vstack([mesh.cells, mesh.cells + n_points]))
+    pair = Mesh(
+        np.vstack([mesh.points, 50.0 + mesh.points]), np.vstack([mesh.cells, mesh.cells + n_points])
+    )
     later, low, high = np.array([[len(mesh.cells), 0]]), sets.facets["y_min"], sets.facets["y_max"]
     both = {"first": low, "second": low + later, "top": high + later}
     loads = ["hold:first", "spring:second:3", "pressure:top:0.2"]
@@ -363,7 +440,8 @@ def test_any_number_of_free_pieces_on_springs():
         solve(model._replace(loads=(model.loads[0], model.loads[2])))
     n_cells = len(mesh.cells)
     assert str(error.value) == (
-        f"mesh: 1 components have no node that is fixed, displaced or on a spring; the first has {n_cells} cells "
+        "mesh: 1 components have no node that is fixed, displaced or on a spring; the first has "
+        f"{n_cells} cells "
         f"around cell {n_cells} (node {pair.cells[n_cells, 0]}); fix it or remove it"
     )
 
@@ -376,7 +454,14 @@ def test_multigrid_of_order_2_is_symmetric_and_positive(nu):
     mesh, sets = bar(3, 1)
     rng = np.random.default_rng(0)
     young = np.exp(rng.uniform(0.0, np.log(1e3), len(mesh.cells)))
-    model = model_with(mesh, sets, ["hold:inferior", "pressure:superior:0.1", "spring:left:0.1"], 2, young=young, nu=nu)
+    model = model_with(
+        mesh,
+        sets,
+        ["hold:inferior", "pressure:superior:0.1", "spring:left:0.1"],
+        2,
+        young=young,
+        nu=nu,
+    )
     system = solve(model).system
     cycle = multigrid(system)
     dense = np.column_stack([cycle @ unit for unit in np.eye(len(system.free))])
@@ -402,7 +487,14 @@ def test_multigrid_and_factorisation_agree_with_order_2(n):
 @pytest.mark.parametrize("method", ["direct", "amg"])
 def test_conditioning_of_order_2(method):
     mesh, sets = bar(3, 1)
-    model = model_with(mesh, sets, ["hold:inferior", "pressure:superior:0.1", "spring:left:0.1"], 2, young=3.0, nu=0.4)
+    model = model_with(
+        mesh,
+        sets,
+        ["hold:inferior", "pressure:superior:0.1", "spring:left:0.1"],
+        2,
+        young=3.0,
+        nu=0.4,
+    )
     system = solve(model).system
     values = np.linalg.eigvalsh(system.K_ff.toarray())
     extremes = conditioning(system, method=method)
@@ -428,7 +520,9 @@ def test_fields(n, order):
         "von_mises_nodes": (n_nodes,),
     }
     assert set(fields.cell_data) == {"strain", "stress", "von_mises"}
-    np.testing.assert_array_equal(fields.cell_data["strain"].reshape(-1, n, n), strains(mesh, solution.u))
+    np.testing.assert_array_equal(
+        fields.cell_data["strain"].reshape(-1, n, n), strains(mesh, solution.u)
+    )
     second = solution_fields(mesh, solution, 2)
     assert set(second.cell_data) == {"strain_step2", "stress_step2", "von_mises_step2"}
     np.testing.assert_array_equal(second.point_data["displacement_step2"], solution.u)
@@ -438,12 +532,16 @@ def test_fields(n, order):
     narrowing = 1.0 - nu**2 if n == 2 else (1.0 + nu) * (1.0 - 2.0 * nu)
     trace_of = np.einsum("cii->c", strain)[:, None, None]
     stress = young * nu / narrowing * trace_of * np.eye(n) + young / (1.0 + nu) * strain
-    np.testing.assert_allclose(fields.cell_data["stress"].reshape(-1, n, n), stress, atol=1e-10 * np.abs(stress).max())
+    np.testing.assert_allclose(
+        fields.cell_data["stress"].reshape(-1, n, n), stress, atol=1e-10 * np.abs(stress).max()
+    )
 
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_strain_at_nodes_of_a_quadratic_displacement(n):
-    """It is linear all over the mesh, so that what each cell says of a node is the same, and exact."""
+    """It is linear all over the mesh, so that what each cell says of a node is the same, and
+    exact.
+    """
     mesh, _, _ = uneven(n)
     points = quadratic(mesh.points, mesh.cells)[0]
     points = points - points.mean(axis=0)
@@ -468,11 +566,17 @@ def test_means_at_nodes_are_by_volume():
 
 
 def test_von_mises():
-    """Pulled along one axis it is that stress; sheared sqrt(3) times; under pressure alone nothing; plane or not."""
+    """Pulled along one axis it is that stress; sheared sqrt(3) times; under pressure alone
+    nothing; plane or not.
+    """
     pulled, sheared = np.diag([2.0, 0.0, 0.0]), np.zeros((3, 3))
     sheared[0, 1] = sheared[1, 0] = 1.5
-    np.testing.assert_allclose(von_mises(np.array([pulled, sheared, -4.0 * np.eye(3)])), [2.0, 1.5 * 3**0.5, 0.0])
-    np.testing.assert_allclose(von_mises(np.array([pulled[:2, :2], sheared[:2, :2]])), [2.0, 1.5 * 3**0.5])
+    np.testing.assert_allclose(
+        von_mises(np.array([pulled, sheared, -4.0 * np.eye(3)])), [2.0, 1.5 * 3**0.5, 0.0]
+    )
+    np.testing.assert_allclose(
+        von_mises(np.array([pulled[:2, :2], sheared[:2, :2]])), [2.0, 1.5 * 3**0.5]
+    )
     np.testing.assert_allclose(von_mises(-4.0 * np.eye(2)), 4.0)
 
 
@@ -491,17 +595,28 @@ def test_what_cannot_be_solved():
     model = model_with(mesh, sets, loads, 1, young=2.0, nu=0.3, density=1.0)
     assert refused(model, 3) == "step: expected 1 to 2, got 3"
     assert refused(model, 0) == "step: expected 1 to 2, got 0"
-    assert refused(model._replace(materials=None)) == "model: the cells have no moduli; give `young`"
+    assert (
+        refused(model._replace(materials=None)) == "model: the cells have no moduli; give `young`"
+    )
     weightless = model._replace(materials=model.materials._replace(density=None))
-    assert refused(weightless) == "gravity: the cells have no density; give `density` in kg/m3, such as 1000"
+    assert (
+        refused(weightless)
+        == "gravity: the cells have no density; give `density` in kg/m3, such as 1000"
+    )
     other = model._replace(loads=(*model.loads, Load("torque", "superior", np.ones(3))))
-    assert refused(other) == 'load: expected displacement, pressure, traction, spring or gravity, got "torque"'
+    assert (
+        refused(other)
+        == 'load: expected displacement, pressure, traction, spring or gravity, got "torque"'
+    )
     adrift = model._replace(loads=model.loads[1:])
     assert refused(adrift) == (
-        "mesh: no displacement or spring constrains it, so it can move freely; fix or support at least one set, "
+        "mesh: no displacement or spring constrains it, so it can move freely; fix or support at "
+        "least one set, "
         "for example with hold:SET or spring:SET:K"
     )
-    sliding = model_with(mesh, sets, ["move:inferior:free,free,0", "pressure:superior:1"], 1, young=2.0)
+    sliding = model_with(
+        mesh, sets, ["move:inferior:free,free,0", "pressure:superior:1"], 1, young=2.0
+    )
     assert refused(sliding).startswith(f"mesh: {len(mesh.cells)} cells around cell 0 ")
     assert "can still rotate or slide as a whole" in refused(sliding)
 
@@ -509,17 +624,22 @@ def test_what_cannot_be_solved():
 def test_forces_that_do_not_balance_are_an_error(monkeypatch):
     """If the matrix were not what it should be: a spring that is not accounted for."""
     mesh, sets = bar(2)
-    model = model_with(mesh, sets, ["hold:inferior", "traction:superior:0,0,0.5"], 1, young=4.0, nu=0.3)
+    model = model_with(
+        mesh, sets, ["hold:inferior", "traction:superior:0,0,0.5"], 1, young=4.0, nu=0.3
+    )
     plain = module.constrained
 
     def with_leak(*arguments, **options):
         system = plain(*arguments, **options)
         leak = diags_array(np.full(system.K.shape[0], 1e-6)).tocsr()
-        return system._replace(K=system.K + leak, K_ff=system.K_ff + leak[system.free][:, system.free])
+        return system._replace(
+            K=system.K + leak, K_ff=system.K_ff + leak[system.free][:, system.free]
+        )
 
     monkeypatch.setattr(module, "constrained", with_leak)
     with pytest.raises(
-        RuntimeError, match=r"^elasticity: forces and reactions do not balance: the remainder .* mN exceeds"
+        RuntimeError,
+        match=r"^elasticity: forces and reactions do not balance: the remainder .* mN exceeds",
     ):
         solve(model)
 
@@ -528,9 +648,16 @@ def test_forces_that_do_not_balance_are_an_error(monkeypatch):
 
 
 def test_reactions_of_a_set_add_up():
-    """Held along single axes by two loads, and on springs besides: one force, which balances the others."""
+    """Held along single axes by two loads, and on springs besides: one force, which balances the
+    others.
+    """
     mesh, sets = bar(3)
-    words = ["move:inferior:0,0,free", "move:inferior:free,free,0.1", "spring:inferior:2", "traction:superior:1,0,3"]
+    words = [
+        "move:inferior:0,0,free",
+        "move:inferior:free,free,0.1",
+        "spring:inferior:2",
+        "traction:superior:1,0,3",
+    ]
     for order in (1, 2):
         solution = solve(build_model(mesh, young=10.0, known_sets=sets, loads=words, order=order))
         assert list(solution.reactions) == ["inferior"]
@@ -557,10 +684,14 @@ print(hashlib.sha256(b"".join(each.tobytes() for each in numbers)).hexdigest(), 
 
 @pytest.mark.deep
 def test_the_same_bits_on_any_number_of_blas_threads():
-    """BLAS and LAPACK share long sums among threads, and round otherwise; a solution by multigrid does not."""
+    """BLAS and LAPACK share long sums among threads, and round otherwise; a solution by
+    multigrid does not.
+    """
     results = set()
     for threads in ("1", "2"):
-        environment = dict(os.environ) | dict.fromkeys(("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), threads)
+        environment = dict(os.environ) | dict.fromkeys(
+            ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), threads
+        )
         words = [sys.executable, "-c", CHILD]
         done = subprocess.run(words, env=environment, capture_output=True, check=True, text=True)
         results.add(done.stdout)
@@ -569,22 +700,32 @@ def test_the_same_bits_on_any_number_of_blas_threads():
 
 @pytest.mark.parametrize("order", [1, 2])
 def test_a_hollow_sphere_under_pressure_from_within(order):
-    """Lame's solution: u_r = p a^3 / (E (b^3 - a^3)) ((1 - 2 nu) r + (1 + nu) b^3 / (2 r^2)), and its stresses.
+    """Lame's solution: u_r = p a^3 / (E (b^3 - a^3)) ((1 - 2 nu) r + (1 + nu) b^3 / (2 r^2)), and
+    its stresses.
 
-    An eighth of it, held across the three planes of symmetry. Facets are flat, which quadratic cells do not change:
-    their error falls with the square of the facets' size.
+    An eighth of it, held across the three planes of symmetry. Facets are flat, which quadratic
+    cells do not change: their error falls with the square of the facets' size.
     """
     inner, outer, young, nu, pressure = 1.0, 2.0, 3.0, 0.45, 0.2
-    loads = ["move:x:0,free,free", "move:y:free,0,free", "move:z:free,free,0", f"pressure:inner:{pressure}"]
+    loads = [
+        "move:x:0,free,free",
+        "move:y:free,0,free",
+        "move:z:free,free,0",
+        f"pressure:inner:{pressure}",
+    ]
     factor = pressure * inner**3 / (outer**3 - inner**3)
     errors = []
     for blocks in (4, 8):
         mesh, sets = eighth_of_a_shell(inner, outer, blocks, blocks // 2)
-        model = build_model(mesh, young=young, nu=nu, loads=loads, known_sets=sets)._replace(order=order)
+        model = build_model(mesh, young=young, nu=nu, loads=loads, known_sets=sets)._replace(
+            order=order
+        )
         solution = solve(model)
         r = np.linalg.norm(mesh.points, axis=1)
         along = factor / young * ((1.0 - 2.0 * nu) * r + (1.0 + nu) * outer**3 / (2.0 * r**2))
-        errors.append(np.abs((solution.u[: len(r)] * mesh.points).sum(axis=1) / r - along).max() / along.max())
+        errors.append(
+            np.abs((solution.u[: len(r)] * mesh.points).sum(axis=1) / r - along).max() / along.max()
+        )
     assert errors[1] < (0.04 if order == 2 else 0.5)
     assert errors[0] / errors[1] > (3.0 if order == 2 else 1.5)
     # The trace of the stress is the same everywhere.
@@ -593,26 +734,41 @@ def test_a_hollow_sphere_under_pressure_from_within(order):
 
 
 def eighth_of_a_shell(inner, outer, around, across):
-    """An eighth of a hollow sphere, and its sides as sets: the lattice of a triangle times the radii."""
+    """An eighth of a hollow sphere, and its sides as sets: the lattice of a triangle times the
+    radii.
+    """
     corners = [(i, j) for i in range(around + 1) for j in range(around + 1 - i)]
     number = {corner: k for k, corner in enumerate(corners)}
-    flat = [(number[i, j], number[i + 1, j], number[i, j + 1]) for i, j in corners if i + j < around]
-    flat += [(number[i + 1, j], number[i + 1, j + 1], number[i, j + 1]) for i, j in corners if i + j < around - 1]
+    flat = [
+        (number[i, j], number[i + 1, j], number[i, j + 1]) for i, j in corners if i + j < around
+    ]
+    flat += [
+        (number[i + 1, j], number[i + 1, j + 1], number[i, j + 1])
+        for i, j in corners
+        if i + j < around - 1
+    ]
     directions = np.array([(around - i - j, i, j) for i, j in corners], dtype=float)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     radii = inner * (outer / inner) ** (np.arange(across + 1) / across)
     points = (radii[:, None, None] * directions).reshape(-1, 3)
     cells, size = [], len(corners)
     for layer in range(across):
-        for a, b, c in (sorted(triangle) for triangle in flat):  # prisms cut alike on the sides that they share
+        # prisms cut alike on the sides that they share
+        for a, b, c in (sorted(triangle) for triangle in flat):
             low, high = layer * size, (layer + 1) * size
-            cells += [[low + a, low + b, low + c, high + c], [low + a, low + b, high + b, high + c],
-                      [low + a, high + a, high + b, high + c]]  # fmt: skip
+            cells += [
+                [low + a, low + b, low + c, high + c],
+                [low + a, low + b, high + b, high + c],
+                [low + a, high + a, high + b, high + c],
+            ]
     mesh = Mesh(points, oriented(points, np.array(cells)))
     rows = boundary_rows(mesh)
     triples = mesh.points[facet_triples(mesh.cells, rows)]
     distance = np.linalg.norm(triples, axis=2)
-    sides = {"inner": (distance < inner + 1e-9).all(axis=1), "outer": (distance > outer - 1e-9).all(axis=1)}
+    sides = {
+        "inner": (distance < inner + 1e-9).all(axis=1),
+        "outer": (distance > outer - 1e-9).all(axis=1),
+    }
     sides |= {"xyz"[d]: (np.abs(triples[:, :, d]) < 1e-12).all(axis=1) for d in range(3)}
     assert sum(each.sum() for each in sides.values()) == len(rows)
     return mesh, Sets({name: rows[is_on] for name, is_on in sides.items()}, {})
@@ -621,14 +777,20 @@ def eighth_of_a_shell(inner, outer, around, across):
 @pytest.mark.parametrize("n", [2, 3])
 @pytest.mark.parametrize("order", [1, 2])
 def test_a_confined_plate_under_pressure(n, order):
-    """Sides held sideways: strain p (1 + nu)(1 - 2 nu) / (E (1 - nu)), in plane stress p (1 - nu^2) / E."""
+    """Sides held sideways: strain p (1 + nu)(1 - 2 nu) / (E (1 - nu)), in plane stress p (1 -
+    nu^2) / E.
+    """
     mesh, sets = bar(n)
     young, nu, pressure = 3.0, 0.4, 0.5
     loads = ["move:left:0,free,free", "move:right:0,free,free", "move:inferior:free,free,0"]
     loads += ["move:posterior:free,0,free", "move:anterior:free,0,free"] if n == 3 else []
-    model = model_with(mesh, sets, [*loads, f"pressure:superior:{pressure}"], order, young=young, nu=nu)
+    model = model_with(
+        mesh, sets, [*loads, f"pressure:superior:{pressure}"], order, young=young, nu=nu
+    )
     solution = solve(model)
-    compliance = (1.0 - nu**2) / young if n == 2 else (1.0 + nu) * (1.0 - 2.0 * nu) / (young * (1.0 - nu))
+    compliance = (
+        (1.0 - nu**2) / young if n == 2 else (1.0 + nu) * (1.0 - 2.0 * nu) / (young * (1.0 - nu))
+    )
     expected = np.zeros_like(solution.u)
     expected[:, -1] = -compliance * pressure * nodes_of_order(mesh, order)[:, -1]
     np.testing.assert_allclose(solution.u, expected, atol=1e-12)
@@ -642,7 +804,8 @@ def test_near_incompressible_cells_of_order_1_lock():
     mesh, sets = bar(3)
     moved = {
         (order, nu): np.abs(solve(model_with(mesh, sets, loads, order, young=4.0, nu=nu)).u).max()
-        for order in (1, 2) for nu in (0.3, 0.499)
-    }  # fmt: skip
+        for order in (1, 2)
+        for nu in (0.3, 0.499)
+    }
     assert moved[2, 0.499] > 0.75 * moved[2, 0.3]
     assert moved[1, 0.499] < 0.6 * moved[1, 0.3]

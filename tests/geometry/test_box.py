@@ -23,7 +23,11 @@ def test_a_place_is_on_a_side_up_to_the_tolerance(fraction, is_on):
 def test_whole_numbers_are_compared_exactly():
     sides = np.array([[-(2**60), 2**60]])
     places = np.array([[-(2**60)], [1 - 2**60], [2**60]])
-    assert is_on_sides(places, sides, tolerance=0)[:, 0].tolist() == [[True, False], [False, False], [False, True]]
+    assert is_on_sides(places, sides, tolerance=0)[:, 0].tolist() == [
+        [True, False],
+        [False, False],
+        [False, True],
+    ]
 
 
 @pytest.mark.parametrize("n", [2, 3])
@@ -31,7 +35,9 @@ def test_whole_numbers_are_compared_exactly():
 def test_axes_are_assigned_by_the_largest_sum_of_cosines(seed, n):
     rng = np.random.default_rng(seed)
     affine = np.eye(n + 1)
-    affine[:n, :n] = Rotation.random(random_state=seed).as_matrix()[:n, :n] + rng.uniform(-0.3, 0.3, (n, n))
+    affine[:n, :n] = Rotation.random(random_state=seed).as_matrix()[:n, :n] + rng.uniform(
+        -0.3, 0.3, (n, n)
+    )
     axes = world_axes(affine)
     assert sorted(axes) == list(range(n))
     assert axes[upright_axis(affine)] == n - 1
@@ -41,7 +47,9 @@ def test_axes_are_assigned_by_the_largest_sum_of_cosines(seed, n):
 
 
 def test_the_axis_that_rises_most_need_not_be_the_upright_one():
-    """The first axis rises by 0.8 and the third by 0.65, but the third fits no other direction as well."""
+    """The first axis rises by 0.8 and the third by 0.65, but the third fits no other direction
+    as well.
+    """
     affine = np.eye(4)
     affine[:3, :3] = [[0.6, 0.0, 0.1], [0.0, 1.0, 0.75], [0.8, 0.0, 0.65]]
     assert (world_axes(affine), upright_axis(affine)) == ((0, 1, 2), 2)

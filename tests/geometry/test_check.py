@@ -28,16 +28,29 @@ def test_sound(n):
 
 def test_faults(mesh):
     points, cells = mesh.points, mesh.cells
-    assert problems(np.vstack([points, [[0, 0, 0]]]), cells) == f"unused nodes: 1, the first [{len(points)}]"
-    split = np.where(np.arange(len(cells))[:, None] < 1, np.where(cells == cells[0, 0], len(points), cells), cells)
-    assert "pairs of nodes at the same position: 1" in problems(np.vstack([points, points[cells[0, 0]]]), split)
+    assert (
+        problems(np.vstack([points, [[0, 0, 0]]]), cells)
+        == f"unused nodes: 1, the first [{len(points)}]"
+    )
+    split = np.where(
+        np.arange(len(cells))[:, None] < 1,
+        np.where(cells == cells[0, 0], len(points), cells),
+        cells,
+    )
+    assert "pairs of nodes at the same position: 1" in problems(
+        np.vstack([points, points[cells[0, 0]]]), split
+    )
     assert "duplicate cells: 1, the first [0]" in problems(points, np.vstack([cells, cells[0]]))
     holed = cells[1:]
-    assert "boundary facets off the faces" in problems(points, holed) or "open" in problems(points, holed)
+    assert "boundary facets off the faces" in problems(points, holed) or "open" in problems(
+        points, holed
+    )
     inner = np.flatnonzero((np.abs(IMAGE.to_index(points) - 3.5) < 2.0).all(axis=1))[0]
     assert "box" in problems(points * 1.1, cells)
     far = np.vstack([points, points[cells[0]] + 100.0])
-    assert "components that share no facet: 2" in problems(far, np.vstack([cells, len(points) + np.arange(4)]))
+    assert "components that share no facet: 2" in problems(
+        far, np.vstack([cells, len(points) + np.arange(4)])
+    )
     # A cell put on top of another one across a facet.
     apex = np.vstack([points, points[cells[0]].mean(axis=0)])
     on_top = np.vstack([cells, [cells[0, 0], cells[0, 1], cells[0, 2], len(points)]])
@@ -63,7 +76,9 @@ def test_beyond_the_box(mesh):
 def cubes(labels):
     """A block of cells for each voxel, and which of them have label 1."""
     image = tetopt.Image(labels)
-    mesh = tetopt.lattice_mesh(image, "criss-cross" if image.ndim == 2 else "five-tet", blocks=image.shape)
+    mesh = tetopt.lattice_mesh(
+        image, "criss-cross" if image.ndim == 2 else "five-tet", blocks=image.shape
+    )
     return mesh, cell_labels(image, mesh)
 
 
@@ -84,14 +99,25 @@ def test_two_cubes_that_touch(corner, words):
     mesh, of_cell = cubes(labels)
     assert tetopt.check_mesh(mesh) == []
     used, alone = np.unique(mesh.cells[of_cell == 1]), part_of(mesh, of_cell == 1)
-    here = np.flatnonzero((alone.points[:, :2] == 1.5).all(axis=1) & (len(corner) < 3 or corner[-1] == 0))
+    here = np.flatnonzero(
+        (alone.points[:, :2] == 1.5).all(axis=1) & (len(corner) < 3 or corner[-1] == 0)
+    )
     here = np.flatnonzero((alone.points == 1.5).all(axis=1)) if corner == (1, 1, 1) else here
     problems = [] if words is None else [words.format("the boundary", "", *here)]
     assert tetopt.check_mesh(alone, is_whole=False) == problems
     assert tetopt.check_mesh(alone, is_whole=False, is_manifold=False) == []
     check_unfolded(alone)  # what an optimisation asks for
-    assert tetopt.check_mesh(alone, is_whole=False, is_manifold=False, of_cell=np.ones(len(alone.cells))) == []
-    inner = [] if words is None else [words.format("the interface of two labels", " (0 and 1 at 1)", *used[here])]
+    assert (
+        tetopt.check_mesh(
+            alone, is_whole=False, is_manifold=False, of_cell=np.ones(len(alone.cells))
+        )
+        == []
+    )
+    inner = (
+        []
+        if words is None
+        else [words.format("the interface of two labels", " (0 and 1 at 1)", *used[here])]
+    )
     assert tetopt.check_mesh(mesh, of_cell=of_cell) == inner
     with pytest.raises(tetopt.InputError, match="whole number >= 0 for each of the mesh's"):
         tetopt.check_mesh(mesh, of_cell=of_cell[1:])
@@ -110,5 +136,6 @@ def test_where_three_labels_meet_interfaces_end():
     mesh, of_cell = cubes(labels)
     (line,) = tetopt.check_mesh(mesh, of_cell=of_cell)
     assert line.startswith(
-        "edges where the interface of two labels has more than two facets (0 and 1 at 1, 0 and 3 at 1)"
+        "edges where the interface of two labels has more than two facets (0 and 1 at 1, 0 and 3 "
+        "at 1)"
     )

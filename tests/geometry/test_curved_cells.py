@@ -1,4 +1,6 @@
-"""Quadratic cells with curved edges: rules of integration, Jacobian determinants, what a mesh takes."""
+"""Quadratic cells with curved edges: rules of integration, Jacobian determinants, what a mesh
+takes.
+"""
 
 from itertools import product
 from math import factorial
@@ -31,7 +33,9 @@ def test_the_rule_is_of_degree_5(n):
     for powers in product(range(6), repeat=n + 1):
         if sum(powers) == 5:
             mean = factorial(n) * np.prod([factorial(power) for power in powers]) / factorial(n + 5)
-            assert (weights * np.prod(places ** np.array(powers), axis=1)).sum() == pytest.approx(mean, rel=1e-13)
+            assert (weights * np.prod(places ** np.array(powers), axis=1)).sum() == pytest.approx(
+                mean, rel=1e-13
+            )
 
 
 @pytest.mark.parametrize("n", [2, 3])
@@ -47,7 +51,9 @@ def test_the_determinant_is_how_the_map_to_the_world_grows(n):
         moved = [places[place] + sign * step * (straight[1:] - straight[0]) for sign in (1.0, -1.0)]
         ahead, behind = (shape_values(each, 2) @ nodes[cells[cell]] for each in moved)
         corners = mesh.points[mesh.cells[cell]]
-        expected = np.linalg.det((ahead - behind) / (2.0 * step)) / np.linalg.det(corners[1:] - corners[0])
+        expected = np.linalg.det((ahead - behind) / (2.0 * step)) / np.linalg.det(
+            corners[1:] - corners[0]
+        )
         assert ratios[cell, place] == pytest.approx(expected, rel=1e-8)
     bounds = jacobian_bounds(nodes, cells)
     assert (bounds <= ratios.min(axis=1) + 1e-12).all()
@@ -58,23 +64,31 @@ def test_the_determinant_is_how_the_map_to_the_world_grows(n):
 
 
 def test_the_bound_is_the_determinant_at_corners():
-    """A corner's Bernstein coefficient is the determinant there: of one folded corner the bound is no less."""
+    """A corner's Bernstein coefficient is the determinant there: of one folded corner the bound
+    is no less.
+    """
     mesh = tetopt.Mesh(np.vstack([np.zeros(3), np.eye(3)]), [[0, 1, 2, 3]])
     edges = numbered_edges(mesh.cells)[0]
     midpoints = mesh.points[edges].mean(axis=1)
-    midpoints[0, 0] = 0.2  # of the edge from 0 to 1: at 0 the map has the slope 4 x 0.2 - 1, at 1 3 - 4 x 0.2
+    # of the edge from 0 to 1: at 0 the map has the slope 4 x 0.2 - 1, at 1 3 - 4 x 0.2
+    midpoints[0, 0] = 0.2
     nodes, cells = quadratic(mesh.points, mesh.cells, midpoints)
     assert jacobian_ratios(nodes, cells, np.eye(4))[0, :2].tolist() == pytest.approx([-0.2, 2.2])
     assert jacobian_bounds(nodes, cells)[0] == pytest.approx(-0.2)
     folded = tetopt.Mesh(mesh.points, mesh.cells, midpoints)
     assert scaled_jacobians(folded)[0] == pytest.approx(-0.2)
     assert tetopt.check_mesh(mesh) == []
-    assert tetopt.check_mesh(folded) == ["quadratic cells folded by their mid-edge nodes: 1, the first [0]"]
+    assert tetopt.check_mesh(folded) == [
+        "quadratic cells folded by their mid-edge nodes: 1, the first [0]"
+    ]
 
 
 def test_midpoints_that_a_mesh_does_not_take():
     points, cells = [[0, 0], [1, 0], [0, 1]], [[0, 1, 2]]
-    with pytest.raises(tetopt.InputError, match=r"expected 3 x 2 finite coordinates, one row per edge, got \(2, 2\)"):
+    with pytest.raises(
+        tetopt.InputError,
+        match=r"expected 3 x 2 finite coordinates, one row per edge, got \(2, 2\)",
+    ):
         tetopt.Mesh(points, cells, [[0, 0], [1, 1]])
     with pytest.raises(tetopt.InputError, match="expected 3 x 2 finite"):
         tetopt.Mesh(points, cells, [[0, 0], [1, 1], [np.nan, 0]])
@@ -84,22 +98,31 @@ def test_midpoints_that_a_mesh_does_not_take():
 
 
 def test_volumes_of_curved_cells_in_closed_form():
-    """A midpoint moved by d adds the integral of d . grad(4 a b): to a triangle 2/3 of its edge times the height."""
-    triangle = tetopt.Mesh([[0, 0], [3, 0], [0, 1]], [[0, 1, 2]], [[1.5, -0.3], [0, 0.5], [1.5, 0.5]])
+    """A midpoint moved by d adds the integral of d . grad(4 a b): to a triangle 2/3 of its edge
+    times the height.
+    """
+    triangle = tetopt.Mesh(
+        [[0, 0], [3, 0], [0, 1]], [[0, 1, 2]], [[1.5, -0.3], [0, 0.5], [1.5, 0.5]]
+    )
     assert triangle.cell_volumes[0] == pytest.approx(1.5 + 2.0 / 3.0 * 3.0 * 0.3, rel=1e-14)
     corners, cells = np.vstack([np.zeros(3), np.eye(3)]), [[0, 1, 2, 3]]
     middles = corners[numbered_edges(np.array(cells))[0]].mean(axis=1)
-    for edge, gradient in ((0, (0, -1, -1)), (5, (0, 1, 1))):  # between 0 and 1, and between 2 and 3
+    # between 0 and 1, and between 2 and 3
+    for edge, gradient in ((0, (0, -1, -1)), (5, (0, 1, 1))):
         moved = middles.copy()
         moved[edge] += (0.05, -0.1, 0.02)
         expected = (1.0 + np.dot(gradient, (0.05, -0.1, 0.02))) / 6.0
-        assert tetopt.Mesh(corners, cells, moved).cell_volumes[0] == pytest.approx(expected, rel=1e-14)
+        assert tetopt.Mesh(corners, cells, moved).cell_volumes[0] == pytest.approx(
+            expected, rel=1e-14
+        )
     assert tetopt.Mesh(corners, cells).cell_volumes[0] == pytest.approx(1.0 / 6.0)
 
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_volumes_of_curved_cells_by_another_rule(n):
-    """That of Gauss on the cube, folded onto the simplex (Duffy 1982), for cells with all edges bent."""
+    """That of Gauss on the cube, folded onto the simplex (Duffy 1982), for cells with all edges
+    bent.
+    """
     mesh = with_bent_edges(ball_mesh(n), 0.08)
     nodes, cells = quadratic(mesh.points, mesh.cells, mesh.midpoints)
     at, weights = np.polynomial.legendre.leggauss(4)
@@ -120,14 +143,16 @@ def test_volumes_of_curved_cells_by_another_rule(n):
     quality = tetopt.quality(mesh.points, mesh.cells, mesh.midpoints)
     assert quality.volume == pytest.approx(mesh.cell_volumes.sum())
     assert quality.smallest_volume == mesh.cell_volumes.min()
-    assert quality._replace(volume=0.0, smallest_volume=0.0) == tetopt.quality(mesh.points, mesh.cells)._replace(
-        volume=0.0, smallest_volume=0.0
-    )
+    assert quality._replace(volume=0.0, smallest_volume=0.0) == tetopt.quality(
+        mesh.points, mesh.cells
+    )._replace(volume=0.0, smallest_volume=0.0)
 
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_pieces_of_curved_cells(n):
-    """They fill a mesh again, each in its cell, on all nodes of order 2; of straight cells they are equal."""
+    """They fill a mesh again, each in its cell, on all nodes of order 2; of straight cells they
+    are equal.
+    """
     mesh = with_bent_edges(ball_mesh(n), 0.05)
     pieces, n_pieces = mesh.straight_pieces()
     assert (n_pieces, len(pieces.cells)) == (2**n, 2**n * len(mesh.cells))
@@ -135,7 +160,8 @@ def test_pieces_of_curved_cells(n):
     nodes, cells = quadratic(mesh.points, mesh.cells, mesh.midpoints)
     np.testing.assert_array_equal(pieces.points, nodes)
     assert all(
-        set(own) <= set(whole) for own, whole in zip(pieces.cells, np.repeat(cells, n_pieces, axis=0), strict=True)
+        set(own) <= set(whole)
+        for own, whole in zip(pieces.cells, np.repeat(cells, n_pieces, axis=0), strict=True)
     )
     straight = tetopt.Mesh(mesh.points, mesh.cells)
     assert straight.straight_pieces() == (straight, 1)
@@ -144,7 +170,9 @@ def test_pieces_of_curved_cells(n):
     assert not any(each.cell_volumes.flags.writeable for each in (mesh, straight))
     middles = mesh.points[numbered_edges(mesh.cells)[0]].mean(axis=1)
     equal = tetopt.Mesh(mesh.points, mesh.cells, middles).straight_pieces()[0].cell_volumes
-    np.testing.assert_allclose(equal, np.repeat(straight.cell_volumes, n_pieces) / n_pieces, rtol=1e-9)
+    np.testing.assert_allclose(
+        equal, np.repeat(straight.cell_volumes, n_pieces) / n_pieces, rtol=1e-9
+    )
 
 
 def test_pieces_of_a_folded_cell_are_straight():

@@ -24,7 +24,9 @@ def sorted_rows(rows):
 
 
 def test_a_regular_tetrahedron_is_halved_in_a_square():
-    """Its section half way between two opposite edges is a square with half their length, sqrt(2)."""
+    """Its section half way between two opposite edges is a square with half their length,
+    sqrt(2).
+    """
     points, cells = REGULAR_TET
     for axis in range(3):
         cut = plane_cut(points, cells, points[:, axis] * 1.0)
@@ -87,7 +89,9 @@ def test_corners_are_those_of_the_twin(seed):
 
 @given(seeds)
 def test_polygons_are_convex_and_tile_the_section_of_the_box(seed):
-    """Random oblique plane through a box: the polygons' areas add up to the box's section, dV/dh by a thin slab."""
+    """Random oblique plane through a box: the polygons' areas add up to the box's section, dV/dh
+    by a thin slab.
+    """
     rng = np.random.default_rng(seed)
     points, cells = split_box(rng, (4, 5, 3), 6)
     normal = rng.normal(size=3)
@@ -101,9 +105,13 @@ def test_polygons_are_convex_and_tile_the_section_of_the_box(seed):
     assert ((turns > -1e-9).all(axis=1) | (turns < 1e-9).all(axis=1)).all()
 
     def volume_below(level):
-        """Of the box, by its tetrahedra: the part of each below the plane, in closed form (divided differences)."""
+        """Of the box, by its tetrahedra: the part of each below the plane, in closed form
+        (divided differences).
+        """
         total = 0.0
-        for v, z in zip(volumes(points, cells), np.sort(height[cells], axis=1) - level, strict=True):
+        for v, z in zip(
+            volumes(points, cells), np.sort(height[cells], axis=1) - level, strict=True
+        ):
             z = z + 1e-7 * np.arange(4)  # the formula needs distinct heights
             total += v * sum(max(-a, 0) ** 3 / np.prod([b - a for b in z if b != a]) for a in z)
         return total

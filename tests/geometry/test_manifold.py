@@ -14,7 +14,9 @@ from tetopt.start.carve import part_of
 
 def box(n):
     """A criss-cross square, or a cube of five-tets, of 4 blocks an edge."""
-    return tetopt.lattice_mesh(tetopt.Image(np.zeros((8,) * n)), "five-tet" if n == 3 else None, blocks=(4,) * n)
+    return tetopt.lattice_mesh(
+        tetopt.Image(np.zeros((8,) * n)), "five-tet" if n == 3 else None, blocks=(4,) * n
+    )
 
 
 def kept_of(mesh):
@@ -29,7 +31,10 @@ def test_a_manifold_keeps_all_cells(n):
 @pytest.mark.parametrize("n_shared", [1, 2])
 def test_of_two_cells_that_touch_the_larger_stays(n_shared):
     """Two tetrahedra with a node, or an edge, in common: 0 and 1 are shared."""
-    points = np.array([[0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 1, 0], [-2, 0, 0], [0, -2, 0], [0, 0, -1]], dtype=float)
+    points = np.array(
+        [[0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 1, 0], [-2, 0, 0], [0, -2, 0], [0, 0, -1]],
+        dtype=float,
+    )
     other = [0, 1, 4, 5] if n_shared == 2 else [0, 6, 5, 4]
     cells = np.array([[0, 2, 3, 1], other])
     cells[volumes(points, cells) < 0] = cells[volumes(points, cells) < 0][:, [1, 0, 2, 3]]

@@ -83,7 +83,11 @@ def test_volumes_do_not_depend_on_how_many_are_taken_at_a_time(monkeypatch):
 
 def test_volume_is_exactly_zero_with_a_node_twice():
     points = np.random.default_rng(1).normal(size=(4, 3))
-    assert volumes(points, np.array([[0, 1, 2, 2], [0, 0, 1, 2], [3, 1, 3, 2]])).tolist() == [0, 0, 0]
+    assert volumes(points, np.array([[0, 1, 2, 2], [0, 0, 1, 2], [3, 1, 3, 2]])).tolist() == [
+        0,
+        0,
+        0,
+    ]
     assert volumes(points[:, :2], np.array([[0, 1, 1], [0, 0, 1], [2, 1, 2]])).tolist() == [0, 0, 0]
 
 
@@ -93,7 +97,9 @@ def test_volume_sign_is_the_parity_of_the_nodes_order(mesh):
     n = points.shape[1]
     for order in permutations(range(n + 1)):
         parity = round(np.linalg.det(np.eye(n + 1)[list(order)]))
-        assert volumes(points, cells[:, order]) == pytest.approx(parity * volumes(points, cells), rel=1e-14)
+        assert volumes(points, cells[:, order]) == pytest.approx(
+            parity * volumes(points, cells), rel=1e-14
+        )
 
 
 @given(seeds, dimensions)
@@ -129,12 +135,16 @@ def test_facet_areas_are_by_opposite_node():
     assert facet_areas(*RIGHT_TRIANGLE).tolist() == [[5, 4, 3]]
     assert facet_areas(*REGULAR_TET)[0] == pytest.approx([2 * sqrt(3)] * 4, rel=1e-15)
     assert facet_areas(*CUBE_CORNER)[0] == pytest.approx([sqrt(3) / 2, 0.5, 0.5, 0.5], rel=1e-15)
-    assert facet_areas(*OBTUSE_TET)[0] == pytest.approx([sqrt(11) / 2, sqrt(0.5), sqrt(0.5), 0.5], rel=1e-15)
+    assert facet_areas(*OBTUSE_TET)[0] == pytest.approx(
+        [sqrt(11) / 2, sqrt(0.5), sqrt(0.5), 0.5], rel=1e-15
+    )
 
 
 def test_centroids():
     assert centroids(*RIGHT_TRIANGLE)[0] == pytest.approx([1, 4 / 3])
-    assert centroids(*TWO_TETS) == pytest.approx(np.array([[0.3125, 0.3125, 0.25], [0.3125, 0.3125, -0.25]]))
+    assert centroids(*TWO_TETS) == pytest.approx(
+        np.array([[0.3125, 0.3125, 0.25], [0.3125, 0.3125, -0.25]])
+    )
 
 
 # Volume gradients
@@ -150,7 +160,9 @@ def test_volume_gradients_are_central_differences(seed, n):
             for axis in range(n):
                 step = np.zeros_like(points)
                 step[cells[cell, node], axis] = 0.5
-                difference = volumes(points + step, cells)[cell] - volumes(points - step, cells)[cell]
+                difference = (
+                    volumes(points + step, cells)[cell] - volumes(points - step, cells)[cell]
+                )
                 assert gradients[cell, node, axis] == pytest.approx(difference, abs=1e-13)
 
 
@@ -162,7 +174,9 @@ def test_volume_gradients_of_a_cell_sum_to_zero_and_give_n_volumes(seed, n):
     np.testing.assert_allclose(gradients.sum(axis=1), 0, atol=1e-13)
     euler = (gradients * points[cells]).sum(axis=(1, 2))
     np.testing.assert_allclose(euler, n * volumes(points, cells), rtol=1e-11, atol=1e-13)
-    np.testing.assert_allclose(np.linalg.norm(gradients, axis=2) * n, facet_areas(points, cells), rtol=1e-13)
+    np.testing.assert_allclose(
+        np.linalg.norm(gradients, axis=2) * n, facet_areas(points, cells), rtol=1e-13
+    )
 
 
 # Circumcentres
@@ -172,7 +186,9 @@ def test_volume_gradients_of_a_cell_sum_to_zero_and_give_n_volumes(seed, n):
 def test_circumcentres_are_as_far_from_every_node(seed, n):
     points, cells = random_cells(seed, n)
     distances = np.linalg.norm(points[cells] - naive.circumcentres(points, cells)[:, None], axis=2)
-    np.testing.assert_allclose(distances, np.broadcast_to(distances[:, :1], distances.shape), rtol=1e-8)
+    np.testing.assert_allclose(
+        distances, np.broadcast_to(distances[:, :1], distances.shape), rtol=1e-8
+    )
 
 
 # rho
@@ -234,7 +250,14 @@ def test_rho_of_flat_cells_is_zero():
         # facet normals (0, 0, -1), (0, -1, -1), (-1, 0, -1), (1, 1, 3) opposite nodes 3, 2, 1, 0
         (
             OBTUSE_TET,
-            [135, 135, 120, degrees(acos(3 / sqrt(11))), degrees(acos(4 / sqrt(22))), degrees(acos(4 / sqrt(22)))],
+            [
+                135,
+                135,
+                120,
+                degrees(acos(3 / sqrt(11))),
+                degrees(acos(4 / sqrt(22))),
+                degrees(acos(4 / sqrt(22))),
+            ],
         ),
     ],
 )
@@ -245,10 +268,13 @@ def test_dihedral_angles_of_single_cells(mesh, angles):
 @pytest.mark.parametrize("t", [0.3, 1e-3, 1e-9])
 def test_dihedral_angles_of_slivers_and_needles_are_accurate(t):
     """By edges 01 02 03 12 13 23; arccos alone would give 0 for the sliver with t = 1e-9."""
-    around = np.degrees(2 * np.arcsin(sqrt(2) * t / sqrt(1 + 4 * t * t)))  # acos(1 / (1 + 4 t^2)), accurate
+    # acos(1 / (1 + 4 t^2)), accurate
+    around = np.degrees(2 * np.arcsin(sqrt(2) * t / sqrt(1 + 4 * t * t)))
     across = 180 - np.degrees(2 * np.arctan(2 * t))
     expected = np.array([around, across, around, around, across, around])
-    np.testing.assert_allclose(np.sort(dihedral_angles(*single(sliver(t)))[0]), np.sort(expected), rtol=1e-6)
+    np.testing.assert_allclose(
+        np.sort(dihedral_angles(*single(sliver(t)))[0]), np.sort(expected), rtol=1e-6
+    )
     at_short = np.degrees(2 * np.arctan(t / 2))
     angles = dihedral_angles(*single(needle(t)))[0]
     assert angles[[0, 5]] == pytest.approx([at_short] * 2, rel=1e-6)
@@ -257,7 +283,14 @@ def test_dihedral_angles_of_slivers_and_needles_are_accurate(t):
 
 def test_angles_of_flat_cells_are_0_and_180():
     flat = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-    assert np.sort(dihedral_angles(flat, np.array([[0, 1, 2, 3]]))[0]).tolist() == [0, 0, 0, 0, 180, 180]
+    assert np.sort(dihedral_angles(flat, np.array([[0, 1, 2, 3]]))[0]).tolist() == [
+        0,
+        0,
+        0,
+        0,
+        180,
+        180,
+    ]
 
 
 # Laws
@@ -267,29 +300,45 @@ def test_angles_of_flat_cells_are_0_and_180():
 def test_rotation_scaling_and_translation(seed, n):
     rng = np.random.default_rng(seed)
     points, cells = random_cells(seed, n)
-    rotation, scale, shift = random_rotation(rng, n), np.exp(rng.uniform(-3, 3)), rng.uniform(-10, 10, n)
+    rotation, scale, shift = (
+        random_rotation(rng, n),
+        np.exp(rng.uniform(-3, 3)),
+        rng.uniform(-10, 10, n),
+    )
     moved = scale * points @ rotation.T + shift
-    np.testing.assert_allclose(volumes(moved, cells), scale**n * volumes(points, cells), rtol=1e-8, atol=1e-9)
-    np.testing.assert_allclose(facet_areas(moved, cells), scale ** (n - 1) * facet_areas(points, cells), rtol=1e-8)
+    np.testing.assert_allclose(
+        volumes(moved, cells), scale**n * volumes(points, cells), rtol=1e-8, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        facet_areas(moved, cells), scale ** (n - 1) * facet_areas(points, cells), rtol=1e-8
+    )
     np.testing.assert_allclose(rho(moved, cells), rho(points, cells), rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(dihedral_angles(moved, cells), dihedral_angles(points, cells), atol=1e-6)
+    np.testing.assert_allclose(
+        dihedral_angles(moved, cells), dihedral_angles(points, cells), atol=1e-6
+    )
     rotated = volume_gradients(points, cells) @ rotation.T * scale ** (n - 1)
     np.testing.assert_allclose(volume_gradients(moved, cells), rotated, rtol=1e-7, atol=1e-9)
 
 
 @pytest.mark.parametrize("mesh", ALL_SMALL)
 def test_far_from_the_origin_nothing_is_lost(mesh):
-    """1e6 mm away coordinates are exact to 1e-10 mm; so is everything made of them, and no more is lost."""
+    """1e6 mm away coordinates are exact to 1e-10 mm; so is everything made of them, and no more
+    is lost.
+    """
     points, cells = mesh
     rng = np.random.default_rng(3)
     shift = 2.0**20 * rng.choice([-1, 1], points.shape[1])
     grid = np.round(points * 2.0**30) / 2.0**30  # exact after the shift
     np.testing.assert_array_equal(volumes(grid + shift, cells), volumes(grid, cells))
     np.testing.assert_array_equal(rho(grid + shift, cells), rho(grid, cells))
-    np.testing.assert_array_equal(dihedral_angles(grid + shift, cells), dihedral_angles(grid, cells))
+    np.testing.assert_array_equal(
+        dihedral_angles(grid + shift, cells), dihedral_angles(grid, cells)
+    )
     np.testing.assert_array_equal(facet_areas(grid + shift, cells), facet_areas(grid, cells))
     np.testing.assert_allclose(
-        naive.circumcentres(grid + shift, cells) - shift, naive.circumcentres(grid, cells), atol=1e-9
+        naive.circumcentres(grid + shift, cells) - shift,
+        naive.circumcentres(grid, cells),
+        atol=1e-9,
     )
 
 

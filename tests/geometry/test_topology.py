@@ -42,7 +42,9 @@ def test_stars_are_those_of_the_twin(seed, n):
     points, cells = random_mesh(seed, n)
     around = stars(cells, len(points) + 2)  # the last two nodes are in no cell
     assert len(around.start) == len(points) + 3
-    listed = [around.cells[a:b].tolist() for a, b in zip(around.start, around.start[1:], strict=False)]
+    listed = [
+        around.cells[a:b].tolist() for a, b in zip(around.start, around.start[1:], strict=False)
+    ]
     assert listed == naive.stars(cells, len(points) + 2)
     assert listed[-2:] == [[], []]
 
@@ -62,7 +64,9 @@ def test_facets_are_those_of_the_twin(seed, n):
     _, cells = random_mesh(seed, n)
     shared, twin = facets(cells), naive.facets(cells)
     assert [tuple(row) for row in shared.nodes.tolist()] == sorted(twin)
-    for nodes, sides, count in zip(shared.nodes.tolist(), shared.cells.tolist(), shared.n_cells, strict=True):
+    for nodes, sides, count in zip(
+        shared.nodes.tolist(), shared.cells.tolist(), shared.n_cells, strict=True
+    ):
         assert [side for side in sides if side >= 0] == twin[tuple(nodes)]
         assert count == len(twin[tuple(nodes)])
 
@@ -88,7 +92,8 @@ def test_facets_know_where_each_cell_holds_them(seed, n):
             nodes = sides.nodes[facet].tolist()
             assert nodes == sorted(set(cell) - {node})
             behind = naive.sign(naive.signed_volume([exact[a] for a in [*nodes, node]]))
-            assert side == (behind if n == 2 else -behind)  # 2-D: left of the edge; 3-D: under the triangle
+            # 2-D: left of the edge; 3-D: under the triangle
+            assert side == (behind if n == 2 else -behind)
 
 
 def test_facets_of_cells_that_do_not_conform_are_counted():
@@ -98,7 +103,9 @@ def test_facets_of_cells_that_do_not_conform_are_counted():
     assert sides.n_cells.tolist() == [3, 1, 1, 1, 1, 1, 1]
     assert sides.cells[0].tolist() == [0, 1]
     assert (sides.cells[1:, 1] == -1).all()
-    assert [0, 1] not in np.sort(boundary_facets(np.array([[0, 1, 2], [0, 1, 3], [1, 0, 4]]))).tolist()
+    assert [0, 1] not in np.sort(
+        boundary_facets(np.array([[0, 1, 2], [0, 1, 3], [1, 0, 4]]))
+    ).tolist()
 
 
 # Boundary
@@ -116,10 +123,14 @@ def test_boundary_facets_enclose_the_mesh(seed, n):
     outward = boundary_facets(cells)
     assert enclosed_volume(points, outward) == pytest.approx(4.0**n, rel=1e-12)
     twin = naive.facets(cells)
-    assert sorted(map(sorted, outward.tolist())) == sorted(list(k) for k, shared in twin.items() if len(shared) == 1)
+    assert sorted(map(sorted, outward.tolist())) == sorted(
+        list(k) for k, shared in twin.items() if len(shared) == 1
+    )
     # The boundary of a part of the mesh encloses that part.
     part = cells[: max(1, len(cells) // 2)]
-    assert enclosed_volume(points, boundary_facets(part)) == pytest.approx(volumes(points, part).sum(), rel=1e-12)
+    assert enclosed_volume(points, boundary_facets(part)) == pytest.approx(
+        volumes(points, part).sum(), rel=1e-12
+    )
 
 
 # Colours
@@ -143,11 +154,18 @@ def test_colours_are_proper_and_those_of_the_twin(seed, n):
     assert colours.tolist() == naive.node_colours(cells, len(points))
     of_cells = np.sort(colours[cells], axis=1)
     assert (np.diff(of_cells, axis=1) > 0).all()
-    neighbours = max(len({a for c in star for a in cells[c].tolist()}) for star in naive.stars(cells, len(points)))
+    neighbours = max(
+        len({a for c in star for a in cells[c].tolist()})
+        for star in naive.stars(cells, len(points))
+    )
     assert colours.max() < neighbours
     # Nodes of one colour have stars without a common cell.
     for colour in range(colours.max() + 1):
-        touched = [cell for node in np.flatnonzero(colours == colour) for cell in naive.stars(cells, len(points))[node]]
+        touched = [
+            cell
+            for node in np.flatnonzero(colours == colour)
+            for cell in naive.stars(cells, len(points))[node]
+        ]
         assert len(touched) == len(set(touched))
 
 
@@ -192,14 +210,20 @@ def test_largest_component_of_nothing_is_empty_and_of_equals_the_first():
     _, cells = FIVE_TET_CUBE
     assert largest_component(cells, np.zeros(5, dtype=bool)).tolist() == []
     assert largest_component(cells, np.array([False, True, True, True, True])).tolist() == [1]
-    assert largest_component(cells, np.array([True, False, True, False, True])).tolist() == [0, 2, 4]
+    assert largest_component(cells, np.array([True, False, True, False, True])).tolist() == [
+        0,
+        2,
+        4,
+    ]
     _, cells = TWO_SQUARES
     assert largest_component(cells, np.isin(np.arange(8), [0, 4, 5])).tolist() == [4, 5]
 
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_folded(n):
-    """A conforming mesh has no fold; a node pulled through its star makes one; a third cell at a facet is one."""
+    """A conforming mesh has no fold; a node pulled through its star makes one; a third cell at a
+    facet is one.
+    """
     mesh = tetopt.lattice_mesh(tetopt.Image(np.zeros((4,) * n)), blocks=(2,) * n)
     assert folded(mesh.cells).shape == (0, 2)
     first = mesh.cells[0]

@@ -1,4 +1,6 @@
-"""Surfaces of sets of tetrahedra: closed and manifold whatever the set, around the same volume, crossing nothing."""
+"""Surfaces of sets of tetrahedra: closed and manifold whatever the set, around the same volume,
+crossing nothing.
+"""
 
 import numpy as np
 import pytest
@@ -14,18 +16,33 @@ from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
 from tetopt.start.lattice import lattice_mesh
 
-# Cells 0 1 2 3 and 0 1 4 5 share the edge 0 1, on either side of the plane x = 0; the third shares the node 3 alone.
+# Cells 0 1 2 3 and 0 1 4 5 share the edge 0 1, on either side of the plane x = 0; the third shares
+# the node 3 alone.
 TOUCHING = (
     np.array(
-        [[0, -1, 0], [0, 1, 0], [1, 0, -1], [1, 0, 1], [-1, 0, -1], [-1, 0, 1], [1, 1, 3], [2, 0, 3], [1, -1, 3.0]]
+        [
+            [0, -1, 0],
+            [0, 1, 0],
+            [1, 0, -1],
+            [1, 0, 1],
+            [-1, 0, -1],
+            [-1, 0, 1],
+            [1, 1, 3],
+            [2, 0, 3],
+            [1, -1, 3.0],
+        ]
     ),
     np.array([[0, 1, 2, 3], [0, 1, 5, 4], [3, 6, 7, 8]]),
 )
 
 
 def grid(blocks, kind="five-tet", noise=0.0, seed=0):
-    """A lattice of unit cubes, its nodes moved a little, so that neighbouring facets lie in no common plane."""
-    mesh = lattice_mesh(Image(np.zeros([2 * b for b in blocks]), np.diag([0.5, 0.5, 0.5, 1.0])), kind, blocks=blocks)
+    """A lattice of unit cubes, its nodes moved a little, so that neighbouring facets lie in no
+    common plane.
+    """
+    mesh = lattice_mesh(
+        Image(np.zeros([2 * b for b in blocks]), np.diag([0.5, 0.5, 0.5, 1.0])), kind, blocks=blocks
+    )
     points = mesh.points + np.random.default_rng(seed).normal(0.0, noise, mesh.points.shape)
     return points - points.min(axis=0), mesh.cells
 
@@ -36,7 +53,9 @@ def edges_of(triangles):
 
 
 def assert_manifold(surface):
-    """Each directed edge once, and once the other way; the triangles around each node are one cycle."""
+    """Each directed edge once, and once the other way; the triangles around each node are one
+    cycle.
+    """
     edges = [tuple(edge) for edge in edges_of(surface.triangles).tolist()]
     assert len(set(edges)) == len(edges)
     assert {(b, a) for a, b in edges} == set(edges)
@@ -54,12 +73,16 @@ def assert_manifold(surface):
 
 
 def assert_surface_of(surface, points, cells):
-    """Manifold, distinct nodes even in float32, and the cells' volume, but for what the copies' shifts sweep."""
+    """Manifold, distinct nodes even in float32, and the cells' volume, but for what the copies'
+    shifts sweep.
+    """
     assert_manifold(surface)
     assert len(np.unique(surface.points.astype(np.float32), axis=0)) == len(surface.points)
     volume, area = volume_and_area(surface)
     expected = volumes(points, cells).sum()
-    assert volume == pytest.approx(expected, abs=1.01 * surface.largest_shift * area + 1e-12 * expected)
+    assert volume == pytest.approx(
+        expected, abs=1.01 * surface.largest_shift * area + 1e-12 * expected
+    )
     assert area > 0.0
     assert (surface.n_parted == 0) == (surface.largest_shift == 0.0)
 
@@ -83,7 +106,9 @@ def n_crossings(surface):
         # Parts of one facet that was cut are flat, and their distances 1e-16, of either sign.
         may = (over_u * over_v < 0.0) & (np.maximum(abs(over_u), abs(over_v)) > 1e-9)
         may &= ~(triangles[:, :, None] == edge).any(axis=(1, 2))
-        sides = [((np.cross(p - u, q - u))[may] @ (v - u)) > 0.0 for p, q in ((a, b), (b, c), (c, a))]
+        sides = [
+            ((np.cross(p - u, q - u))[may] @ (v - u)) > 0.0 for p, q in ((a, b), (b, c), (c, a))
+        ]
         crossings += int(((sides[0] == sides[1]) & (sides[1] == sides[2])).sum())
     return crossings
 
@@ -102,7 +127,9 @@ def test_a_single_cell_has_its_four_facets_turned_out(mesh):
     corners = surface.points[surface.triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert (((corners.mean(axis=1) - points.mean(axis=0)) * normals).sum(axis=1) > 0.0).all()
-    assert volume_and_area(surface) == pytest.approx((volumes(points, cells)[0], facet_areas(points, cells).sum()))
+    assert volume_and_area(surface) == pytest.approx(
+        (volumes(points, cells)[0], facet_areas(points, cells).sum())
+    )
 
 
 @pytest.mark.parametrize("mesh", [FIVE_TET_CUBE, TWO_TETS, grid((3, 2, 2), "bcc")])
@@ -134,7 +161,9 @@ def test_the_wall_of_a_cavity_is_turned_into_it():
     surface = extract_surface(points, cells, np.delete(np.arange(len(cells)), middle))
     assert_surface_of(surface, points, np.delete(cells, middle, axis=0))
     assert (n_pieces(surface), surface.n_parted) == (2, 0)
-    is_wall = np.isin(surface.points, points[cells[middle]]).all(axis=1)[surface.triangles].all(axis=1)
+    is_wall = (
+        np.isin(surface.points, points[cells[middle]]).all(axis=1)[surface.triangles].all(axis=1)
+    )
     wall = surface._replace(triangles=surface.triangles[is_wall])
     assert volume_and_area(wall)[0] == pytest.approx(-volumes(points, cells)[middle])
 
@@ -163,7 +192,9 @@ def test_cells_that_share_an_edge_or_a_node_come_apart(chosen, shared):
 
 @pytest.mark.parametrize(("cubes", "characteristic", "parted"), [(8, 0, 0), (7, 2, 2)])
 def test_a_ring_that_closes_in_an_edge_alone_opens(cubes, characteristic, parted):
-    """Eight cubes around a hole are a ring. Without one at a corner its two neighbours share an edge, one cube long."""
+    """Eight cubes around a hole are a ring. Without one at a corner its two neighbours share an
+    edge, one cube long.
+    """
     points, cells = grid((3, 3, 1))
     x, y, _ = np.floor(points[cells].mean(axis=1)).T
     is_chosen = ((x != 1) | (y != 1)) & ((x != 0) | (y != 0) | (cubes == 8))
@@ -177,12 +208,20 @@ def edge_star(cells, a, b):
     left = [k for k, cell in enumerate(cells) if a in cell and b in cell]
     star = [left.pop(0)]
     while left:
-        star.append(left.pop(next(i for i, k in enumerate(left) if len(set(cells[k]) & set(cells[star[-1]])) == 3)))
+        star.append(
+            left.pop(
+                next(
+                    i for i, k in enumerate(left) if len(set(cells[k]) & set(cells[star[-1]])) == 3
+                )
+            )
+        )
     return star
 
 
 def test_an_edge_closed_at_both_ends_gets_two_middles():
-    """Two cavities that share an edge become one: at neither end does the surface have several fans."""
+    """Two cavities that share an edge become one: at neither end does the surface have several
+    fans.
+    """
     points, cells = grid((3, 3, 3), "bcc", noise=0.02)
     cell = cells[np.abs(points[cells].mean(axis=1) - points.mean(axis=0)).max(axis=1).argmin()]
     star = edge_star(cells.tolist(), *cell[:2].tolist())
@@ -191,7 +230,11 @@ def test_an_edge_closed_at_both_ends_gets_two_middles():
     assert_surface_of(surface, points, cells[is_chosen])
     outside = len(boundary_facets(cells))
     # Of the cavities' eight facets four are at the edge, each cut from its centroid into four.
-    assert (len(surface.triangles) - outside, surface.n_parted, n_pieces(surface)) == (4 + 4 * 4, 1, 2)
+    assert (len(surface.triangles) - outside, surface.n_parted, n_pieces(surface)) == (
+        4 + 4 * 4,
+        1,
+        2,
+    )
     assert euler(surface) == 4  # two spheres
     assert n_crossings(surface) == 0
 
@@ -228,7 +271,11 @@ def test_the_shift_is_felt_in_float32_and_turns_no_cell():
 # Any set
 
 
-@given(st.integers(0, 2**32 - 1), st.sampled_from(["five-tet", "bcc"]), st.sampled_from([0.1, 0.5, 0.9]))
+@given(
+    st.integers(0, 2**32 - 1),
+    st.sampled_from(["five-tet", "bcc"]),
+    st.sampled_from([0.1, 0.5, 0.9]),
+)
 def test_any_cells_of_a_lattice(seed, kind, fraction):
     points, cells = grid((3, 3, 2), kind, noise=0.05, seed=seed)
     is_chosen = np.random.default_rng(seed).random(len(cells)) < fraction
@@ -242,9 +289,13 @@ def test_any_cells_of_a_lattice(seed, kind, fraction):
 @pytest.mark.parametrize("kind", ["five-tet", "bcc"])
 @pytest.mark.parametrize(("fraction", "seed"), [(0.1, 0), (0.9, 1)])
 def test_parted_sheets_do_not_cross(kind, fraction, seed):
-    """Nor do they in 999 of 1000 places of larger random sets; where fans wind around one another they may."""
+    """Nor do they in 999 of 1000 places of larger random sets; where fans wind around one
+    another they may.
+    """
     points, cells = grid((4, 4, 3), kind, noise=0.05, seed=seed)
-    surface = extract_surface(points, cells, np.random.default_rng(seed).random(len(cells)) < fraction)
+    surface = extract_surface(
+        points, cells, np.random.default_rng(seed).random(len(cells)) < fraction
+    )
     assert surface.n_parted > 8
     assert n_crossings(surface) == 0
 

@@ -1,4 +1,6 @@
-"""Many hostile inputs, each in a forked child of this process, which has everything loaded; outcomes counted."""
+"""Many hostile inputs, each in a forked child of this process, which has everything loaded;
+outcomes counted.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,8 @@ MOST_MEMORY = 3 << 30  # bytes of address space that a command may take beyond t
 LARGEST_FILE = 1 << 28  # bytes that it may write
 MOST_CPU_SECONDS = 10
 MOST_SECONDS = 120  # on a busy machine
-IDLE_SECONDS = 10  # after which a child that has used no more than this fraction of them waits for ever
+# after which a child that has used no more than this fraction of them waits for ever
+IDLE_SECONDS = 10
 IDLE_FRACTION = 0.04
 POLL_SECONDS = 0.002
 
@@ -48,7 +51,9 @@ class Running(NamedTuple):
 
 
 def load_everything() -> None:
-    """Import what any command imports, and link all kernels, without starting a thread that a fork would lose."""
+    """Import what any command imports, and link all kernels, without starting a thread that a
+    fork would lose.
+    """
     modules = [f"tetopt.cli.{module}" for module in app.COMMANDS.values()]
     modules += [f"tetopt.report.{name}" for name in ("exhibit", "explore", "figures")]
     modules += ["tetopt.fem.reference", "tetopt.fem.solution", "tetopt.measure.segmentation"]
@@ -135,7 +140,9 @@ def _is_hanging(child: int, seconds: float) -> bool:
 
 
 class ForkedReader:
-    """In place of the process in which `tetopt.io.apart` reads: forked, so that it need not load the libraries."""
+    """In place of the process in which `tetopt.io.apart` reads: forked, so that it need not load
+    the libraries.
+    """
 
     def __init__(self, *_: Any, **__: Any) -> None:
         job, answer = os.pipe(), os.pipe()
@@ -190,7 +197,11 @@ class Campaign:
         """Run these cases, as far as the time goes; how many were run."""
         begin, waiting = time.monotonic(), list(reversed(numbers))
         while self.running or (waiting and time.monotonic() - begin < max_seconds):
-            while waiting and len(self.running) < self.workers and time.monotonic() - begin < max_seconds:
+            while (
+                waiting
+                and len(self.running) < self.workers
+                and time.monotonic() - begin < max_seconds
+            ):
                 self._start(waiting.pop())
             self._reap()
         return len(numbers) - len(waiting)
@@ -218,9 +229,14 @@ class Campaign:
                 self._count(one, os.waitstatus_to_exitcode(status), is_killed, usage)
         time.sleep(POLL_SECONDS)
 
-    def _count(self, one: Running, code: int, is_killed: bool, usage: resource.struct_rusage) -> None:
+    def _count(
+        self, one: Running, code: int, is_killed: bool, usage: resource.struct_rusage
+    ) -> None:
         log = self.scratch / f"{one.number}.log"
-        texts = [Path(f"{log}.{end}").read_bytes().decode("utf-8", "backslashreplace") for end in ("out", "err")]
+        texts = [
+            Path(f"{log}.{end}").read_bytes().decode("utf-8", "backslashreplace")
+            for end in ("out", "err")
+        ]
         # Not ru_maxrss of its own, which begins at that of the program that has started it.
         own = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
         used = max(usage.ru_maxrss * 1024 - own, 0)
@@ -251,8 +267,10 @@ class Campaign:
             f"outcome: {judged.outcome}: {judged.why}",
             f"input:   {one.case.kind}: {one.case.what}",
             f"command: tetopt {' '.join(shlex.quote(word) for word in one.case.words)}"[:3000],
-            f"again:   PYTHONPATH=.:tests python -m hostile --seed {self.seed} --only {one.number} --show",
-            f"ended:   exit {ending.code} after {ending.seconds:.1f} s, {ending.n_bytes / 1e6:.0f} MB more than before",
+            f"again:   PYTHONPATH=.:tests python -m hostile --seed {self.seed} --only "
+            f"{one.number} --show",
+            f"ended:   exit {ending.code} after {ending.seconds:.1f} s, "
+            f"{ending.n_bytes / 1e6:.0f} MB more than before",
             "",
             *ending.output.splitlines()[-5:],
             *ending.errors.splitlines()[-25:],
@@ -263,7 +281,11 @@ class Campaign:
 
     def table(self) -> list[str]:
         """Outcomes by kind of input, in Markdown."""
-        shown = [outcome for outcome in (*GOOD, *BAD) if any(self.counts[kind, outcome] for kind in KINDS)]
+        shown = [
+            outcome
+            for outcome in (*GOOD, *BAD)
+            if any(self.counts[kind, outcome] for kind in KINDS)
+        ]
         rows = [f"| input | {' | '.join(shown)} |", f"|---|{'---:|' * len(shown)}"]
         rows += [
             f"| {kind} | {' | '.join(str(self.counts[kind, outcome] or '') for outcome in shown)} |"
@@ -283,12 +305,19 @@ def main() -> int:
     """Run a campaign from the command line; the exit code is 1 if any case ended badly."""
     parser = argparse.ArgumentParser(prog="python -m hostile", description=__doc__)
     parser.add_argument("--inputs", type=int, default=200, help="how many")
-    parser.add_argument("--seed", type=int, default=int(os.environ.get("HOSTILE_SEED", "1")), help="also HOSTILE_SEED")
+    parser.add_argument(
+        "--seed",
+        type=int,
+        default=int(os.environ.get("HOSTILE_SEED", "1")),
+        help="also HOSTILE_SEED",
+    )
     parser.add_argument("--only", type=int, nargs="*", help="these numbers alone")
     parser.add_argument("--kind", choices=list(KINDS), help="of this kind alone")
     parser.add_argument("--first", type=int, default=0, help="the first number")
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--max-seconds", type=float, default=1e9, help="start no more after this time")
+    parser.add_argument(
+        "--max-seconds", type=float, default=1e9, help="start no more after this time"
+    )
     parser.add_argument(
         "--failures",
         type=Path,
@@ -303,12 +332,22 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="hostile-") as scratch:
         campaign = Campaign(chosen.seed, chosen.workers, Path(scratch), chosen.failures)
         if (numbers := chosen.only) is None:
-            cases = (case_of(campaign.seeds, chosen.seed, number) for number in itertools.count(chosen.first))
-            own = (number for number, case in enumerate(cases, chosen.first) if chosen.kind in (None, case.kind))
+            cases = (
+                case_of(campaign.seeds, chosen.seed, number)
+                for number in itertools.count(chosen.first)
+            )
+            own = (
+                number
+                for number, case in enumerate(cases, chosen.first)
+                if chosen.kind in (None, case.kind)
+            )
             numbers = list(itertools.islice(own, chosen.inputs))
         count = campaign.run(numbers, chosen.max_seconds)
     print("\n".join(campaign.table()))
-    print(f"\n{count} inputs of seed {chosen.seed} in {time.monotonic() - begin:.0f} s, {campaign.n_bad} ended badly")
+    print(
+        f"\n{count} inputs of seed {chosen.seed} in {time.monotonic() - begin:.0f} s, "
+        f"{campaign.n_bad} ended badly"
+    )
     for reason, times in campaign.reasons.most_common():
         print(f"{times:5d} x {page_words(reason)[:180]}")
     if campaign.reasons:
@@ -317,8 +356,17 @@ def main() -> int:
         for report in sorted(chosen.failures.glob("*.txt")):
             print(report.read_text(encoding="utf-8"))
     if chosen.json is not None:
-        table = [[kind, outcome, times] for (kind, outcome), times in sorted(campaign.counts.items())]
+        table = [
+            [kind, outcome, times] for (kind, outcome), times in sorted(campaign.counts.items())
+        ]
         chosen.json.write_text(
-            json.dumps({"inputs": count, "bad": campaign.n_bad, "counts": table, "reasons": campaign.reasons})
+            json.dumps(
+                {
+                    "inputs": count,
+                    "bad": campaign.n_bad,
+                    "counts": table,
+                    "reasons": campaign.reasons,
+                }
+            )
         )
     return 1 if campaign.n_bad else 0

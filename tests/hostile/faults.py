@@ -1,6 +1,8 @@
-"""Each step of writing a file, by number: made to fail once, or to be the last thing that a process does.
+"""Each step of writing a file, by number: made to fail once, or to be the last thing that a process
+does.
 
-As SQLite's tests have it: what happens at step 1, at step 2, and so on, until a run has fewer steps than that.
+As SQLite's tests have it: what happens at step 1, at step 2, and so on, until a run has fewer steps
+than that.
 """
 
 import builtins
@@ -14,14 +16,37 @@ from unittest import mock
 
 import numpy as np
 
-# Of each function of `os` that changes what is in folders, the argument that is a path or an open file.
-STEPS = ("open", "fsync", "replace", "rename", "unlink", "remove", "chmod", "chown", "mkdir", "rmdir")
-ALLOCATIONS = ("empty", "zeros", "ones", "full", "empty_like", "zeros_like", "arange", "concatenate", "column_stack")
+# Of each function of `os` that changes what is in folders, the argument that is a path or an open
+# file.
+STEPS = (
+    "open",
+    "fsync",
+    "replace",
+    "rename",
+    "unlink",
+    "remove",
+    "chmod",
+    "chown",
+    "mkdir",
+    "rmdir",
+)
+ALLOCATIONS = (
+    "empty",
+    "zeros",
+    "ones",
+    "full",
+    "empty_like",
+    "zeros_like",
+    "arange",
+    "concatenate",
+    "column_stack",
+)
 FULL_DISK = OSError(errno.ENOSPC, "No space left on device")
 
 
 class Steps:
-    """Counts the steps that touch a folder; before number `at` it calls `act` with the step's name, once.
+    """Counts the steps that touch a folder; before number `at` it calls `act` with the step's name,
+    once.
 
     With `is_half`, a write does half of its work before.
     """
@@ -50,7 +75,11 @@ class Steps:
     def watched(self):
         """Within it the steps count."""
         with contextlib_stack(
-            *(mock.patch.object(os, name, self._of_system(name)) for name in STEPS if hasattr(os, name)),
+            *(
+                mock.patch.object(os, name, self._of_system(name))
+                for name in STEPS
+                if hasattr(os, name)
+            ),
             mock.patch.object(io, "open", self._opening(io.open)),
             mock.patch.object(builtins, "open", self._opening(builtins.open)),
         ):
@@ -61,7 +90,11 @@ class Steps:
 
         def stepped(first, *others, **options):
             if self.is_inside(first):
-                self.step(f"{name} folder" if name in ("open", "fsync") and self._is_folder(first) else name)
+                self.step(
+                    f"{name} folder"
+                    if name in ("open", "fsync") and self._is_folder(first)
+                    else name
+                )
             return real(first, *others, **options)
 
         return stepped
@@ -71,7 +104,9 @@ class Steps:
 
     def _opening(self, real):
         def opened(file, mode="r", *others, **options):
-            is_written = not isinstance(file, int) and set(mode) & set("wax+") and self.is_inside(file)
+            is_written = (
+                not isinstance(file, int) and set(mode) & set("wax+") and self.is_inside(file)
+            )
             if is_written:
                 self.step("open to write")
             stream = real(file, mode, *others, **options)
@@ -114,7 +149,9 @@ class Allocations:
     @contextmanager
     def watched(self):
         """Within it they count."""
-        with contextlib_stack(*(mock.patch.object(np, name, self._counted(name)) for name in ALLOCATIONS)):
+        with contextlib_stack(
+            *(mock.patch.object(np, name, self._counted(name)) for name in ALLOCATIONS)
+        ):
             yield self
 
     def _counted(self, name):
@@ -146,5 +183,7 @@ def contextlib_stack(*patches):
 def left_in(folder):
     """Names of all files under a folder, with their bytes."""
     return {
-        str(path.relative_to(folder)): path.read_bytes() for path in sorted(Path(folder).rglob("*")) if path.is_file()
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(Path(folder).rglob("*"))
+        if path.is_file()
     }

@@ -19,12 +19,21 @@ from hostile.cases import Case
 
 GOOD = ("done", "refused", "requirement violated")
 BAD = (
-    "traceback", "signal", "hang", "memory", "invalid output", "half-written", "stray file", "let in",
-    "refused badly", "wrong exit code",
-)  # fmt: skip
+    "traceback",
+    "signal",
+    "hang",
+    "memory",
+    "invalid output",
+    "half-written",
+    "stray file",
+    "let in",
+    "refused badly",
+    "wrong exit code",
+)
 LONGEST_LINE = 500  # characters of a refusal
 SHORTEST_LINE = 24  # "tetopt: " and less than two words say nothing
-MOST_BYTES = 2_200_000_000  # of memory beyond the libraries: a reader in its own process may take 2 GiB
+# of memory beyond the libraries: a reader in its own process may take 2 GiB
+MOST_BYTES = 2_200_000_000
 OUTSIDE_VOXELS = 1e-3  # of digits that a text leaves out
 MOST_CONDITION = 1e6  # of an affine whose inverse tells where a node is
 # What a library has said itself, past tetopt.
@@ -32,7 +41,8 @@ RAW_TEXT = re.compile(
     r"0x[0-9a-f]{8}|\.cxx|itk::|vtk\w+ \(|Generic Warning|^Warning|^ERROR|\.py:\d+|Traceback|terminate called|libpng|"
     r"TIFF|RuntimeWarning|UserWarning|DeprecationWarning|^WARNING"
 )
-SAID_WRITTEN = re.compile("^written before the error: |is kept", re.MULTILINE)  # outputs before the one that failed
+# outputs before the one that failed
+SAID_WRITTEN = re.compile("^written before the error: |is kept", re.MULTILINE)
 CONTROL = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f]")
 TRACED = re.compile(r'File "[^"]*?(tetopt/[\w/]+\.py)", line (\d+), in (\w+)')
 
@@ -68,7 +78,9 @@ def verdict(case: Case, folder: Path, before: dict[str, tuple], ending: Ending) 
 
 
 def _suffixes(case: Case) -> str:
-    return " ".join(sorted({Path(name.encode("utf-8", "replace").decode()).suffix for name in case.files}))
+    return " ".join(
+        sorted({Path(name.encode("utf-8", "replace").decode()).suffix for name in case.files})
+    )
 
 
 def _verdict(case: Case, folder: Path, before: dict[str, tuple], ending: Ending) -> tuple[str, str]:
@@ -88,7 +100,9 @@ def _verdict(case: Case, folder: Path, before: dict[str, tuple], ending: Ending)
     return _of_files(case, folder, before, ending) or _of_words(case, ending)
 
 
-def _of_files(case: Case, folder: Path, before: dict[str, tuple], ending: Ending) -> tuple[str, str] | None:
+def _of_files(
+    case: Case, folder: Path, before: dict[str, tuple], ending: Ending
+) -> tuple[str, str] | None:
     """What is wrong with the files that are there now, if anything is."""
     after = listing(folder)
     changed = [name for name, stamp in before.items() if after.get(name) != stamp]
@@ -96,7 +110,11 @@ def _of_files(case: Case, folder: Path, before: dict[str, tuple], ending: Ending
         return "stray file", f"changed: {changed[:3]}"
     new = {name for name in after if name not in before}
     outputs = {os.path.normpath(f"cwd/{name}") for name in case.outputs}
-    strays = sorted(name for name in new if not any(name == each or name.startswith(each + "/") for each in outputs))
+    strays = sorted(
+        name
+        for name in new
+        if not any(name == each or name.startswith(each + "/") for each in outputs)
+    )
     if strays:
         return "stray file", f"left behind: {strays[:3]}"
     if ending.code == 2 and new and not SAID_WRITTEN.search(ending.errors):
@@ -121,14 +139,19 @@ def _of_words(case: Case, ending: Ending) -> tuple[str, str]:
     if match := CONTROL.search(text):
         return (
             "refused badly",
-            f"control character {match[0]!r} in {text[max(match.start() - 30, 0) : match.end() + 10]!r}",
+            f"control character {match[0]!r} in "
+            f"{text[max(match.start() - 30, 0) : match.end() + 10]!r}",
         )
     raw = [line for line in lines if RAW_TEXT.search(line) and not line.startswith("tetopt:")]
     if raw:
         return "refused badly", f"raw text: {raw[0][:120]}"
     if ending.code not in (0, 1, 2):
         return "wrong exit code", f"{ending.code}: {_last(ending)[:120]}"
-    mistakes = [line for line in lines if line.startswith("tetopt: ") and not line.startswith("tetopt: warning:")]
+    mistakes = [
+        line
+        for line in lines
+        if line.startswith("tetopt: ") and not line.startswith("tetopt: warning:")
+    ]
     if ending.code == 0:
         return ("done", "") if not mistakes else ("wrong exit code", f"0, but {mistakes[0][:120]}")
     if not mistakes:
@@ -162,10 +185,18 @@ def listing(folder: Path) -> dict[str, tuple]:
     """All files below a folder, with what tells whether they are the same."""
     found = {}
     for root, folders, names in os.walk(folder):
-        for name in [*names, *(each for each in folders if os.path.islink(os.path.join(root, each)))]:
+        for name in [
+            *names,
+            *(each for each in folders if os.path.islink(os.path.join(root, each))),
+        ]:
             path = os.path.join(root, name)
             stamp = os.lstat(path)
-            found[os.path.relpath(path, folder)] = (stamp.st_size, stamp.st_mtime_ns, stamp.st_mode, stamp.st_ino)
+            found[os.path.relpath(path, folder)] = (
+                stamp.st_size,
+                stamp.st_mtime_ns,
+                stamp.st_mode,
+                stamp.st_ino,
+            )
     return found
 
 
@@ -198,11 +229,17 @@ def _problem(path: Path, suffix: str, case: Case) -> str:
         return ""
     if suffix in (".nii", ".nii.gz"):
         image = nibabel.load(path)
-        return "" if np.isfinite(np.asarray(image.dataobj)).all() and np.isfinite(image.affine).all() else "not finite"
+        return (
+            ""
+            if np.isfinite(np.asarray(image.dataobj)).all() and np.isfinite(image.affine).all()
+            else "not finite"
+        )
     if suffix in (".ply", ".stl"):
         surface = trimesh.load(path, process=False)
         sound = (
-            len(surface.faces) and np.isfinite(surface.vertices).all() and surface.faces.max() < len(surface.vertices)
+            len(surface.faces)
+            and np.isfinite(surface.vertices).all()
+            and surface.faces.max() < len(surface.vertices)
         )
         return "" if sound else "no triangles, or nodes that are not finite"
     if suffix == ".vtk" and b"POLYDATA" in data[:400]:  # which meshio does not read
@@ -250,7 +287,9 @@ def _meshio_parts(path: Path, suffix: str) -> tuple[np.ndarray, dict[str, np.nda
 def _medit_parts(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """As `_meshio_parts`, of quadratic cells, which it does not read from this format."""
     tables: dict[str, np.ndarray] = {}
-    lines = iter([line for line in path.read_text().splitlines() if line and not line.startswith("#")])
+    lines = iter(
+        [line for line in path.read_text().splitlines() if line and not line.startswith("#")]
+    )
     for line in lines:
         if line in ("Vertices", "TetrahedraP2"):
             rows = [next(lines).split() for _ in range(int(next(lines)))]
@@ -288,13 +327,16 @@ def cells_problem(points: np.ndarray, cells: np.ndarray) -> str:
 def box_problem(points: np.ndarray, folder: Path, case: Case) -> str:
     """Nodes outside of the box of the NIfTI image that was meshed, if that is what was done."""
     words = case.words
-    is_whole = not any(word.startswith(("--crop", "--slice", "--space", "--volume", "--start")) for word in words)
+    is_whole = not any(
+        word.startswith(("--crop", "--slice", "--space", "--volume", "--start")) for word in words
+    )
     if words[0] != "mesh" or not is_whole or not words[1].endswith((".nii", ".nii.gz")):
         return ""
     near = folder / "cwd" / words[1]  # of what is written above the case's current folder
     image = nibabel.load(near if near.is_file() else folder / words[1])
     matrix, unit = np.array(image.affine, dtype=np.float64), int(image.header["xyzt_units"]) & 7
-    matrix[:3] *= {1: 1000.0, 3: 0.001}.get(unit, 1.0)  # metres and micrometres; others are taken for mm
+    # metres and micrometres; others are taken for mm
+    matrix[:3] *= {1: 1000.0, 3: 0.001}.get(unit, 1.0)
     if len(image.shape) < 3 or np.linalg.cond(matrix[:3, :3]) > MOST_CONDITION:
         return ""
     index = np.linalg.solve(matrix[:3, :3], (points - matrix[:3, 3]).T).T

@@ -1,7 +1,7 @@
 """Processes killed within the window of writing: at each step, and in the middle of each write.
 
-``python -m hostile.kills FOLDER`` prints what each left, as JSON. It runs apart from the tests, whose threads a fork
-would lose.
+``python -m hostile.kills FOLDER`` prints what each left, as JSON. It runs apart from the tests,
+whose threads a fork would lose.
 """
 
 import json
@@ -19,7 +19,9 @@ from tetopt.system.files import checked_output, outputs_of_command, save_json
 MODEL, IMAGE = sample_model(3), sample_image(3)
 WRITERS = {
     "a.json": lambda path, k: save_json(path, {"numbers": [k] * 1000}),
-    "a.vtu": lambda path, k: tetopt.save_mesh(path, MODEL.mesh, {"k": [float(k)] * len(MODEL.mesh.cells)}),
+    "a.vtu": lambda path, k: tetopt.save_mesh(
+        path, MODEL.mesh, {"k": [float(k)] * len(MODEL.mesh.cells)}
+    ),
     "a.inp": lambda path, k: tetopt.save_model(path, MODEL._replace(about={"image": f"image {k}"})),
     "a.nii.gz": lambda path, k: tetopt.save_image(path, tetopt.Image(IMAGE.data + k, IMAGE.affine)),
 }
@@ -69,7 +71,9 @@ def killed(folder, name, case, at):
 
 
 def window(folder, name, case):
-    """All steps of one file: each, what was left, and whether the next run comes to a whole file all the same."""
+    """All steps of one file: each, what was left, and whether the next run comes to a whole file
+    all the same.
+    """
     wholes = []
     for k in (0, 1, 2):
         (folder / f"whole{k}").mkdir(parents=True)
@@ -83,9 +87,13 @@ def window(folder, name, case):
         files = left_in(place)
         hidden = [each for each in files if Path(each).name.startswith(".")]
         seen = {Path(each).name: content for each, content in files.items() if each not in hidden}
-        state = {None: "none", wholes[0]: "old", wholes[1]: "new"}.get(seen.pop(name, None), "damaged")
+        state = {None: "none", wholes[0]: "old", wholes[1]: "new"}.get(
+            seen.pop(name, None), "damaged"
+        )
         written(place / name, 2, True)
-        again = (place / name).read_bytes() == wholes[2] and (case != "through a link" or (place / name).is_symlink())
+        again = (place / name).read_bytes() == wholes[2] and (
+            case != "through a link" or (place / name).is_symlink()
+        )
         rows.append([step, state, len(hidden), sorted(seen), again])
         if step is None:
             return rows
@@ -94,7 +102,11 @@ def window(folder, name, case):
 
 def main(folder):
     """Every file in every case, as JSON."""
-    shown = {f"{name}, {case}": window(folder / name / case, name, case) for name in WRITERS for case in CASES}
+    shown = {
+        f"{name}, {case}": window(folder / name / case, name, case)
+        for name in WRITERS
+        for case in CASES
+    }
     print(json.dumps(shown))
 
 

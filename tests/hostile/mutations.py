@@ -1,6 +1,7 @@
 """What is done to a valid file: mutations that know its format, and some that know none.
 
-Each takes a numpy Generator and the file's bytes, and returns the words for what was done and the bytes.
+Each takes a numpy Generator and the file's bytes, and returns the words for what was done and the
+bytes.
 """
 
 import gzip
@@ -15,30 +16,156 @@ from nibabel.nifti1 import header_dtype as nifti1_dtype
 from nibabel.nifti2 import header_dtype as nifti2_dtype
 
 HOSTILE_NUMBERS = (
-    "0", "-1", "-0", "1", "2", "3", "7", "32767", "65535", "65536", "2147483647", "2147483648", "-2147483648",
+    "0",
+    "-1",
+    "-0",
+    "1",
+    "2",
+    "3",
+    "7",
+    "32767",
+    "65535",
+    "65536",
+    "2147483647",
+    "2147483648",
+    "-2147483648",
     "4294967295",
-    "9223372036854775807", "-9223372036854775808", "18446744073709551615", "18446744073709551616", "1e30", "-1e30",
-    "1e300", "1e308", "1e309", "-1e309", "1e-300", "5e-324", "1e-20", "1e20", "1e6", "0.1", "nan", "-nan", "inf",
+    "9223372036854775807",
+    "-9223372036854775808",
+    "18446744073709551615",
+    "18446744073709551616",
+    "1e30",
+    "-1e30",
+    "1e300",
+    "1e308",
+    "1e309",
+    "-1e309",
+    "1e-300",
+    "5e-324",
+    "1e-20",
+    "1e20",
+    "1e6",
+    "0.1",
+    "nan",
+    "-nan",
+    "inf",
     "-inf",
-    "NaN", "Infinity", "1.5", "1,5", "1e", "0x10", "1_000", "\u0663", "", " ", "abc", "--", "+", "1 2", "9" * 400,
+    "NaN",
+    "Infinity",
+    "1.5",
+    "1,5",
+    "1e",
+    "0x10",
+    "1_000",
+    "\u0663",
+    "",
+    " ",
+    "abc",
+    "--",
+    "+",
+    "1 2",
+    "9" * 400,
     "9" * 5000,
-    "1" + "0" * 20, "-" + "9" * 30, "0." + "0" * 400 + "1", "true", "null", "[]", "{}", "'", '"', "%s%n", "{0}",
+    "1" + "0" * 20,
+    "-" + "9" * 30,
+    "0." + "0" * 400 + "1",
+    "true",
+    "null",
+    "[]",
+    "{}",
+    "'",
+    '"',
+    "%s%n",
+    "{0}",
     "$HOME",
-)  # fmt: skip
+)
 HOSTILE_NAMES = (
-    "[bold]x[/bold]", "[/]", "[link=http://x]y[/link]", "<x>", 'a"b', "a'b", "a&b", "a<b>&amp;", "]]>",
+    "[bold]x[/bold]",
+    "[/]",
+    "[link=http://x]y[/link]",
+    "<x>",
+    'a"b',
+    "a'b",
+    "a&b",
+    "a<b>&amp;",
+    "]]>",
     "--><script>hostile()</script>",
-    "<script>hostile()</script>", "<img src=x onerror=hostile()>", "\x1b[31mred\x1b[0m", "a\x07b", "tab\there",
-    "new\nline", "cr\rlf\r\n",
-    "a\x00b", "\x7f", "\x85", "\u202egnp.exe", "\u200b", "e\u0301", "\U0001f4a3", "*KEYWORD", "*END STEP",
-    "$EndElements", "$HOME",
-    "$(touch PWNED)", "`touch PWNED`", ";touch PWNED", "|touch PWNED", "{{7*7}}", "%s%s%n", "{0.__class__}", "=1+1",
-    "-o", "--help",
-    "../up", "/abs", "a/b", "a\\b", "CON", "nul", ".", "..", "~", "x" * 200, "x" * 5000, " ", "", ",", ":", "a,b",
-    "a:b", "a=b", "*", "#c",
-    "\\", '"', "'", "\ufeff", "\ud800", "None", "nan", "1", "-1", "All", "label_1", "boundary", "interface_1_2",
-)  # fmt: skip
-CONTROLS = ("\x00", "\x01", "\x08", "\x0b", "\x0c", "\x1b[2J", "\x7f", "\x85", "\u2028", "\ufeff", "\r", "\t")
+    "<script>hostile()</script>",
+    "<img src=x onerror=hostile()>",
+    "\x1b[31mred\x1b[0m",
+    "a\x07b",
+    "tab\there",
+    "new\nline",
+    "cr\rlf\r\n",
+    "a\x00b",
+    "\x7f",
+    "\x85",
+    "\u202egnp.exe",
+    "\u200b",
+    "e\u0301",
+    "\U0001f4a3",
+    "*KEYWORD",
+    "*END STEP",
+    "$EndElements",
+    "$HOME",
+    "$(touch PWNED)",
+    "`touch PWNED`",
+    ";touch PWNED",
+    "|touch PWNED",
+    "{{7*7}}",
+    "%s%s%n",
+    "{0.__class__}",
+    "=1+1",
+    "-o",
+    "--help",
+    "../up",
+    "/abs",
+    "a/b",
+    "a\\b",
+    "CON",
+    "nul",
+    ".",
+    "..",
+    "~",
+    "x" * 200,
+    "x" * 5000,
+    " ",
+    "",
+    ",",
+    ":",
+    "a,b",
+    "a:b",
+    "a=b",
+    "*",
+    "#c",
+    "\\",
+    '"',
+    "'",
+    "\ufeff",
+    "\ud800",
+    "None",
+    "nan",
+    "1",
+    "-1",
+    "All",
+    "label_1",
+    "boundary",
+    "interface_1_2",
+)
+CONTROLS = (
+    "\x00",
+    "\x01",
+    "\x08",
+    "\x0b",
+    "\x0c",
+    "\x1b[2J",
+    "\x7f",
+    "\x85",
+    "\u2028",
+    "\ufeff",
+    "\r",
+    "\t",
+)
 OUTSIDE = (
     "../outside.raw",
     "/etc/passwd",
@@ -48,9 +175,12 @@ OUTSIDE = (
     "/dev/zero",
     "/dev/stdin",
 )
-XML_BOMB = "<!DOCTYPE z [" + '<!ENTITY a0 "ha">' + "".join(
-    f'<!ENTITY a{k} "{f"&a{k - 1};" * 10}">' for k in range(1, 12)
-) + "]>"  # fmt: skip
+XML_BOMB = (
+    "<!DOCTYPE z ["
+    + '<!ENTITY a0 "ha">'
+    + "".join(f'<!ENTITY a{k} "{f"&a{k - 1};" * 10}">' for k in range(1, 12))
+    + "]>"
+)
 XML_OUTSIDE = '<!DOCTYPE z [<!ENTITY a11 SYSTEM "file:///etc/passwd">]>'
 
 
@@ -84,12 +214,20 @@ def overwritten(rng, data):
     patch = one_of(
         rng,
         [
-            b"\x00", b"\xff", b"\xff\xff\xff\x7f", b"\x00\x00\x00\x80", b"\xff" * 8, b"\xff" * 7 + b"\x7f",
+            b"\x00",
+            b"\xff",
+            b"\xff\xff\xff\x7f",
+            b"\x00\x00\x00\x80",
+            b"\xff" * 8,
+            b"\xff" * 7 + b"\x7f",
             b"\x7f\xff\xff\xff",
-            struct.pack("<d", np.nan), struct.pack("<d", np.inf), struct.pack("<f", np.nan), struct.pack("<d",
-            1e300), b"\x00" * 64,
+            struct.pack("<d", np.nan),
+            struct.pack("<d", np.inf),
+            struct.pack("<f", np.nan),
+            struct.pack("<d", 1e300),
+            b"\x00" * 64,
         ],
-    )  # fmt: skip
+    )
     at = int(rng.integers(max(len(data) if rng.random() < 0.5 else min(len(data), 400), 1)))
     array[at : at + len(patch)] = patch
     return f"{patch[:8].hex()} at byte {at}", bytes(array)
@@ -114,13 +252,20 @@ def rearranged(rng, data):
 def replaced(rng, data):
     """Something else altogether."""
     choices = {
-        "empty": b"", "one zero byte": b"\0", "a million zeros": bytes(1_000_000), "noise": rng.bytes(3000),
+        "empty": b"",
+        "one zero byte": b"\0",
+        "a million zeros": bytes(1_000_000),
+        "noise": rng.bytes(3000),
         "a line": b"hello\n",
-        "HTML": b"<!DOCTYPE html><html><body>404</body></html>", "gzip of nothing": gzip.compress(b""),
+        "HTML": b"<!DOCTYPE html><html><body>404</body></html>",
+        "gzip of nothing": gzip.compress(b""),
         "ff": b"\xff" * 5000,
-        "UTF-16": "\ufeffhello".encode("utf-16"), "open brackets": b"[" * 100_000, "open tags": b"<a>" * 100_000,
-        "half the file twice": data[: len(data) // 2] * 2, "pickle": b"cos\nsystem\n(S'touch PWNED'\ntR.",
-    }  # fmt: skip
+        "UTF-16": "\ufeffhello".encode("utf-16"),
+        "open brackets": b"[" * 100_000,
+        "open tags": b"<a>" * 100_000,
+        "half the file twice": data[: len(data) // 2] * 2,
+        "pickle": b"cos\nsystem\n(S'touch PWNED'\ntR.",
+    }
     what = one_of(rng, sorted(choices))
     return what, choices[what]
 
@@ -130,7 +275,23 @@ def packed_head(rng, data):
     array, at = bytearray(data), int(rng.integers(min(len(data), 20) or 1))
     size = int(one_of(rng, [1, 1, 2, 4, 8]))
     number = int(
-        one_of(rng, [0, 1, 2, 127, 255, 2**15, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, len(data), 5 * len(data)])
+        one_of(
+            rng,
+            [
+                0,
+                1,
+                2,
+                127,
+                255,
+                2**15,
+                2**31 - 1,
+                2**31,
+                2**32 - 1,
+                2**63 - 1,
+                len(data),
+                5 * len(data),
+            ],
+        )
     )
     array[at : at + size] = (number % 256**size).to_bytes(size, "little")
     return f"{number} in {size} bytes at {at}", bytes(array)
@@ -162,14 +323,58 @@ ANY = (cut, flipped, overwritten, rearranged, replaced)
 def _extreme(rng, dtype):
     """A number that no sane writer has put there."""
     if dtype.kind == "f":
-        values = [0, -1, np.nan, np.inf, -np.inf, 1e-300, 1e300, 1e30, -1e30, 1e-30, 1e-6, 1e6, 5e-324, 1e20, 3.4e38]
+        values = [
+            0,
+            -1,
+            np.nan,
+            np.inf,
+            -np.inf,
+            1e-300,
+            1e300,
+            1e30,
+            -1e30,
+            1e-30,
+            1e-6,
+            1e6,
+            5e-324,
+            1e20,
+            3.4e38,
+        ]
     elif dtype.kind in "iu":
         info = np.iinfo(dtype)
-        values = [0, -1, 1, 2, 3, 7, 8, 16, 64, 255, 1000, 32767, info.max, info.min, info.max // 2, 1 << 20, 1 << 40]
-    else:
-        return one_of(rng, [b"", b"\xff" * 80, b"../outside", b"n+1\0", b"ni1\0", b"\0" * 80, b"\x1b[31m", b"%s%n"])[
-            : dtype.itemsize
+        values = [
+            0,
+            -1,
+            1,
+            2,
+            3,
+            7,
+            8,
+            16,
+            64,
+            255,
+            1000,
+            32767,
+            info.max,
+            info.min,
+            info.max // 2,
+            1 << 20,
+            1 << 40,
         ]
+    else:
+        return one_of(
+            rng,
+            [
+                b"",
+                b"\xff" * 80,
+                b"../outside",
+                b"n+1\0",
+                b"ni1\0",
+                b"\0" * 80,
+                b"\x1b[31m",
+                b"%s%n",
+            ],
+        )[: dtype.itemsize]
     value = one_of(rng, values)
     with np.errstate(all="ignore"):
         if dtype.kind in "iu":
@@ -232,7 +437,9 @@ def mgh(rng, data):
 def affines(rng, data):
     """A NIfTI-1 image somewhere odd: sheared, thin, huge, tiny, nearly flat, or not anywhere."""
     matrix = np.eye(4)
-    how = one_of(rng, ["aspect", "shear", "tiny", "huge", "flat", "far", "nan", "mirror", "zero column"])
+    how = one_of(
+        rng, ["aspect", "shear", "tiny", "huge", "flat", "far", "nan", "mirror", "zero column"]
+    )
     size = float(10.0 ** rng.integers(1, 31))
     axis, other = rng.permutation(3)[:2]
     if how == "aspect":
@@ -263,10 +470,33 @@ def voxels(rng, data):
     image = nibabel.Nifti1Image.from_bytes(data)
     array = np.array(image.dataobj, dtype=np.float64)
     low, high = one_of(
-        rng, [(0, 1e-300), (0, 1e300), (-1e300, 1e300), (1, 1 + 1e-15), (0, 5e-324), (1e15, 1e15 + 1), (0, 1e154),
-        (-1e-160, 1e-160), (0, 1e38)]
-    )  # fmt: skip
-    how = one_of(rng, ["scaled", "one voxel", "nan", "inf", "constant", "half nan", "noise", "checkers", "scaled"])
+        rng,
+        [
+            (0, 1e-300),
+            (0, 1e300),
+            (-1e300, 1e300),
+            (1, 1 + 1e-15),
+            (0, 5e-324),
+            (1e15, 1e15 + 1),
+            (0, 1e154),
+            (-1e-160, 1e-160),
+            (0, 1e38),
+        ],
+    )
+    how = one_of(
+        rng,
+        [
+            "scaled",
+            "one voxel",
+            "nan",
+            "inf",
+            "constant",
+            "half nan",
+            "noise",
+            "checkers",
+            "scaled",
+        ],
+    )
     unit = (array - array.min()) / np.ptp(array)
     if how == "scaled":
         array = low + unit * (high - low) if np.isfinite(high - low) else unit * high
@@ -288,8 +518,24 @@ def voxels(rng, data):
 def shapes(rng, data):
     """A NIfTI-1 image of another, honest shape."""
     image = nibabel.Nifti1Image.from_bytes(data)
-    sizes = one_of(rng, [(1, 1, 1), (1, 12, 12), (12, 12, 1), (2, 2, 2), (1, 1, 400), (3, 3, 300), (12,), (12, 12),
-    (2, 3), (0, 4, 4), (4, 4, 4, 3), (4, 4, 4, 1, 3), (5, 5, 5, 0)])  # fmt: skip
+    sizes = one_of(
+        rng,
+        [
+            (1, 1, 1),
+            (1, 12, 12),
+            (12, 12, 1),
+            (2, 2, 2),
+            (1, 1, 400),
+            (3, 3, 300),
+            (12,),
+            (12, 12),
+            (2, 3),
+            (0, 4, 4),
+            (4, 4, 4, 3),
+            (4, 4, 4, 1, 3),
+            (5, 5, 5, 0),
+        ],
+    )
     array = rng.integers(0, 50, sizes).astype(np.int16)
     return f"shape {sizes}", nibabel.Nifti1Image(array, image.affine).to_bytes()
 
@@ -314,14 +560,30 @@ def dicom(rng, data):
     elif (
         how == "size"
         and (
-            spot := data.find(one_of(rng, [b"\x28\0\x10\0US", b"\x28\0\x11\0US", b"\x28\0\0\x01US", b"\x28\0\x02\0US"]))
+            spot := data.find(
+                one_of(
+                    rng,
+                    [b"\x28\0\x10\0US", b"\x28\0\x11\0US", b"\x28\0\0\x01US", b"\x28\0\x02\0US"],
+                )
+            )
         )
         > 0
     ):
-        array[spot + 8 : spot + 10] = one_of(rng, [b"\0\0", b"\xff\xff", b"\x01\0", b"\xff\x7f", b"\x40\0"])
+        array[spot + 8 : spot + 10] = one_of(
+            rng, [b"\0\0", b"\xff\xff", b"\x01\0", b"\xff\x7f", b"\x40\0"]
+        )
     elif (spot := data.find(one_of(rng, [b"5\\-7\\", b"1\\0\\0\\0\\1\\0", b"2\\2"]))) > 0:
         text = one_of(
-            rng, [b"nan\\nan\\n", b"1e99\\1e9", b"0\\0\\0\\0\\0\\0", b"inf\\", b"a\\b\\c", b"\\\\\\", b"-1\\-1"]
+            rng,
+            [
+                b"nan\\nan\\n",
+                b"1e99\\1e9",
+                b"0\\0\\0\\0\\0\\0",
+                b"inf\\",
+                b"a\\b\\c",
+                b"\\\\\\",
+                b"-1\\-1",
+            ],
         )
         array[spot : spot + len(text)] = text
     return f"DICOM: {how} at {at}", bytes(array)
@@ -337,7 +599,10 @@ def _split_text(data):
 def numbers(rng, data):
     """Some numbers of a text are others."""
     text = _split_text(data)
-    places = [m.span() for m in re.finditer(r"(?<![\w.])[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?(?![\w.])", text[:200_000])]
+    places = [
+        m.span()
+        for m in re.finditer(r"(?<![\w.])[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?(?![\w.])", text[:200_000])
+    ]
     words = []
     for _ in range(int(rng.choice([1, 1, 1, 2, 5])) if places else 0):
         if not places:
@@ -356,9 +621,25 @@ def numbers(rng, data):
 def lines(rng, data):
     """A line is left out, doubled, moved, garbled, or very long."""
     rows = _split_text(data).split("\n")
-    k = int(rng.integers(min(len(rows), 60))) if rng.random() < 0.6 else int(rng.integers(len(rows)))
+    k = (
+        int(rng.integers(min(len(rows), 60)))
+        if rng.random() < 0.6
+        else int(rng.integers(len(rows)))
+    )
     how = one_of(
-        rng, ["left out", "doubled", "last", "garbled", "long", "control", "non-UTF-8", "1000 times", "blank", "first"]
+        rng,
+        [
+            "left out",
+            "doubled",
+            "last",
+            "garbled",
+            "long",
+            "control",
+            "non-UTF-8",
+            "1000 times",
+            "blank",
+            "first",
+        ],
     )
     row = rows[k]
     if how == "left out":
@@ -394,7 +675,11 @@ def words(rng, data):
     a, b = one_of(rng, places[:120] if rng.random() < 0.7 else places)
     other = one_of(rng, places[:120])
     new = text[other[0] : other[1]] if rng.random() < 0.4 else one_of(rng, HOSTILE_NAMES)
-    changed = text[:a].encode("latin-1") + new.encode("utf-8", "surrogatepass") + text[b:].encode("latin-1")
+    changed = (
+        text[:a].encode("latin-1")
+        + new.encode("utf-8", "surrogatepass")
+        + text[b:].encode("latin-1")
+    )
     return f"{text[a:b]!r} is {new[:30]!r}", changed
 
 
@@ -413,7 +698,9 @@ def key_values(rng, data):
     k = one_of(rng, spots)
     mark = "=" if "=" in rows[k] else ":"
     key, _, value = rows[k].partition(mark)
-    how = one_of(rng, ["number", "all numbers", "other", "kind", "left out", "long", "more", "fewer"])
+    how = one_of(
+        rng, ["number", "all numbers", "other", "kind", "left out", "long", "more", "fewer"]
+    )
     parts = value.split()
     if how == "number" and parts:
         parts[int(rng.integers(len(parts)))] = one_of(rng, HOSTILE_NUMBERS)
@@ -453,7 +740,9 @@ def key_values(rng, data):
         value = " ".join(parts[:1])
     if how != "left out":
         rows[k] = f"{key}{mark} {value}"
-    return f"{key.strip()}: {how} {value[:30]!r}", "\n".join(rows).encode("utf-8", "replace") + data[end:]
+    return f"{key.strip()}: {how} {value[:30]!r}", "\n".join(rows).encode(
+        "utf-8", "replace"
+    ) + data[end:]
 
 
 def outside(rng, data):
@@ -510,7 +799,11 @@ def xml(rng, data):
 
 def xml_names(rng, data):
     """The names of fields are hostile, and the file is well-formed: a good reader takes it."""
-    names = [name for name in HOSTILE_NAMES if name and all(c >= " " and not "\ud800" <= c <= "\udfff" for c in name)]
+    names = [
+        name
+        for name in HOSTILE_NAMES
+        if name and all(c >= " " and not "\ud800" <= c <= "\udfff" for c in name)
+    ]
     chosen = []
 
     def renamed(match):
@@ -527,7 +820,9 @@ def xml_names(rng, data):
 
 
 def xml_bomb(rng, data):
-    """Entities that expand to gigabytes, or to a file of the system: to be refused, or left as they are."""
+    """Entities that expand to gigabytes, or to a file of the system: to be refused, or left as
+    they are.
+    """
     doctype = XML_BOMB if rng.random() < 0.5 else XML_OUTSIDE
     head, mark, rest = data.partition(b"<VTKFile")
     spot = rest.find(b'Name="')
@@ -569,7 +864,14 @@ def payload(rng, data):
         at = int(rng.integers(len(data)))
     array = bytearray(data)
     array[at : at + 8] = one_of(
-        rng, [b"\xff" * 8, b"\xff" * 7 + b"\x7f", b"\0" * 8, b"\0\0\0\x80\0\0\0\0", b"\xff\xff\xff\x7f\0\0\0\0"]
+        rng,
+        [
+            b"\xff" * 8,
+            b"\xff" * 7 + b"\x7f",
+            b"\0" * 8,
+            b"\0\0\0\x80\0\0\0\0",
+            b"\xff\xff\xff\x7f\0\0\0\0",
+        ],
     )
     return f"length at {at}", bytes(array)
 
@@ -583,16 +885,52 @@ def toml_value(rng):
     return one_of(
         rng,
         [
-            "0", "-1", "nan", "inf", "-inf", "1e308", "1e400", "1e-320", "true", '""', '"x"', "[]", "[[]]", "{}",
-            big, f"-{big}", f"[{big}]", "0x" + "f" * 5000,
-            "[1, 2]", "[1, 2, 3, 4]", "[1, 2, nan]", "[1e30, 1, 1]", "[1e-30, 1, 1]", "[0, 0, 0]", "1979-05-27",
-            "[" * 3000 + "]" * 3000, "{a=" * 500 + "1" + "}" * 500,
-            '"<script>hostile()</script>"', '"\\u001b[31m"', '"a\\nb"', '"\\u0000"', '"[bold]x[/]"', "[\"a\", 1, 2]",
-            "1e6", "1e-6", "1000000", "2147483648",
-            "0.001", '"../outside"', '"""' + "x" * 10000 + '"""', "[1000, 1000, 1000]", "[24, 24, 1e-9]",
-            "9007199254740993", "1.5",
+            "0",
+            "-1",
+            "nan",
+            "inf",
+            "-inf",
+            "1e308",
+            "1e400",
+            "1e-320",
+            "true",
+            '""',
+            '"x"',
+            "[]",
+            "[[]]",
+            "{}",
+            big,
+            f"-{big}",
+            f"[{big}]",
+            "0x" + "f" * 5000,
+            "[1, 2]",
+            "[1, 2, 3, 4]",
+            "[1, 2, nan]",
+            "[1e30, 1, 1]",
+            "[1e-30, 1, 1]",
+            "[0, 0, 0]",
+            "1979-05-27",
+            "[" * 3000 + "]" * 3000,
+            "{a=" * 500 + "1" + "}" * 500,
+            '"<script>hostile()</script>"',
+            '"\\u001b[31m"',
+            '"a\\nb"',
+            '"\\u0000"',
+            '"[bold]x[/]"',
+            '["a", 1, 2]',
+            "1e6",
+            "1e-6",
+            "1000000",
+            "2147483648",
+            "0.001",
+            '"../outside"',
+            '"""' + "x" * 10000 + '"""',
+            "[1000, 1000, 1000]",
+            "[24, 24, 1e-9]",
+            "9007199254740993",
+            "1.5",
         ],
-    )  # fmt: skip
+    )
 
 
 def toml(rng, data):
@@ -668,7 +1006,8 @@ def damaged_picture(rng, data):
         at = 16 + 4 * int(rng.integers(2))
         array = bytearray(data)
         array[at : at + 4] = one_of(
-            rng, [b"\0\0\0\0", b"\x7f\xff\xff\xff", b"\0\x01\0\0", b"\0\0\x40\0", b"\xff\xff\xff\xff"]
+            rng,
+            [b"\0\0\0\0", b"\x7f\xff\xff\xff", b"\0\x01\0\0", b"\0\0\x40\0", b"\xff\xff\xff\xff"],
         )
         array[29:33] = zlib.crc32(bytes(array[12:29])).to_bytes(4, "big")
         return f"PNG size at {at}", bytes(array)

@@ -1,4 +1,6 @@
-"""The harness seen to fail: in place of the command everything that none may do, each once; prints the outcomes."""
+"""The harness seen to fail: in place of the command everything that none may do, each once;
+prints the outcomes.
+"""
 
 from __future__ import annotations
 
@@ -70,7 +72,10 @@ def spin() -> int:
 DEEDS = {
     "done": (write, "done"),
     "refused": (refuse, "refused"),
-    "requirement violated": (lambda: write() or say("tetopt: out.vtk: 3 cells are flat") or 1, "requirement violated"),
+    "requirement violated": (
+        lambda: write() or say("tetopt: out.vtk: 3 cells are flat") or 1,
+        "requirement violated",
+    ),
     "exception": (lambda: 1 // 0, "traceback"),
     "deep recursion": (lambda: json.loads("[" * 100_000), "traceback"),
     "segmentation fault": (lambda: os.kill(os.getpid(), signal.SIGSEGV), "signal"),
@@ -86,7 +91,10 @@ DEEDS = {
     "not a number": (lambda: write(SOUND.replace(b"0 10 25", b"0 nan 25")), "invalid output"),
     "beyond the box": (lambda: write(SOUND.replace(b"0 10 25", b"0 10 99")), "invalid output"),
     "not XML": (lambda: write(b"<VTKFile><a b='<'/></VTKFile>", "out.vtu"), "invalid output"),
-    "markup": (lambda: write(b"<html><script>hostile()</script></html>", "v.html"), "invalid output"),
+    "markup": (
+        lambda: write(b"<html><script>hostile()</script></html>", "v.html"),
+        "invalid output",
+    ),
     "infinity in JSON": (lambda: write(b'{"E": Infinity}', "o.json"), "invalid output"),
     "refused and written": (lambda: write() or refuse(), "half-written"),
     "temporary file left": (write_in_temporary, "stray file"),
@@ -98,11 +106,17 @@ DEEDS = {
     "two lines": (lambda: refuse() and refuse(), "refused badly"),
     "empty line": (lambda: refuse("tetopt: "), "refused badly"),
     "long line": (lambda: refuse("tetopt: " + "x" * 600), "refused badly"),
-    "library's words": (lambda: say("ERROR: In vtkReader.cxx, line 7") or refuse(), "refused badly"),
-    "control characters": (lambda: refuse("tetopt: \x1b[2Ji.nii: expected voxels"), "refused badly"),
+    "library's words": (
+        lambda: say("ERROR: In vtkReader.cxx, line 7") or refuse(),
+        "refused badly",
+    ),
+    "control characters": (
+        lambda: refuse("tetopt: \x1b[2Ji.nii: expected voxels"),
+        "refused badly",
+    ),
     "nothing written": (lambda: 0, "wrong exit code"),
     "other code": (lambda: 3, "wrong exit code"),
-}  # fmt: skip
+}
 
 
 def main() -> int:
@@ -121,7 +135,8 @@ def main() -> int:
     outcomes = {}
     with tempfile.TemporaryDirectory() as scratch:
         for number, deed in enumerate(deeds):
-            campaign.MOST_CPU_SECONDS = 2 if deed == "spinning" else 60  # a slow machine takes seconds to fill memory
+            # a slow machine takes seconds to fill memory
+            campaign.MOST_CPU_SECONDS = 2 if deed == "spinning" else 60
             one = campaign.Campaign(1, 1, Path(scratch), Path(scratch) / "failures")
             one.run([number], 100.0)
             outcomes[deed] = next(outcome for _, outcome in one.counts)

@@ -1,4 +1,6 @@
-"""Small valid files of every kind that tetopt reads, made here and nowhere copied from; what is mutated."""
+"""Small valid files of every kind that tetopt reads, made here and nowhere copied from; what is
+mutated.
+"""
 
 import contextlib
 import io
@@ -78,7 +80,9 @@ def affine():
 
 
 def write_seeds(folder: Path):
-    """Write all of them into a folder; run in a child, since libraries start threads and tetopt compiles."""
+    """Write all of them into a folder; run in a child, since libraries start threads and tetopt
+    compiles.
+    """
     index = np.indices((VOXELS,) * 3)
     inside = ((index - 5.0) ** 2).sum(axis=0) < 14.0
     data = (20.0 + 60.0 * inside + index[0]).astype(np.int16)
@@ -96,8 +100,14 @@ def write_seeds(folder: Path):
 
 
 def _write_nibabel(folder, data, labels, inside, place):
-    for name, kind in (("i.nii", nibabel.Nifti1Image), ("i2.nii", nibabel.Nifti2Image), ("i.mgz", None)):
-        image = nibabel.MGHImage(data.astype(np.float32), place) if kind is None else kind(data, place)
+    for name, kind in (
+        ("i.nii", nibabel.Nifti1Image),
+        ("i2.nii", nibabel.Nifti2Image),
+        ("i.mgz", None),
+    ):
+        image = (
+            nibabel.MGHImage(data.astype(np.float32), place) if kind is None else kind(data, place)
+        )
         if kind is not None:
             image.header.set_xyzt_units("mm")
         nibabel.save(image, folder / name)
@@ -107,7 +117,9 @@ def _write_nibabel(folder, data, labels, inside, place):
     nibabel.save(nibabel.Nifti1Image(np.stack([data, data + 1], axis=3), place), folder / "i4.nii")
     nibabel.save(nibabel.Nifti1Image(labels, place), folder / "labels.nii")
     nibabel.save(nibabel.Nifti1Image(inside.astype(np.uint8), place), folder / "mask.nii")
-    nibabel.save(nibabel.Nifti1Image(np.full(data.shape, 9.0, np.float32), place), folder / "sizes.nii")
+    nibabel.save(
+        nibabel.Nifti1Image(np.full(data.shape, 9.0, np.float32), place), folder / "sizes.nii"
+    )
 
 
 def _write_itk(folder, data):
@@ -127,10 +139,17 @@ def _write_itk(folder, data):
         plane = SimpleITK.GetImageFromArray(data.T[k])
         plane.SetSpacing(EDGE_MM[:2])
         tags = {
-            "0008|0060": "MR", "0020|000d": "1.2.3", "0020|000e": "1.2.3.4", "0008|0018": f"1.2.3.4.{k + 1}",
-            "0008|0016": "1.2.840.10008.5.1.4.1.1.4", "0020|0013": str(k + 1), "0010|0010": "Nobody",
-            "0020|0032": f"5\\-7\\{11 + 3 * k}", "0020|0037": "1\\0\\0\\0\\1\\0", "0018|0050": "3",
-        }  # fmt: skip
+            "0008|0060": "MR",
+            "0020|000d": "1.2.3",
+            "0020|000e": "1.2.3.4",
+            "0008|0018": f"1.2.3.4.{k + 1}",
+            "0008|0016": "1.2.840.10008.5.1.4.1.1.4",
+            "0020|0013": str(k + 1),
+            "0010|0010": "Nobody",
+            "0020|0032": f"5\\-7\\{11 + 3 * k}",
+            "0020|0037": "1\\0\\0\\0\\1\\0",
+            "0018|0050": "3",
+        }
         for tag, value in tags.items():
             plane.SetMetaData(tag, value)
         writer.SetFileName(str(folder / f"s{k}.dcm"))
@@ -138,46 +157,85 @@ def _write_itk(folder, data):
 
 
 def _write_zarr(folder, data, place):
-    """Arrays by themselves, of both formats and each packer, in two chunks; and an OME-Zarr image by tetopt."""
+    """Arrays by themselves, of both formats and each packer, in two chunks; and an OME-Zarr
+    image by tetopt.
+    """
     import numcodecs
     import zarr
     from zarr import codecs
 
     of_format_2 = {
-        "blosc": numcodecs.Blosc("lz4", 5, numcodecs.Blosc.SHUFFLE), "bits": numcodecs.Blosc("zstd", 1, 2),
-        "zstd": numcodecs.Zstd(), "lz4": numcodecs.LZ4(), "zlib": numcodecs.Zlib(), "gzip": numcodecs.GZip(),
-        "bz2": numcodecs.BZ2(), "lzma": numcodecs.LZMA(), "bare": None,
-    }  # fmt: skip
+        "blosc": numcodecs.Blosc("lz4", 5, numcodecs.Blosc.SHUFFLE),
+        "bits": numcodecs.Blosc("zstd", 1, 2),
+        "zstd": numcodecs.Zstd(),
+        "lz4": numcodecs.LZ4(),
+        "zlib": numcodecs.Zlib(),
+        "gzip": numcodecs.GZip(),
+        "bz2": numcodecs.BZ2(),
+        "lzma": numcodecs.LZMA(),
+        "bare": None,
+    }
     of_format_3 = {
-        "blosc": codecs.BloscCodec(typesize=2, cname="zstd", shuffle="bitshuffle"), "zstd": codecs.ZstdCodec(),
-        "gzip": codecs.GzipCodec(), "shards": codecs.BloscCodec(typesize=2),
-    }  # fmt: skip
+        "blosc": codecs.BloscCodec(typesize=2, cname="zstd", shuffle="bitshuffle"),
+        "zstd": codecs.ZstdCodec(),
+        "gzip": codecs.GzipCodec(),
+        "shards": codecs.BloscCodec(typesize=2),
+    }
     half = (data.shape[0] // 2, *data.shape[1:])
     for number, packers in ((2, of_format_2), (3, of_format_3)):
         for name, packer in packers.items():
             array = zarr.create_array(
-                folder / f"{name}{number}.zarr", shape=data.shape, dtype=data.dtype, zarr_format=number,
-                chunks=(half[0] // 2, *half[1:]) if name == "shards" else half, compressors=packer,
-                shards=half if name == "shards" else None, attributes={"affine": place.tolist()},
-            )  # fmt: skip
+                folder / f"{name}{number}.zarr",
+                shape=data.shape,
+                dtype=data.dtype,
+                zarr_format=number,
+                chunks=(half[0] // 2, *half[1:]) if name == "shards" else half,
+                compressors=packer,
+                shards=half if name == "shards" else None,
+                attributes={"affine": place.tolist()},
+            )
             array[...] = data
     tetopt.save_image(folder / "ome.zarr", tetopt.Image(data, place))
 
 
 def _write_meshes():
     """By tetopt itself, and again by meshio and VTK in other encodings."""
-    base = ["mesh", "i.nii", "--nodes", "50", "--iterations", "2", "--labels", "labels.nii", "--label-names", "lut.txt"]
-    loads = ["--young", "1+0.1*h", "--load", "hold:superior", "--load", "pressure:inferior:0.1", "--bins", "4"]
+    base = [
+        "mesh",
+        "i.nii",
+        "--nodes",
+        "50",
+        "--iterations",
+        "2",
+        "--labels",
+        "labels.nii",
+        "--label-names",
+        "lut.txt",
+    ]
+    loads = [
+        "--young",
+        "1+0.1*h",
+        "--load",
+        "hold:superior",
+        "--load",
+        "pressure:inferior:0.1",
+        "--bins",
+        "4",
+    ]
     _tetopt(*base, *loads, "-o", "m.vtu", "--json", "m.json")
     for name in ("m.vtk", "m.msh", "m.msh2", "m.inp"):
         _tetopt("convert", "m.vtu", name)
     for name in ("q.vtu", "q.msh"):
         _tetopt("convert", "m.vtu", name, "--order", "2")
     _tetopt("fem", "m.vtu", "-o", "solved.vtu")
-    _tetopt("mesh", "i.nii", "--slice", "k=5", "--nodes", "40", "--iterations", "1", "-o", "flat.vtu")
+    _tetopt(
+        "mesh", "i.nii", "--slice", "k=5", "--nodes", "40", "--iterations", "1", "-o", "flat.vtu"
+    )
     mesh = meshio.read("m.vtu")
     bare = meshio.Mesh(
-        mesh.points, mesh.cells, cell_data={"mean": mesh.cell_data["mean"], "label": mesh.cell_data["label"]}
+        mesh.points,
+        mesh.cells,
+        cell_data={"mean": mesh.cell_data["mean"], "label": mesh.cell_data["label"]},
     )
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
         meshio.vtu.write("ascii.vtu", bare, binary=False)
@@ -199,7 +257,9 @@ def _tetopt(*words):
     with contextlib.redirect_stdout(None):
         code = main(list(words))
     if code != 0:
-        raise SystemExit(f"the harness's own seed could not be made: exit {code} of tetopt {' '.join(words)}")
+        raise SystemExit(
+            f"the harness's own seed could not be made: exit {code} of tetopt {' '.join(words)}"
+        )
 
 
 def frd_of(mesh):
@@ -224,9 +284,16 @@ def frd_of(mesh):
 
 def load_seeds(folder: Path) -> Seeds:
     """What `write_seeds` has left."""
-    files = {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+    files = {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
     packer = zlib.compressobj(9, zlib.DEFLATED, 31)
-    member = b"".join(packer.compress(bytes(1 << 20)) for _ in range(MEMBER_BYTES >> 20)) + packer.flush()
+    member = (
+        b"".join(packer.compress(bytes(1 << 20)) for _ in range(MEMBER_BYTES >> 20))
+        + packer.flush()
+    )
     return Seeds(files, member * N_MEMBERS)
 
 

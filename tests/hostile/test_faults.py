@@ -1,4 +1,5 @@
-"""Each step of writing made to fail once, by number, until a run passes: old or new file whole, nothing else left.
+"""Each step of writing made to fail once, by number, until a run passes: old or new file whole,
+nothing else left.
 
 With -s the table of what the faults left is printed. `make test-hostile` has all commands.
 """
@@ -24,7 +25,10 @@ import tetopt
 import tetopt.job.meshing
 from tetopt.engine.meshing import Attempt, MeshSearch
 
-pytestmark = [pytest.mark.deep, pytest.mark.skipif(sys.platform != "linux", reason="open files are told by /proc")]
+pytestmark = [
+    pytest.mark.deep,
+    pytest.mark.skipif(sys.platform != "linux", reason="open files are told by /proc"),
+]
 
 ERRORS = {"full": errno.ENOSPC, "refused": errno.EACCES, "broken": errno.EIO}
 MESH = ["mesh", "{in}/a.nii.gz", "--spacing", "8", "--iterations", "1"]
@@ -32,7 +36,16 @@ MESH = ["mesh", "{in}/a.nii.gz", "--spacing", "8", "--iterations", "1"]
 COMMANDS = {
     "mesh, numbers": ([*MESH, "-o", "{out}/a.vtu", "--json", "{out}/a.json"], ["a.vtu", "a.json"]),
     "phantom": (
-        ["phantom", "disc_2d", "--voxel-mm", "8", "-o", "{out}/p.nii.gz", "--labels", "{out}/l.nii.gz"],
+        [
+            "phantom",
+            "disc_2d",
+            "--voxel-mm",
+            "8",
+            "-o",
+            "{out}/p.nii.gz",
+            "--labels",
+            "{out}/l.nii.gz",
+        ],
         ["p.nii.gz", "l.nii.gz"],
     ),
 }
@@ -43,22 +56,43 @@ MORE_COMMANDS = {
         ["a.vtu", "slice.png", "rho.png", "energies.png", "thumbnail.png"],
     ),
     "convert": (
-        ["convert", "{in}/m.vtu", "{out}/c.feb", "--young", "3", "--json", "{out}/c.json"], ["c.feb", "c.json"],
+        ["convert", "{in}/m.vtu", "{out}/c.feb", "--young", "3", "--json", "{out}/c.json"],
+        ["c.feb", "c.json"],
     ),
     "quality": (["quality", "{in}/m.vtu", "--json", "{out}/q.json"], ["q.json"]),
     "segment": (
-        ["segment", "{in}/a.nii.gz", "{in}/m.vtu", "-o", "{out}/s.nii.gz", "--json", "{out}/s.json"],
+        [
+            "segment",
+            "{in}/a.nii.gz",
+            "{in}/m.vtu",
+            "-o",
+            "{out}/s.nii.gz",
+            "--json",
+            "{out}/s.json",
+        ],
         ["s.nii.gz", "s.json"],
     ),
     "surface": (
-        ["surface", "{in}/m.vtu", "--boundary", "-o", "{out}/s.stl", "--json", "{out}/s.json"], ["s.stl", "s.json"],
+        ["surface", "{in}/m.vtu", "--boundary", "-o", "{out}/s.stl", "--json", "{out}/s.json"],
+        ["s.stl", "s.json"],
     ),
     "fem": (
-        ["fem", "{in}/m.vtu", "--young", "3", "--load", "compress:1%", "-o", "{out}/f.vtu", "--json", "{out}/f.json"],
+        [
+            "fem",
+            "{in}/m.vtu",
+            "--young",
+            "3",
+            "--load",
+            "compress:1%",
+            "-o",
+            "{out}/f.vtu",
+            "--json",
+            "{out}/f.json",
+        ],
         ["f.vtu", "f.json"],
     ),
     "view": (["view", "{in}/m.vtu", "--html", "{out}/v.html"], ["v.html"]),
-}  # fmt: skip
+}
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +145,9 @@ def _said(command):
 
 
 def _is_new(name, content, expected):
-    """Whether a file is whole and of a run without faults; of numbers that a clock changes the keys are compared."""
+    """Whether a file is whole and of a run without faults; of numbers that a clock changes the
+    keys are compared.
+    """
     if name.endswith(".json"):
         return list(json.loads(content)) == list(json.loads(expected))
     return content == expected
@@ -123,7 +159,9 @@ def _without_fields(content):
 
 
 def _check_left(out, other, outputs, before, expected, words):
-    """Each output is old, new or not there; besides these there is nothing but a mesh that was kept. What is left."""
+    """Each output is old, new or not there; besides these there is nothing but a mesh that was
+    kept. What is left.
+    """
     states, there = [], left_in(out)
     for name in outputs:
         content = there.pop(name, None)
@@ -135,7 +173,9 @@ def _check_left(out, other, outputs, before, expected, words):
         else:
             if "fields could not be measured" in words:  # it is as told without them
                 content, whole = (_without_fields(each) for each in (content, expected[name]))
-                is_whole = name.endswith(".vtu") and len(tetopt.load_mesh(out / name).mesh.cells) > 100
+                is_whole = (
+                    name.endswith(".vtu") and len(tetopt.load_mesh(out / name).mesh.cells) > 100
+                )
                 assert is_whole or _is_new(name, content, whole), f"{name} is not whole ({words})"
             else:
                 assert _is_new(name, content, expected[name]), f"{name} is not whole ({words})"
@@ -149,7 +189,9 @@ def _check_left(out, other, outputs, before, expected, words):
     return states, kept, hidden
 
 
-def _every_fault(name, command, outputs, inputs, tmp_path, runs, table, kind, is_replacing, steps=slice(1, 1000)):
+def _every_fault(
+    name, command, outputs, inputs, tmp_path, runs, table, kind, is_replacing, steps=slice(1, 1000)
+):
     """One command with each of its steps, or those of a slice, failing once."""
     other = tmp_path / "tmp"
     other.mkdir()
@@ -171,7 +213,9 @@ def _every_fault(name, command, outputs, inputs, tmp_path, runs, table, kind, is
         runs.pop("is_there", None)
         watch = Steps(out, number, fail)
         with watch.watched():
-            code, words = _said([*_filled(command, inputs, out), *(["--force"] if is_replacing else [])])
+            code, words = _said(
+                [*_filled(command, inputs, out), *(["--force"] if is_replacing else [])]
+            )
         states, kept, hidden = _check_left(out, other, outputs, before, expected, words)
         if watch.reached is None:
             assert (code, states, kept, hidden) == (0, ["new"] * len(outputs), [], [])
@@ -189,7 +233,13 @@ def _every_fault(name, command, outputs, inputs, tmp_path, runs, table, kind, is
         if name.startswith("mesh") and "is_there" in runs:
             assert "new" in states[0] or kept, (watch.reached, words)
         left = [*states, *["kept elsewhere"] * len(kept), *["a hidden file"] * len(hidden)]
-        table[name, f"{kind}, {'old files' if is_replacing else 'no files'}", watch.reached, code, ", ".join(left)] += 1
+        table[
+            name,
+            f"{kind}, {'old files' if is_replacing else 'no files'}",
+            watch.reached,
+            code,
+            ", ".join(left),
+        ] += 1
         for path in kept:
             path.unlink()
     raise AssertionError("no end of steps")
@@ -200,7 +250,8 @@ def _every_fault(name, command, outputs, inputs, tmp_path, runs, table, kind, is
 def test_every_step_may_fail(name, is_replacing, inputs, tmp_path, runs, table, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
     command, outputs = COMMANDS[name]
-    # A mesh takes a second: every tenth of its steps, others with old files than without; `make test-hostile` has all.
+    # A mesh takes a second: every tenth of its steps, others with old files than without; `make
+    # test-hostile` has all.
     steps = slice(1 + is_replacing, 1000, 10) if name.startswith("mesh") else slice(1, 1000)
     _every_fault(name, command, outputs, inputs, tmp_path, runs, table, "full", is_replacing, steps)
 
@@ -209,7 +260,9 @@ def test_every_step_may_fail(name, is_replacing, inputs, tmp_path, runs, table, 
 @pytest.mark.parametrize("is_replacing", [False, True])
 @pytest.mark.parametrize("kind", ERRORS)
 @pytest.mark.parametrize("name", [*COMMANDS, *MORE_COMMANDS])
-def test_every_step_of_every_command_may_fail(name, kind, is_replacing, inputs, tmp_path, runs, table, monkeypatch):
+def test_every_step_of_every_command_may_fail(
+    name, kind, is_replacing, inputs, tmp_path, runs, table, monkeypatch
+):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
     command, outputs = (COMMANDS | MORE_COMMANDS)[name]
     _every_fault(name, command, outputs, inputs, tmp_path, runs, table, kind, is_replacing)
@@ -238,8 +291,12 @@ def _every_allocation(name, inputs, tmp_path, runs, table, stride):
             return
         if code == 1:  # a number that could not be measured: the others are written
             assert states[0] == "new"
-            assert re.search("^tetopt: .* could not be (measured|checked): .*Memory", words, re.MULTILINE)
-        elif code == 0:  # of the tiny run that prepares kernels, or of the copy that is kept until the file is written
+            assert re.search(
+                "^tetopt: .* could not be (measured|checked): .*Memory", words, re.MULTILINE
+            )
+        # of the tiny run that prepares kernels, or of the copy that is kept until the file is
+        # written
+        elif code == 0:
             assert states == ["new"] * len(outputs), allocations.reached
         else:
             line = words.strip().splitlines()[-2 if "written before the error" in words else -1]
@@ -247,7 +304,13 @@ def _every_allocation(name, inputs, tmp_path, runs, table, stride):
             assert "emory" in line, (allocations.reached, words)
         if name.startswith("mesh") and "is_there" in runs:
             assert "new" in states[0] or kept, (allocations.reached, words)
-        table[name, "memory", allocations.reached.split(":")[0], code, ", ".join([*states, *["kept"] * len(kept)])] += 1
+        table[
+            name,
+            "memory",
+            allocations.reached.split(":")[0],
+            code,
+            ", ".join([*states, *["kept"] * len(kept)]),
+        ] += 1
         for path in kept:
             path.unlink()
     raise AssertionError("no end of arrays")
@@ -276,7 +339,11 @@ def test_the_harness_sees_a_fault(tmp_path):
         other = tmp_path / "none"
         if content == b"half":
             with pytest.raises(AssertionError, match="not whole"):
-                _check_left(tmp_path, other, ["a.vtu"], {"a.vtu": b"old a.vtu"}, {"a.vtu": b"new"}, "")
+                _check_left(
+                    tmp_path, other, ["a.vtu"], {"a.vtu": b"old a.vtu"}, {"a.vtu": b"new"}, ""
+                )
         else:
-            left = _check_left(tmp_path, other, ["a.vtu"], {"a.vtu": b"old a.vtu"}, {"a.vtu": b"new"}, "")
+            left = _check_left(
+                tmp_path, other, ["a.vtu"], {"a.vtu": b"old a.vtu"}, {"a.vtu": b"new"}, ""
+            )
             assert left == (["old"], [], [".x"])

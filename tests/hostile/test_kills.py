@@ -1,4 +1,6 @@
-"""kill -9 within the window of writing leaves the old file or the new one, whole, and confuses no later run."""
+"""kill -9 within the window of writing leaves the old file or the new one, whole, and confuses
+no later run.
+"""
 
 import json
 import os
@@ -11,16 +13,22 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 
-pytestmark = [pytest.mark.deep, pytest.mark.skipif(sys.platform != "linux", reason="open files are told by /proc")]
+pytestmark = [
+    pytest.mark.deep,
+    pytest.mark.skipif(sys.platform != "linux", reason="open files are told by /proc"),
+]
 
 
 def test_a_killed_process_leaves_a_whole_file(tmp_path):
     """Old or new; and at most one temporary file, of a hidden name."""
     path = os.pathsep.join((str(ROOT), str(ROOT / "tests")))
     done = subprocess.run(
-        [sys.executable, "-m", "hostile.kills", tmp_path], env=os.environ | {"PYTHONPATH": path}, capture_output=True,
-        text=True, check=False,
-    )  # fmt: skip
+        [sys.executable, "-m", "hostile.kills", tmp_path],
+        env=os.environ | {"PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr[-3000:]
     counts = Counter()
     for window, rows in json.loads(done.stdout).items():
@@ -34,7 +42,9 @@ def test_a_killed_process_leaves_a_whole_file(tmp_path):
             assert is_whole_again, where
             counts[step or "none", state, "a hidden file" if n_hidden else ""] += 1
         assert rows[-1][:3] == [None, "new", 0], window
-        assert [row[1] for row in rows] == sorted((row[1] for row in rows), key=["none", "old", "new"].index)
+        assert [row[1] for row in rows] == sorted(
+            (row[1] for row in rows), key=["none", "old", "new"].index
+        )
     print("\n| killed before | file | besides | times |\n|---|---|---|---|")
     for row, times in sorted(counts.items()):
         print(f"| {' | '.join(row)} | {times} |")

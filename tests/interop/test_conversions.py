@@ -16,8 +16,10 @@ from tetopt.geometry.quadratic import quadratic
 from tetopt.geometry.simplex import volumes
 from tetopt.interop.conversions import add_array
 
-VTK_NUMBERS = {2: (pyvista.CellType.TRIANGLE, pyvista.CellType.QUADRATIC_TRIANGLE),
-               3: (pyvista.CellType.TETRA, pyvista.CellType.QUADRATIC_TETRA)}  # fmt: skip
+VTK_NUMBERS = {
+    2: (pyvista.CellType.TRIANGLE, pyvista.CellType.QUADRATIC_TRIANGLE),
+    3: (pyvista.CellType.TETRA, pyvista.CellType.QUADRATIC_TETRA),
+}
 THERE_AND_BACK = {
     "pyvista": lambda mesh: Mesh.from_pyvista(mesh.to_pyvista()),
     "meshio": lambda mesh: Mesh.from_meshio(mesh.to_meshio()),
@@ -45,7 +47,10 @@ def test_there_and_back_is_the_same_mesh(name, n):
 @pytest.mark.parametrize("n", [2, 3])
 def test_data_go_with_the_mesh(n):
     mesh, rng = sample_model(n).mesh, np.random.default_rng(n)
-    on_cells = {"mean": rng.normal(size=len(mesh.cells)), "is_in": rng.random(len(mesh.cells)) < 0.5}
+    on_cells = {
+        "mean": rng.normal(size=len(mesh.cells)),
+        "is_in": rng.random(len(mesh.cells)) < 0.5,
+    }
     on_nodes = {"moved": rng.normal(size=mesh.points.shape), "count": np.arange(len(mesh.points))}
     grid, other = mesh.to_pyvista(on_cells, on_nodes), mesh.to_meshio(on_cells, on_nodes)
     assert (grid.points == in_space(mesh.points)).all()
@@ -57,7 +62,10 @@ def test_data_go_with_the_mesh(n):
     for name, values in on_nodes.items():
         assert (grid.point_data[name] == values).all()
         assert (other.point_data[name] == values).all()
-    assert (grid.cell_data.active_scalars_name, grid.point_data.active_scalars_name) == ("mean", "moved")
+    assert (grid.cell_data.active_scalars_name, grid.point_data.active_scalars_name) == (
+        "mean",
+        "moved",
+    )
     other.points[:] = 0.0  # copies
     grid.points[:] = 0.0
     assert np.ptp(mesh.points) > 0
@@ -67,14 +75,28 @@ def test_data_go_with_the_mesh(n):
 def test_data_that_do_not_fit_are_one_line(convert):
     mesh = sample_model(3).mesh
     ragged = [[1.0, 2.0]] + [[1.0]] * (len(mesh.cells) - 1)
-    for data in ([1.0, 2.0], ["a"] * len(mesh.cells), 3.0, None, ragged, np.zeros((len(mesh.cells), 0))):
-        with pytest.raises(InputError, match=r"^cell_data: 'a\\nb': expected an array of numbers with \d+ rows, got "):
+    for data in (
+        [1.0, 2.0],
+        ["a"] * len(mesh.cells),
+        3.0,
+        None,
+        ragged,
+        np.zeros((len(mesh.cells), 0)),
+    ):
+        with pytest.raises(
+            InputError,
+            match=r"^cell_data: 'a\\nb': expected an array of numbers with \d+ rows, got ",
+        ):
             getattr(mesh, convert)({"a\nb": data})
-    with pytest.raises(InputError, match=r"^point_data: 'u': expected an array of numbers with \d+ rows"):
+    with pytest.raises(
+        InputError, match=r"^point_data: 'u': expected an array of numbers with \d+ rows"
+    ):
         getattr(mesh, convert)(point_data={"u": np.zeros(len(mesh.cells) + 1)})
     with pytest.raises(InputError, match=r"^cell_data: expected strings as names, got 3"):
         getattr(mesh, convert)({3: np.zeros(len(mesh.cells))})
-    with pytest.raises(InputError, match=r"^point_data: expected a dict of arrays by name, got ndarray"):
+    with pytest.raises(
+        InputError, match=r"^point_data: expected a dict of arrays by name, got ndarray"
+    ):
         getattr(mesh, convert)(point_data=np.zeros(len(mesh.points)))
 
 
@@ -110,8 +132,11 @@ def test_inverted_cells_are_turned_and_others_left_out():
     cells[::2] = cells[::2][:, [1, 0, 2, 3]]
     points = np.vstack([np.full((1, 3), 99.0), mesh.points])  # the first is used by none
     blocks = [
-        ("triangle", cells[:3, :3] + 1), ("tetra", cells[:7] + 1), ("vertex", np.array([[0]])), ("tetra", cells[7:] + 1)
-    ]  # fmt: skip
+        ("triangle", cells[:3, :3] + 1),
+        ("tetra", cells[:7] + 1),
+        ("vertex", np.array([[0]])),
+        ("tetra", cells[7:] + 1),
+    ]
     other = meshio.Mesh(points, blocks)
     for back in (Mesh.from_meshio(other), Mesh.from_pyvista(pyvista.from_meshio(other))):
         assert (back.points == mesh.points).all()
@@ -122,7 +147,9 @@ def test_inverted_cells_are_turned_and_others_left_out():
 def test_a_surface_in_the_plane_is_a_mesh():
     sheet = pyvista.Plane(i_resolution=3, j_resolution=2).triangulate()
     assert len(Mesh.from_pyvista(sheet).cells) == 12
-    with pytest.raises(InputError, match="from_pyvista: a triangle mesh must lie in the plane z = 0"):
+    with pytest.raises(
+        InputError, match="from_pyvista: a triangle mesh must lie in the plane z = 0"
+    ):
         Mesh.from_pyvista(pyvista.Sphere())
 
 
@@ -140,14 +167,39 @@ CORNERS = np.vstack([np.zeros(3), np.eye(3), np.ones((6, 3))])
         ("pyvista", "a.vtu", "expected a pyvista or VTK grid, got str"),
         ("pyvista", None, "expected a pyvista or VTK grid, got NoneType"),
         ("meshio", meshio.Mesh(CORNERS, [TETRA, ("hexahedron", [range(8)])]), "found hexahedron"),
-        ("meshio", meshio.Mesh(CORNERS, [TETRA, ("tetra10", [range(10)])]), "found tetra cells of both order 1 and"),
+        (
+            "meshio",
+            meshio.Mesh(CORNERS, [TETRA, ("tetra10", [range(10)])]),
+            "found tetra cells of both order 1 and",
+        ),
         ("meshio", meshio.Mesh(CORNERS, [("line", [[0, 1]])]), "found line"),
         ("meshio", meshio.Mesh(CORNERS, []), "found no cells"),
-        ("meshio", meshio.Mesh(np.eye(3), [("triangle", [[0, 1, 2]])]), "must lie in the plane z = 0"),  # one off it
-        ("meshio", meshio.Mesh(CORNERS, [("tetra", [[0, 1, 2, 44]])]), r"uses? nodes 0\.\.44, but it has 0\.\.9"),
-        ("meshio", meshio.Mesh(CORNERS, [("tetra", [[0.0, 1.0, 2.5, 3.0]])]), "4 integers each, got float64"),
-        ("meshio", meshio.Mesh(CORNERS, [("tetra", [[0, 1, 2]])]), r"tetra cells of 4 integers each, got .*1, 3"),
-        ("meshio", meshio.Mesh(CORNERS, [("tetra10", [range(9)])]), r"tetra10 cells of 10 integers"),
+        # one off it
+        (
+            "meshio",
+            meshio.Mesh(np.eye(3), [("triangle", [[0, 1, 2]])]),
+            "must lie in the plane z = 0",
+        ),
+        (
+            "meshio",
+            meshio.Mesh(CORNERS, [("tetra", [[0, 1, 2, 44]])]),
+            r"uses? nodes 0\.\.44, but it has 0\.\.9",
+        ),
+        (
+            "meshio",
+            meshio.Mesh(CORNERS, [("tetra", [[0.0, 1.0, 2.5, 3.0]])]),
+            "4 integers each, got float64",
+        ),
+        (
+            "meshio",
+            meshio.Mesh(CORNERS, [("tetra", [[0, 1, 2]])]),
+            r"tetra cells of 4 integers each, got .*1, 3",
+        ),
+        (
+            "meshio",
+            meshio.Mesh(CORNERS, [("tetra10", [range(9)])]),
+            r"tetra10 cells of 10 integers",
+        ),
         (
             "meshio",
             meshio.Mesh(np.zeros((10, 4)), [TETRA]),
@@ -159,7 +211,11 @@ CORNERS = np.vstack([np.zeros(3), np.eye(3), np.ones((6, 3))])
         ("meshio", 3, "expected a meshio.Mesh, got int"),
         ("skfem", skfem.MeshQuad(), "expected a scikit-fem MeshTri or MeshTet, got MeshQuad"),
         ("skfem", skfem.MeshLine(), "got MeshLine"),
-        ("skfem", skfem.MeshTet(np.zeros((3, 4)), np.zeros((4, 0), dtype=int)), r"4 integers each.*\(0, 4\)"),
+        (
+            "skfem",
+            skfem.MeshTet(np.zeros((3, 4)), np.zeros((4, 0), dtype=int)),
+            r"4 integers each.*\(0, 4\)",
+        ),
         ("skfem", sample_model(3).mesh, "got Mesh"),
     ],
 )
@@ -190,13 +246,19 @@ def test_the_boundary_in_trimesh():
 )
 def test_a_library_that_is_missing_is_named(monkeypatch, name, package, convert):
     monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(InputError, match=f'{package} is not installed; pip install "{package}[^ ]*"$'):
+    with pytest.raises(
+        InputError, match=f'{package} is not installed; pip install "{package}[^ ]*"$'
+    ):
         convert(sample_model(3).mesh)
 
 
-@pytest.mark.parametrize("model", [sample_model(2), sample_model(3), quadratic_model(2), quadratic_model(3)])
+@pytest.mark.parametrize(
+    "model", [sample_model(2), sample_model(3), quadratic_model(2), quadratic_model(3)]
+)
 def test_a_model_has_its_sets_and_materials_with_it(model, tmp_path):
-    """As a file of ours that is read by the library has them, but sets of cells, which files have in words of ours."""
+    """As a file of ours that is read by the library has them, but sets of cells, which files
+    have in words of ours.
+    """
     tetopt.save_model(tmp_path / "a.vtu", model)
     saved, grid, other = pyvista.read(tmp_path / "a.vtu"), model.to_pyvista(), model.to_meshio()
     assert (grid.points == saved.points).all()
@@ -214,8 +276,13 @@ def test_a_model_has_its_sets_and_materials_with_it(model, tmp_path):
         assert np.flatnonzero(grid.cell_data[f"in_{name}"]).tolist() == members.tolist()
         assert other.cell_sets[name][0].tolist() == members.tolist()
     for name in model.sets.facets:
-        assert other.point_sets[name].tolist() == np.flatnonzero(saved.point_data[f"on_{name}"]).tolist()
-    assert (other.cells[0].data == grid.cells_dict[VTK_NUMBERS[model.mesh.ndim][model.order - 1]]).all()
+        assert (
+            other.point_sets[name].tolist()
+            == np.flatnonzero(saved.point_data[f"on_{name}"]).tolist()
+        )
+    assert (
+        other.cells[0].data == grid.cells_dict[VTK_NUMBERS[model.mesh.ndim][model.order - 1]]
+    ).all()
     assert (Mesh.from_meshio(other).cells == model.mesh.cells).all()
 
 

@@ -48,7 +48,9 @@ def test_a_section_is_grey_by_its_values():
     mesh = tetopt.lattice_mesh(tetopt.Image(np.zeros((8, 8))), blocks=(4, 4))
     where = mesh.points[mesh.cells].mean(axis=1)
     for axis, low, high in ((0, (50, 100), (270, 100)), (1, (100, 270), (100, 50))):
-        picture = picture_in(notebook.section_html(mesh.points, mesh.cells, np.sign(where[:, axis] - 3.5)))
+        picture = picture_in(
+            notebook.section_html(mesh.points, mesh.cells, np.sign(where[:, axis] - 3.5))
+        )
         grey = picture.convert("RGBA")
         assert sum(grey.getpixel(low)[:3]) < sum(grey.getpixel(high)[:3])
 
@@ -56,13 +58,19 @@ def test_a_section_is_grey_by_its_values():
 def test_pictures_are_small_however_many_cells_there_are():
     rng = np.random.default_rng(0)
     mesh = tetopt.lattice_mesh(tetopt.Image(np.zeros((40, 40, 40))), nodes=5000)
-    assert len(notebook.section_html(mesh.points, mesh.cells, rng.normal(size=len(mesh.cells)))) < 60_000
+    assert (
+        len(notebook.section_html(mesh.points, mesh.cells, rng.normal(size=len(mesh.cells))))
+        < 60_000
+    )
     assert len(mesh._repr_html_()) < 60_000
     assert len(tetopt.Image(rng.normal(size=(900, 700)))._repr_html_()) < 200_000
 
 
 def test_values_that_are_no_numbers_are_dark():
-    assert notebook.greys(np.array([np.nan, 0.0, -np.inf, 1.0]))[[0, 2]].tolist() == [notebook.DARKEST_GREY] * 2
+    assert (
+        notebook.greys(np.array([np.nan, 0.0, -np.inf, 1.0]))[[0, 2]].tolist()
+        == [notebook.DARKEST_GREY] * 2
+    )
     assert len(set(notebook.greys(np.full(4, np.nan)).tolist())) == 1
     assert len(set(notebook.greys(np.ones(4)).tolist())) == 1
 
@@ -71,13 +79,19 @@ def test_data_of_any_kind_are_no_reason_for_a_card_to_fail():
     """As another program's file may call them "mean"."""
     model = sample_model(3)
     n_cells = len(model.mesh.cells)
-    for values in (np.arange(n_cells) < 3, np.zeros((n_cells, 3)), np.arange(n_cells, dtype=np.uint64)):
+    for values in (
+        np.arange(n_cells) < 3,
+        np.zeros((n_cells, 3)),
+        np.arange(n_cells, dtype=np.uint64),
+    ):
         assert "<img" in model._replace(materials=None, cell_data={"mean": values})._repr_html_()
 
 
 def test_a_plane_between_two_pieces_has_no_picture():
     points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
-    mesh = tetopt.Mesh(np.vstack([points, points + np.array([0.0, 0.0, 9.0])]), [[0, 1, 2, 3], [4, 5, 6, 7]])
+    mesh = tetopt.Mesh(
+        np.vstack([points, points + np.array([0.0, 0.0, 9.0])]), [[0, 1, 2, 3], [4, 5, 6, 7]]
+    )
     assert "<img" not in mesh._repr_html_()
     assert "<table" in mesh._repr_html_()
 
@@ -100,7 +114,10 @@ def test_a_result_tells_what_is_left_and_what_it_violates(ball):
     assert f"{result.history[-1].E:.4g} of the initial" in card
     assert "violates" not in card
     assert "<b>" not in result._replace(violated={"min_dihedral": "<b>3</b> cells"})._repr_html_()
-    assert "min_dihedral: &lt;b&gt;3" in result._replace(violated={"min_dihedral": "<b>3</b> cells"})._repr_html_()
+    assert (
+        "min_dihedral: &lt;b&gt;3"
+        in result._replace(violated={"min_dihedral": "<b>3</b> cells"})._repr_html_()
+    )
     assert "left within" not in result._replace(fraction=None)._repr_html_()  # of `optimize`
 
 
@@ -120,7 +137,9 @@ def test_models_files_and_qualities_show_what_they_hold(tmp_path):
 
 
 class FakeShell:
-    """What IPython's shell is to `in_kernel`; its display hook is IPython's own in the test of a real kernel."""
+    """What IPython's shell is to `in_kernel`; its display hook is IPython's own in the test of a
+    real kernel.
+    """
 
     kernel = object()
 
@@ -141,13 +160,17 @@ def test_runs_show_a_bar_in_a_notebook_alone(monkeypatch, capsys, ball):
     assert capsys.readouterr() == ("", "")
     ipython = type("IPython", (), {"get_ipython": staticmethod(FakeShell)})
     monkeypatch.setitem(__import__("sys").modules, "IPython", ipython)
-    monkeypatch.setitem(__import__("sys").modules, "IPython.display", type("display", (), {"display": display}))
+    monkeypatch.setitem(
+        __import__("sys").modules, "IPython.display", type("display", (), {"display": display})
+    )
     records = []
     tetopt.optimize(image, result.mesh, iterations=1, callback=records.append)
     assert shown == []
     tetopt.optimize(image, result.mesh, iterations=1)
     assert shown[0] == "tetopt: begins"
-    assert [words.split(",")[0] for words in shown[1:-1]] == [f"tetopt: iteration {k} of 1" for k in (0, 1)]
+    assert [words.split(",")[0] for words in shown[1:-1]] == [
+        f"tetopt: iteration {k} of 1" for k in (0, 1)
+    ]
     assert re.fullmatch(r"tetopt: ended after 1 iterations \(\w+\), E [\d.]+, [\d.]+ s", shown[-1])
     del shown[:]
     tetopt.optimize_paper(image, tetopt.lattice_mesh(image, blocks=(2, 2, 2)), iterations=1)
@@ -161,12 +184,20 @@ def test_a_mesh_is_plotted_off_screen(opengl, tmp_path):
     whole, opened = (mesh.plot(cut=cut, off_screen=True) for cut in (False, True))
     assert whole.shape == opened.shape
     assert (whole != opened).any()
-    by_cells = mesh.plot(mesh.points[mesh.cells].mean(axis=(1, 2)), name="place", screenshot=tmp_path / "a.png")
-    assert (np.asarray(PIL.Image.open(tmp_path / "a.png").convert("RGB")) == by_cells[..., :3]).all()
+    by_cells = mesh.plot(
+        mesh.points[mesh.cells].mean(axis=(1, 2)), name="place", screenshot=tmp_path / "a.png"
+    )
+    assert (
+        np.asarray(PIL.Image.open(tmp_path / "a.png").convert("RGB")) == by_cells[..., :3]
+    ).all()
     assert np.ptp(mesh.plot(mesh.points[:, 0], off_screen=True, cmap="gray", show_edges=False)) > 0
     assert np.ptp(sample_model(2).mesh.plot(off_screen=True)) > 0
     result = MeshingResult(
-        mesh, [], "iterations", mesh, labels=(mesh.points[mesh.cells].mean(axis=(1, 2)) > 40.0).astype(int)
+        mesh,
+        [],
+        "iterations",
+        mesh,
+        labels=(mesh.points[mesh.cells].mean(axis=(1, 2)) > 40.0).astype(int),
     )
     shown = result.plot(off_screen=True, show_edges=False, lighting=False).reshape(-1, 3)
     for colour in label_colours(np.unique(result.labels)):  # as in other pictures
@@ -183,14 +214,17 @@ def test_a_mesh_is_plotted_off_screen(opengl, tmp_path):
 
 @pytest.mark.slow
 def test_in_a_real_kernel():
-    """A cell shows a card, a bar that ends, and a static picture without trame; nothing is printed."""
+    """A cell shows a card, a bar that ends, and a static picture without trame; nothing is
+    printed.
+    """
     nbformat = pytest.importorskip("nbformat")
     nbclient = pytest.importorskip("nbclient")
     pytest.importorskip("ipykernel")
     program = (
         "import numpy as np, tetopt\n"
         "image = tetopt.Image(np.random.default_rng(0).normal(size=(6, 7)))\n"
-        "result = tetopt.optimize(image, tetopt.lattice_mesh(image, blocks=(3, 3)), iterations=2)\nresult"
+        "result = tetopt.optimize(image, tetopt.lattice_mesh(image, blocks=(3, 3)), "
+        "iterations=2)\nresult"
     )
     book = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(program)])
     nbclient.NotebookClient(book, timeout=300, kernel_name="python3").execute()

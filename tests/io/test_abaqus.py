@@ -1,4 +1,6 @@
-"""Abaqus input files: read back by meshio, and by a parser of the manual's rules where meshio skips."""
+"""Abaqus input files: read back by meshio, and by a parser of the manual's rules where meshio
+skips.
+"""
 
 import io
 import re
@@ -41,7 +43,9 @@ def read_by_meshio(raw):
 
 
 def blocks_of(raw):
-    """(keyword, parameters, data lines split at commas) of each keyword, by the manual's syntax rules."""
+    """(keyword, parameters, data lines split at commas) of each keyword, by the manual's syntax
+    rules.
+    """
     blocks = []
     for line in raw.decode().splitlines():
         if line.startswith("**"):
@@ -57,7 +61,11 @@ def blocks_of(raw):
 
 def named(raw, keyword):
     """Data lines of each block of a keyword, by the value of its first parameter."""
-    return {next(iter(parameters.values())): data for word, parameters, data in blocks_of(raw) if word == keyword}
+    return {
+        next(iter(parameters.values())): data
+        for word, parameters, data in blocks_of(raw)
+        if word == keyword
+    }
 
 
 def test_meshio_reads_points_and_cells_back(model):
@@ -73,7 +81,9 @@ def test_meshio_reads_points_and_cells_back(model):
     assert block.type == "tetra10"
     assert block.data.shape == (n_cells, 10)
     ends = file.points[block.data[:, np.array(MIDPOINTS) - 1]]
-    np.testing.assert_allclose(file.points[block.data[:, 4:]], ends.mean(axis=2), rtol=1e-15, atol=1e-17)
+    np.testing.assert_allclose(
+        file.points[block.data[:, 4:]], ends.mean(axis=2), rtol=1e-15, atol=1e-17
+    )
     assert len(np.unique(block.data)) == len(file.points)
     assert len(np.unique(file.points, axis=0)) == len(file.points)
 
@@ -87,10 +97,15 @@ def test_meshio_reads_node_and_cell_sets_back(model):
         is_corner = nodes < len(model.mesh.points)
         np.testing.assert_array_equal(nodes[is_corner], nodes_of(model.mesh, rows))
         corners = np.sort(facet_triples(model.mesh.cells, rows), axis=1)
-        edges = np.unique(np.concatenate([corners[:, pair] for pair in ([0, 1], [1, 2], [0, 2])]), axis=0)
+        edges = np.unique(
+            np.concatenate([corners[:, pair] for pair in ([0, 1], [1, 2], [0, 2])]), axis=0
+        )
         middles = model.mesh.points[edges].mean(axis=1) if model.order == 2 else np.empty((0, 3))
         np.testing.assert_allclose(
-            np.unique(file.points[nodes[~is_corner]], axis=0), np.unique(middles, axis=0), rtol=1e-15, atol=1e-17
+            np.unique(file.points[nodes[~is_corner]], axis=0),
+            np.unique(middles, axis=0),
+            rtol=1e-15,
+            atol=1e-17,
         )
     own = {"all_cells", *named_materials(model)} - set(model.sets.cells)
     assert [name for name in file.cell_sets if name not in own] == list(model.sets.cells)
@@ -102,7 +117,10 @@ def test_surfaces_are_the_facets_by_the_manual_s_faces(model):
     surfaces = named(abaqus(model), "*SURFACE")
     assert list(surfaces) == list(model.sets.facets)
     for name, rows in model.sets.facets.items():
-        nodes = [[model.mesh.cells[int(cell) - 1][k - 1] for k in FACES[face]] for cell, face in surfaces[name]]
+        nodes = [
+            [model.mesh.cells[int(cell) - 1][k - 1] for k in FACES[face]]
+            for cell, face in surfaces[name]
+        ]
         np.testing.assert_array_equal([int(cell) - 1 for cell, _ in surfaces[name]], rows[:, 0])
         # Faces are listed as seen from outside, clockwise: the same nodes, turned the other way.
         expected = facet_triples(model.mesh.cells, rows)
@@ -114,7 +132,11 @@ def test_each_cell_has_its_material_and_no_other(model):
     raw = abaqus(model)
     elements, sections = named(raw, "*ELSET"), named(raw, "*SOLID SECTION")
     words = blocks_of(raw)
-    elastic = {words[k - 1][1]["NAME"]: data for k, (word, _, data) in enumerate(words) if word == "*ELASTIC"}
+    elastic = {
+        words[k - 1][1]["NAME"]: data
+        for k, (word, _, data) in enumerate(words)
+        if word == "*ELASTIC"
+    }
     assert list(elastic) == list(sections) == named_materials(model)
     links = [parameters for word, parameters, _ in words if word == "*SOLID SECTION"]
     assert all(parameters["ELSET"] == parameters["MATERIAL"] for parameters in links)
@@ -138,14 +160,28 @@ def test_the_step_holds_and_moves_all_three_components():
     words = blocks_of(abaqus(moved))
     order = [word for word, _, _ in words]
     assert order[order.index("*STEP") :] == [
-        *("*STEP", "*STATIC", "*BOUNDARY", "*NODE FILE", "*EL FILE", "*EL PRINT", "*NODE PRINT", "*NODE PRINT"),
+        *(
+            "*STEP",
+            "*STATIC",
+            "*BOUNDARY",
+            "*NODE FILE",
+            "*EL FILE",
+            "*EL PRINT",
+            "*NODE PRINT",
+            "*NODE PRINT",
+        ),
         "*END STEP",
     ]
     (conditions,) = (data for word, _, data in words if word == "*BOUNDARY")
     expected = [["superior", d, d, "0.0"] for d in "123"]
-    expected += [["inferior", d, d, value] for d, value in zip("123", ("0.5", "-0.25", "1.0"), strict=True)]
+    expected += [
+        ["inferior", d, d, value] for d, value in zip("123", ("0.5", "-0.25", "1.0"), strict=True)
+    ]
     assert conditions == expected
-    assert [parameters["NSET"] for word, parameters, _ in words if word == "*NODE PRINT"] == ["superior", "inferior"]
+    assert [parameters["NSET"] for word, parameters, _ in words if word == "*NODE PRINT"] == [
+        "superior",
+        "inferior",
+    ]
 
 
 def test_without_loads_no_step_and_without_materials_no_sections():
@@ -163,14 +199,22 @@ def test_head_states_coordinates_units_and_image():
     start = lines.index("*HEADING")
     assert all(line.startswith("** ") and len(line) <= 256 for line in lines[:start])
     head = "".join(line[2:] for line in lines[:start])
-    for text in ("LPS+, mm", "mm, MPa, N, mJ, t, s", "Kopf *STEP ü & <more>", "ab" * 32, ", ".join(model.cell_data)):
+    for text in (
+        "LPS+, mm",
+        "mm, MPa, N, mJ, t, s",
+        "Kopf *STEP ü & <more>",
+        "ab" * 32,
+        ", ".join(model.cell_data),
+    ):
         assert text.replace(" ", "") in head.replace(" ", "")
     assert lines[start + 1] == "tetopt 0.1.0; coordinates: LPS+, mm; units: mm, MPa, N, mJ, t, s"
     assert [line for line in lines[start:] if line.startswith("*STEP")] == ["*STEP"]
 
 
 def test_lines_keep_to_the_manual_s_limits(model):
-    """256 characters a line, 16 entries, names of up to 80, told apart whatever their case; ASCII beside comments."""
+    """256 characters a line, 16 entries, names of up to 80, told apart whatever their case;
+    ASCII beside comments.
+    """
     raw = abaqus(model)
     assert raw.endswith(b"\n")
     assert max(map(len, raw.splitlines())) <= 256
@@ -181,7 +225,9 @@ def test_lines_keep_to_the_manual_s_limits(model):
         if word == "*HEADING":
             continue
         names.update(
-            (word, key, value.lower()) for key, value in parameters.items() if key in ("NSET", "ELSET", "NAME")
+            (word, key, value.lower())
+            for key, value in parameters.items()
+            if key in ("NSET", "ELSET", "NAME")
         )
         assert all(re.fullmatch(r"[A-Za-z0-9_.+-]{1,80}", text) for line in data for text in line)
         numbers = [text for line in data for text in line if re.match(r"[-0-9]", text)]
@@ -189,7 +235,13 @@ def test_lines_keep_to_the_manual_s_limits(model):
     assert max(names.values()) == 1
 
 
-AWKWARD = [-1.2345678901234567e-05, -1.23456789012345e-05, -0.012345678901234567, -1.2345678901234567e-101, -1.5e17 / 7]
+AWKWARD = [
+    -1.2345678901234567e-05,
+    -1.23456789012345e-05,
+    -0.012345678901234567,
+    -1.2345678901234567e-101,
+    -1.5e17 / 7,
+]
 
 
 @pytest.mark.parametrize("value", AWKWARD)
@@ -199,9 +251,17 @@ def test_numbers_of_more_than_twenty_characters_are_rounded_to_fit(value):
     mesh = Mesh(np.array([[value, 0, 0], [size, 0, 0], [0, size, 0], [0, 0, size]]), [[0, 1, 2, 3]])
     side = np.array([[0, 3]])
     loads = (Load("displacement", "side", np.full(3, value)),)
-    model = Model(mesh, {}, Sets({"side": side}, {}), materials(-11.0 * value, 1.0 / 30.0, 1), loads)
+    model = Model(
+        mesh, {}, Sets({"side": side}, {}), materials(-11.0 * value, 1.0 / 30.0, 1), loads
+    )
     raw = abaqus(model)
-    written = {text for word, _, data in blocks_of(raw) if word != "*HEADING" for line in data for text in line}
+    written = {
+        text
+        for word, _, data in blocks_of(raw)
+        if word != "*HEADING"
+        for line in data
+        for text in line
+    }
     assert max(map(len, written)) <= 20
     np.testing.assert_allclose(read_by_meshio(raw).points, mesh.points, rtol=5e-13, atol=0.0)
     ((young, nu),) = next(data for word, _, data in blocks_of(raw) if word == "*ELASTIC")
@@ -224,7 +284,12 @@ def test_what_the_format_cannot_carry_is_refused():
 
 
 def test_each_load_has_its_card_and_steps_begin_anew():
-    words = ["hold:superior", "1/pressure:inferior:0.5", "1/gravity:0,0,-9810", "2/traction:inferior:0,0,2"]
+    words = [
+        "hold:superior",
+        "1/pressure:inferior:0.5",
+        "1/gravity:0,0,-9810",
+        "2/traction:inferior:0,0,2",
+    ]
     model = loaded_model([*words, "spring:left:3"])
     blocks = blocks_of(abaqus(model))
     steps = [k for k, (word, _, _) in enumerate(blocks) if word == "*STEP"]
@@ -242,14 +307,19 @@ def test_each_load_has_its_card_and_steps_begin_anew():
     assert weight == ["all_cells", "GRAV", "9810.0", "0.0", "0.0", "-1.0"]
     nodes, forces = facet_forces(model.mesh, model.sets, model.loads[3])
     assert [(int(node) - 1, dof, float(force)) for node, dof, force in data[1]["*CLOAD"]] == [
-        (node, "3", force) for node, force in zip(nodes.tolist(), forces[:, 2].tolist(), strict=True)
+        (node, "3", force)
+        for node, force in zip(nodes.tolist(), forces[:, 2].tolist(), strict=True)
     ]
     springs = [lines for word, _, lines in blocks if word == "*SPRING"]
     nodes, stiffness = spring_constants(model.mesh, model.sets, model.loads[4])
     assert [line[0][0] for line in springs] == ["1", "2", "3"] * len(nodes)
     assert [float(line[1][0]) for line in springs] == np.repeat(stiffness, 3).tolist()
-    numbers = [int(lines[0][0]) for _, parameters, lines in blocks if parameters.get("TYPE") == "SPRING1"]
-    assert numbers == list(range(len(model.mesh.cells) + 1, len(model.mesh.cells) + 1 + 3 * len(nodes)))
+    numbers = [
+        int(lines[0][0]) for _, parameters, lines in blocks if parameters.get("TYPE") == "SPRING1"
+    ]
+    assert numbers == list(
+        range(len(model.mesh.cells) + 1, len(model.mesh.cells) + 1 + 3 * len(nodes))
+    )
     assert {lines[0][0] for word, _, lines in blocks if word == "*DENSITY"} == {"1e-06", "1.5e-06"}
 
 
@@ -257,7 +327,9 @@ def test_forces_on_one_node_add_up():
     """Those of two sets that share an edge."""
     model = loaded_model(["hold:superior", "traction:inferior:0,0,2", "traction:left:0,0,3"])
     (card,) = (lines for word, _, lines in blocks_of(abaqus(model)) if word == "*CLOAD")
-    total = sum(facet_forces(model.mesh, model.sets, load)[1][:, 2].sum() for load in model.loads[1:])
+    total = sum(
+        facet_forces(model.mesh, model.sets, load)[1][:, 2].sum() for load in model.loads[1:]
+    )
     assert sum(float(force) for _, _, force in card) == pytest.approx(total, rel=1e-12)
     assert len({node for node, _, _ in card}) == len(card)
 
@@ -278,7 +350,11 @@ def test_a_modulus_that_varies_is_one_that_depends_on_the_temperature(order):
     blocks = blocks_of(abaqus(model))
     tables = [np.array(lines, dtype=float) for word, _, lines in blocks if word == "*ELASTIC"]
     assert len(tables) == 2  # of one ratio and density each
-    (degrees,) = (np.array(lines, dtype=float)[:, 1] for word, _, lines in blocks if word == "*INITIAL CONDITIONS")
+    (degrees,) = (
+        np.array(lines, dtype=float)[:, 1]
+        for word, _, lines in blocks
+        if word == "*INITIAL CONDITIONS"
+    )
     for table in tables:
         young = np.interp(degrees, table[:, 2], table[:, 0])
         np.testing.assert_allclose(young[: len(model.node_young)], model.node_young, rtol=1e-14)
@@ -304,7 +380,10 @@ def test_steps_that_a_file_cannot_tell_apart_are_refused():
 def test_sets_are_read_back(model, tmp_path):
     (tmp_path / "a.inp").write_bytes(abaqus(model))
     read = input_sets(tmp_path / "a.inp", model.mesh)
-    assert (list(read.facets), list(read.cells)) == (list(model.sets.facets), list(model.sets.cells))
+    assert (list(read.facets), list(read.cells)) == (
+        list(model.sets.facets),
+        list(model.sets.cells),
+    )
     for kind, others in zip(read, model.sets, strict=True):
         for name, members in kind.items():
             np.testing.assert_array_equal(members, others[name])

@@ -1,4 +1,6 @@
-"""Units of headers, and headers that state two places, sides or sizes: one is used, both are told."""
+"""Units of headers, and headers that state two places, sides or sizes: one is used, both are
+told.
+"""
 
 import re
 import warnings
@@ -15,7 +17,10 @@ from tetopt.io.units import mm_of_unit
 pytest.importorskip("SimpleITK")
 
 VOXELS = np.arange(3 * 4 * 500, dtype=np.uint8)  # 3 x 4 x 500: 10 mm long at 0.02 mm
-LPS = "space: left-posterior-superior\nspace directions: (20,0,0) (0,20,0) (0,0,20)\nspace origin: (100,0,-50)\n"
+LPS = (
+    "space: left-posterior-superior\nspace directions: (20,0,0) (0,20,0) (0,0,20)\nspace "
+    "origin: (100,0,-50)\n"
+)
 
 
 def read(path):
@@ -23,7 +28,11 @@ def read(path):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         image = load_image(path)
-    return image, [str(each.message).removeprefix(f"{path}: ") for each in caught if each.category is UserWarning]
+    return image, [
+        str(each.message).removeprefix(f"{path}: ")
+        for each in caught
+        if each.category is UserWarning
+    ]
 
 
 def nrrd(folder, fields, sizes="3 4 500"):
@@ -44,29 +53,60 @@ def mha(folder, fields, data=VOXELS):
 
 @pytest.mark.parametrize(
     ("word", "mm"),
-    [("microns", 1e-3), ("um", 1e-3), ("µm", 1e-3), ("\u03bcm", 1e-3), (r"\u00B5m", 1e-3), ("Micrometres", 1e-3),
-     ("mm", 1.0), ("MM", 1.0), ("millimeter", 1.0), ("cm", 10.0), ("m", 1000.0), ("metre", 1000.0), ("nm", 1e-6),
-     ("inches", 25.4), ("feet", 304.8), (" in ", 25.4), ("", None), ("pixels", None), ("Unknown", None)],
-)  # fmt: skip
+    [
+        ("microns", 1e-3),
+        ("um", 1e-3),
+        ("µm", 1e-3),
+        ("\u03bcm", 1e-3),
+        (r"\u00B5m", 1e-3),
+        ("Micrometres", 1e-3),
+        ("mm", 1.0),
+        ("MM", 1.0),
+        ("millimeter", 1.0),
+        ("cm", 10.0),
+        ("m", 1000.0),
+        ("metre", 1000.0),
+        ("nm", 1e-6),
+        ("inches", 25.4),
+        ("feet", 304.8),
+        (" in ", 25.4),
+        ("", None),
+        ("pixels", None),
+        ("Unknown", None),
+    ],
+)
 def test_words_of_units(word, mm):
     assert mm_of_unit(word) == mm
 
 
 @pytest.mark.parametrize("word", ["second", "furlong", "s", "Hz", "mm2", "mms m"])
 def test_words_of_no_length_are_refused(word):
-    with pytest.raises(InputError, match=f'unit: expected a length such as "mm" or "um", got "{word}"'):
+    with pytest.raises(
+        InputError, match=f'unit: expected a length such as "mm" or "um", got "{word}"'
+    ):
         mm_of_unit(word)
 
 
 UNITS_OF_NRRD = {  # fields, voxel edges in mm, first voxel in RAS mm
-    "of a space": (LPS + 'space units: "microns" "microns" "microns"\n', [0.02] * 3, [-0.1, 0.0, -0.05]),
+    "of a space": (
+        LPS + 'space units: "microns" "microns" "microns"\n',
+        [0.02] * 3,
+        [-0.1, 0.0, -0.05],
+    ),
     "µm": (LPS + 'space units: "µm" "µm" "µm"\n', [0.02] * 3, [-0.1, 0.0, -0.05]),
-    "that differ": (LPS + 'space units: "mm" "mm" "cm"\n', [20.0, 20.0, 200.0], [-100.0, 0.0, -500.0]),
-    "of RAS": (LPS.replace("left-posterior", "right-anterior") + 'space units: "um" "um" "um"\n', [0.02] * 3,
-               [0.1, 0.0, -0.05]),
+    "that differ": (
+        LPS + 'space units: "mm" "mm" "cm"\n',
+        [20.0, 20.0, 200.0],
+        [-100.0, 0.0, -500.0],
+    ),
+    "of RAS": (
+        LPS.replace("left-posterior", "right-anterior") + 'space units: "um" "um" "um"\n',
+        [0.02] * 3,
+        [0.1, 0.0, -0.05],
+    ),
     "of axes": ('spacings: 20 20 40\nunits: "um" "um" "um"\n', [0.02, 0.02, 0.04], [0.0, 0.0, 0.0]),
     "none": (LPS, [20.0] * 3, [-100.0, 0.0, -50.0]),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", UNITS_OF_NRRD)
@@ -81,9 +121,13 @@ def test_units_of_nrrd(tmp_path, name):
 
 
 def test_unit_of_no_length_in_nrrd(tmp_path):
-    with pytest.raises(InputError, match='space units: expected a length such as "mm" or "um", got "furlong"'):
+    with pytest.raises(
+        InputError, match='space units: expected a length such as "mm" or "um", got "furlong"'
+    ):
         load_image(nrrd(tmp_path, LPS + 'space units: "mm" "mm" "furlong"\n'))
-    with pytest.raises(InputError, match="space units: expected a unit in quotation marks per axis, got um um um"):
+    with pytest.raises(
+        InputError, match="space units: expected a unit in quotation marks per axis, got um um um"
+    ):
         load_image(nrrd(tmp_path, LPS + "space units: um um um\n"))
     image, said = read(nrrd(tmp_path, LPS + 'space units: "um" "um" ""\n'))
     assert image.spacing.tolist() == pytest.approx([0.02, 0.02, 20.0])
@@ -95,9 +139,13 @@ def test_unit_of_metaimage(tmp_path):
     assert (image.spacing.tolist(), said) == (pytest.approx([0.02] * 3), [])
 
 
-@pytest.mark.parametrize(("unit", "said"), [("micron", None), ("mm", "0.1 mm, in the unit that"), ("unknown", "or in")])
+@pytest.mark.parametrize(
+    ("unit", "said"), [("micron", None), ("mm", "0.1 mm, in the unit that"), ("unknown", "or in")]
+)
 def test_small_box_of_a_stated_unit(tmp_path, unit, said):
-    file = nibabel.Nifti1Image(ramp(3, 4, 5), np.diag([0.02 if unit != "micron" else 20.0] * 3 + [1.0]))
+    file = nibabel.Nifti1Image(
+        ramp(3, 4, 5), np.diag([0.02 if unit != "micron" else 20.0] * 3 + [1.0])
+    )
     file.header.set_xyzt_units(unit)
     nibabel.save(file, tmp_path / "a.nii")
     image, heard = read(tmp_path / "a.nii")
@@ -117,7 +165,9 @@ def nifti(folder, sform, qform, codes=(1, 1), **fields):
     for name, value in fields.items():
         file.header[name] = value
     # Saved by nibabel, a file would get one affine.
-    (folder / "a.nii").write_bytes(file.header.binaryblock + bytes(4) + ramp(3, 4, 5).tobytes(order="F"))
+    (folder / "a.nii").write_bytes(
+        file.header.binaryblock + bytes(4) + ramp(3, 4, 5).tobytes(order="F")
+    )
     return folder / "a.nii"
 
 
@@ -128,17 +178,47 @@ def moved(by, affine=None):
 
 
 STEPS = moved([0, 0, 0])
-TURN = np.diag([np.cos(0.1), np.cos(0.1), 1.0, 1.0]) + np.sin(0.1) * np.eye(4)[[1, 0, 2, 3]] * [[-1], [1], [0], [0]]
+TURN = np.diag([np.cos(0.1), np.cos(0.1), 1.0, 1.0]) + np.sin(0.1) * np.eye(4)[[1, 0, 2, 3]] * [
+    [-1],
+    [1],
+    [0],
+    [0],
+]
 PLACES = {  # sform, qform, codes, what is told; None for nothing
-    "moved": (STEPS, moved([0, 0, 7.5]), (1, 1), "place it differently, by up to 7.5 mm; the sform is used"),
+    "moved": (
+        STEPS,
+        moved([0, 0, 7.5]),
+        (1, 1),
+        "place it differently, by up to 7.5 mm; the sform is used",
+    ),
     "half a voxel": (STEPS, moved([0.5, 0, 0]), (1, 1), "by up to 0.5 mm"),
-    "mirrored": (STEPS, np.diag([-1.0, 2.0, 3.0, 1.0]), (1, 1), "are mirror images of each other (left/right)"),
-    "sizes": (STEPS, np.diag([1.0, 2.0, 3.3, 1.0]), (2, 2), "have voxels of 1 x 2 x 3 and 1 x 2 x 3.3 mm"),
+    "mirrored": (
+        STEPS,
+        np.diag([-1.0, 2.0, 3.0, 1.0]),
+        (1, 1),
+        "are mirror images of each other (left/right)",
+    ),
+    "sizes": (
+        STEPS,
+        np.diag([1.0, 2.0, 3.3, 1.0]),
+        (2, 2),
+        "have voxels of 1 x 2 x 3 and 1 x 2 x 3.3 mm",
+    ),
     "turned": (STEPS, TURN @ STEPS, (1, 1), "place it differently, by up to 0.6"),
-    "spaces": (moved([5, 0, 0]), STEPS, (4, 1), "the sform (MNI space) and the qform (scanner space) place it"),
+    "spaces": (
+        moved([5, 0, 0]),
+        STEPS,
+        (4, 1),
+        "the sform (MNI space) and the qform (scanner space) place it",
+    ),
     "equal": (STEPS, STEPS, (1, 1), None),
     "rounded": (moved(1e-3), STEPS, (1, 1), None),
-    "half a turn": (moved(0, np.diag([-1.0, -2.0, 3.0, 1.0])), np.diag([-1.0, -2.0, 3.0, 1.0]), (4, 1), None),
+    "half a turn": (
+        moved(0, np.diag([-1.0, -2.0, 3.0, 1.0])),
+        np.diag([-1.0, -2.0, 3.0, 1.0]),
+        (4, 1),
+        None,
+    ),
     "no qform": (STEPS, moved([50, 0, 0]), (1, 0), None),
     "no sform": (moved([50, 0, 0]), STEPS, (0, 1), None),
     "pixdim": (
@@ -170,32 +250,66 @@ def test_shear_that_a_qform_cannot_have(tmp_path):
 
 def test_sizes_of_nifti(tmp_path):
     path = nifti(tmp_path, STEPS, STEPS, dim=[3, 3, 4, 5, 7, 1, 1, 1])
-    assert read(path)[1] == ["its dim lists [3, 4, 5, 7, 1, 1, 1] voxels, but only 3 axes (dim[0]) are read"]
+    assert read(path)[1] == [
+        "its dim lists [3, 4, 5, 7, 1, 1, 1] voxels, but only 3 axes (dim[0]) are read"
+    ]
     path = nifti(tmp_path, STEPS, STEPS, dim=[3, 3, 4, 4, 1, 1, 1, 1])
     assert read(path)[1] == [
-        "its header declares 3 x 4 x 4 voxels, but the file has 24 more bytes after them; check its sizes"
+        "its header declares 3 x 4 x 4 voxels, but the file has 24 more bytes after them; check "
+        "its sizes"
     ]
 
 
 TURNED = "0 1 0 0 0 1 1 0 0"
 METAIMAGES = {  # fields, what is told, voxel edges, RAS direction of the first axis
-    "sizes": ("ElementSize = 2 2 2\nElementSpacing = 1 1 3\n", "voxel sizes, ElementSpacing = 1 1 3 and ElementSize",
-              [1, 1, 3], [-1, 0, 0]),
+    "sizes": (
+        "ElementSize = 2 2 2\nElementSpacing = 1 1 3\n",
+        "voxel sizes, ElementSpacing = 1 1 3 and ElementSize",
+        [1, 1, 3],
+        [-1, 0, 0],
+    ),
     "size alone": ("ElementSize = 2 2 3\n", None, [2, 2, 3], [-1, 0, 0]),
     "no size": ("Comment = x\n", "has no voxel size: assuming 1 mm", [1, 1, 1], [-1, 0, 0]),
-    "positions": ("Position = 2 2 2\nOffset = 1 1 1\n", "two positions, Offset = 1 1 1 and Position", None, None),
-    "directions": (f"Orientation = 1 0 0 0 1 0 0 0 1\nTransformMatrix = {TURNED}\n", "two directions, TransformMatrix",
-                   None, [0, -1, 0]),
-    "twice": ("ElementSpacing = 2 2 2\nElementSpacing = 1 1 3\n", "ElementSpacing twice, 2 2 2 and 1 1 3", [1, 1, 3],
-              None),
-    "letters": ("AnatomicalOrientation = LAI\n", "AnatomicalOrientation LAI contradicts its directions, LxPxS", None,
-                [-1, 0, 0]),
+    "positions": (
+        "Position = 2 2 2\nOffset = 1 1 1\n",
+        "two positions, Offset = 1 1 1 and Position",
+        None,
+        None,
+    ),
+    "directions": (
+        f"Orientation = 1 0 0 0 1 0 0 0 1\nTransformMatrix = {TURNED}\n",
+        "two directions, TransformMatrix",
+        None,
+        [0, -1, 0],
+    ),
+    "twice": (
+        "ElementSpacing = 2 2 2\nElementSpacing = 1 1 3\n",
+        "ElementSpacing twice, 2 2 2 and 1 1 3",
+        [1, 1, 3],
+        None,
+    ),
+    "letters": (
+        "AnatomicalOrientation = LAI\n",
+        "AnatomicalOrientation LAI contradicts its directions, LxPxS",
+        None,
+        [-1, 0, 0],
+    ),
     "letters of ITK": ("AnatomicalOrientation = RAI\n", None, None, [-1, 0, 0]),
-    "letters of MetaIO": (f"AnatomicalOrientation = PSL\nTransformMatrix = {TURNED}\n", None, None, [0, -1, 0]),
+    "letters of MetaIO": (
+        f"AnatomicalOrientation = PSL\nTransformMatrix = {TURNED}\n",
+        None,
+        None,
+        [0, -1, 0],
+    ),
     "letters unset": ("AnatomicalOrientation = ???\n", None, None, None),
-    "lengths": ("TransformMatrix = 2 0 0 0 2 0 0 0 1\n", "directions have lengths 2 x 2 x 1", [2, 2, 1], None),
+    "lengths": (
+        "TransformMatrix = 2 0 0 0 2 0 0 0 1\n",
+        "directions have lengths 2 x 2 x 1",
+        [2, 2, 1],
+        None,
+    ),
     "equal": ("Position = 1 1 1\nOffset = 1 1 1.0\n", None, None, None),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", METAIMAGES)
@@ -224,15 +338,24 @@ NRRDS = {
         "spacings: 2 2 2\naxis mins: 0 0 0\naxis maxs: 6 8 1000\n",
         "it has no space, which leaves left and right open",
     ),
-    "mins and maxs alone": ("axis mins: 0 0 0\naxis maxs: 6 8 1000\n", "has no voxel size: assuming 1 mm"),
+    "mins and maxs alone": (
+        "axis mins: 0 0 0\naxis maxs: 6 8 1000\n",
+        "has no voxel size: assuming 1 mm",
+    ),
     "no size": ("", "has no voxel size: assuming 1 mm"),
     "unknown sizes": ("spacings: nan NaN nan\n", "has no voxel size: assuming 1 mm"),
-    "an unknown size": ("spacings: 2 2 nan\n", "has no voxel size along 1 of 3 axes: assuming 1 mm"),
+    "an unknown size": (
+        "spacings: 2 2 nan\n",
+        "has no voxel size along 1 of 3 axes: assuming 1 mm",
+    ),
     "space": (
         LPS.replace("left-posterior-superior", "3D-right-handed"),
         'its space "3D-right-handed" does not tell',
     ),
-    "no space": (LPS.replace("space: left-posterior-superior", "space dimension: 3"), "it has no space, which"),
+    "no space": (
+        LPS.replace("space: left-posterior-superior", "space dimension: 3"),
+        "it has no space, which",
+    ),
 }
 
 
@@ -245,10 +368,15 @@ def test_two_statements_of_nrrd(tmp_path, name):
 
 @pytest.mark.parametrize(
     ("fields", "told"),
-    [(LPS + "spacings: 1 1 1\n", 'both "spacedirections" .* and "spacings" (1 1 1)'),
-     (LPS + "space dimension: 3\n", 'both "space" (left-posterior-superior) and "spacedimension" (3)'),
-     ("space: LPS\nspacings: 1 1 1\n", 'has the space "LPS" but no "space directions"')],
-)  # fmt: skip
+    [
+        (LPS + "spacings: 1 1 1\n", 'both "spacedirections" .* and "spacings" (1 1 1)'),
+        (
+            LPS + "space dimension: 3\n",
+            'both "space" (left-posterior-superior) and "spacedimension" (3)',
+        ),
+        ("space: LPS\nspacings: 1 1 1\n", 'has the space "LPS" but no "space directions"'),
+    ],
+)
 def test_statements_that_nrrd_excludes(tmp_path, fields, told):
     with pytest.raises(InputError, match=".*".join(re.escape(part) for part in told.split(".*"))):
         load_image(nrrd(tmp_path, fields))

@@ -1,4 +1,6 @@
-"""Curved mid-edge nodes in the files of each format, as independent readers have them, and on their way back."""
+"""Curved mid-edge nodes in the files of each format, as independent readers have them, and on
+their way back.
+"""
 
 import xml.etree.ElementTree as ElementTree
 
@@ -23,7 +25,11 @@ def curved_model(n=3):
 def febio(path):
     """Nodes and elements of FEBio's file, from 0."""
     root = ElementTree.parse(path)
-    nodes = {int(node.get("id")): [float(x) for x in node.text.split(",")] for node in root.iter("node") if node.text}
+    nodes = {
+        int(node.get("id")): [float(x) for x in node.text.split(",")]
+        for node in root.iter("node")
+        if node.text
+    }
     cells = [[int(k) for k in each.text.split(",")] for each in root.findall(".//Elements/elem")]
     places = {number: k for k, number in enumerate(nodes)}
     return np.array(list(nodes.values())), np.array([[places[k] for k in cell] for cell in cells])
@@ -43,7 +49,9 @@ def read(path, n):
 @pytest.mark.parametrize("n", [3, 2])
 @pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".msh", ".xdmf", ".inp", ".feb"])
 def test_others_read_the_curved_nodes(suffix, n, tmp_path):
-    """Each cell has its own mid-edge nodes between its corners, whatever the order of nodes in the format."""
+    """Each cell has its own mid-edge nodes between its corners, whatever the order of nodes in
+    the format.
+    """
     if n == 2 and suffix in (".inp", ".feb"):
         pytest.skip("3-D only")
     model = curved_model(n)
@@ -52,7 +60,10 @@ def test_others_read_the_curved_nodes(suffix, n, tmp_path):
     points, cells = read(path, n)
     nodes, ours = quadratic(model.mesh.points, model.mesh.cells, model.mesh.midpoints)
     assert (
-        np.abs(model.mesh.midpoints - quadratic(model.mesh.points, model.mesh.cells)[0][len(model.mesh.points) :]).max()
+        np.abs(
+            model.mesh.midpoints
+            - quadratic(model.mesh.points, model.mesh.cells)[0][len(model.mesh.points) :]
+        ).max()
         > 0.1
     )
     theirs = points[cells]
@@ -98,7 +109,9 @@ def test_turned_to_lps_and_back(tmp_path):
     save_model(tmp_path / "a.vtu", model, space="lps")
     turned = np.asarray(pyvista.read(tmp_path / "a.vtu").points)[len(model.mesh.points) :]
     np.testing.assert_array_equal(turned, model.mesh.midpoints * (-1.0, -1.0, 1.0))
-    np.testing.assert_array_equal(load_mesh(tmp_path / "a.vtu").mesh.midpoints, model.mesh.midpoints)
+    np.testing.assert_array_equal(
+        load_mesh(tmp_path / "a.vtu").mesh.midpoints, model.mesh.midpoints
+    )
 
 
 def test_cells_turned_by_the_reader_keep_their_midpoints(tmp_path):
@@ -113,7 +126,9 @@ def test_cells_turned_by_the_reader_keep_their_midpoints(tmp_path):
     for local, (a, b) in enumerate(cell_edges(3), start=4):
         pairs = np.sort(back.mesh.cells[:, [a, b]], axis=1)
         for cell, pair in zip(of_cells[:20, local], pairs[:20], strict=True):
-            which, place = np.argwhere((np.sort(cells[:, :4][:, cell_edges(3)], axis=2) == pair).all(axis=2))[0]
+            which, place = np.argwhere(
+                (np.sort(cells[:, :4][:, cell_edges(3)], axis=2) == pair).all(axis=2)
+            )[0]
             np.testing.assert_array_equal(theirs[cell], nodes[cells[which, 4 + place]])
 
 
@@ -121,4 +136,6 @@ def test_order_1_leaves_them_out():
     model = curved_model()
     linear = Model(model.mesh, {}, model.sets)
     assert len(linear.to_pyvista().points) == len(model.mesh.points)
-    assert len(linear._replace(order=2).to_meshio().points) == len(model.mesh.points) + len(model.mesh.midpoints)
+    assert len(linear._replace(order=2).to_meshio().points) == len(model.mesh.points) + len(
+        model.mesh.midpoints
+    )

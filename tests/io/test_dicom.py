@@ -1,4 +1,5 @@
-"""DICOM to images: frames lie where they say, whatever their order, file or kind; or are refused for the true reason.
+"""DICOM to images: frames lie where they say, whatever their order, file or kind; or are refused
+for the true reason.
 
 Files are made by pydicom, segmentations by highdicom, which is also the oracle for them.
 """
@@ -17,13 +18,18 @@ from tetopt.io.label_tables import load_label_table
 pydicom = pytest.importorskip("pydicom")
 from pydicom.dataset import Dataset, FileDataset, FileMetaDataset  # noqa: E402
 
-CT, ENHANCED_CT, MR = "1.2.840.10008.5.1.4.1.1.2", "1.2.840.10008.5.1.4.1.1.2.1", "1.2.840.10008.5.1.4.1.1.4"
+CT, ENHANCED_CT, MR = (
+    "1.2.840.10008.5.1.4.1.1.2",
+    "1.2.840.10008.5.1.4.1.1.2.1",
+    "1.2.840.10008.5.1.4.1.1.4",
+)
 EXPLICIT = "1.2.840.10008.1.2.1"
 AXES = np.array([[0.8, 0.6, 0.0], [-0.36, 0.48, 0.8]])  # of rows and columns: oblique
 NORMAL = np.cross(*AXES)
 AXIAL = [1, 0, 0, 0, 1, 0]
 ORIGIN, BETWEEN_ROWS, BETWEEN_COLUMNS, STEP = np.array([10.0, -20.0, 30.0]), 0.5, 0.75, 3.0
-RAMP = np.arange(6 * 4 * 5, dtype=np.int16).reshape(6, 4, 5)  # slices, rows, columns: every voxel another value
+# slices, rows, columns: every voxel another value
+RAMP = np.arange(6 * 4 * 5, dtype=np.int16).reshape(6, 4, 5)
 
 
 def tagged(**tags):
@@ -42,10 +48,20 @@ def file_of(kind, pixels, **tags):
     """A file of 16-bit pixels (rows, columns), or (frames, rows, columns)."""
     rows, columns = pixels.shape[-2:]
     data = tagged(
-        SOPClassUID=kind, SOPInstanceUID=pydicom.uid.generate_uid(), SeriesInstanceUID="1.2.3", Rows=rows,
-        Columns=columns, SamplesPerPixel=1, PhotometricInterpretation="MONOCHROME2", BitsAllocated=16, BitsStored=16,
-        HighBit=15, PixelRepresentation=1, PixelData=np.ascontiguousarray(pixels, "<i2").tobytes(), **tags,
-    )  # fmt: skip
+        SOPClassUID=kind,
+        SOPInstanceUID=pydicom.uid.generate_uid(),
+        SeriesInstanceUID="1.2.3",
+        Rows=rows,
+        Columns=columns,
+        SamplesPerPixel=1,
+        PhotometricInterpretation="MONOCHROME2",
+        BitsAllocated=16,
+        BitsStored=16,
+        HighBit=15,
+        PixelRepresentation=1,
+        PixelData=np.ascontiguousarray(pixels, "<i2").tobytes(),
+        **tags,
+    )
     if pixels.ndim == 3:
         data.NumberOfFrames = len(pixels)
     return data
@@ -65,14 +81,20 @@ def places(n=6, step=STEP * NORMAL):
 
 
 def enhanced(frames, where, *, own=None, axes=AXES, **measures):
-    """An Enhanced CT of frames at these places; `own` are further functional groups of each frame."""
-    measures = {"PixelSpacing": [BETWEEN_ROWS, BETWEEN_COLUMNS], "SpacingBetweenSlices": STEP} | measures
+    """An Enhanced CT of frames at these places; `own` are further functional groups of each
+    frame.
+    """
+    measures = {
+        "PixelSpacing": [BETWEEN_ROWS, BETWEEN_COLUMNS],
+        "SpacingBetweenSlices": STEP,
+    } | measures
     data = file_of(ENHANCED_CT, frames)
     shared = group("PlaneOrientation", ImageOrientationPatient=axes.ravel().tolist())
     data.SharedFunctionalGroupsSequence = [tagged(**shared | group("PixelMeasures", **measures))]
     data.PerFrameFunctionalGroupsSequence = [
         tagged(
-            **group("PlanePosition", ImagePositionPatient=place.round(9).tolist()), **({} if own is None else own[k])
+            **group("PlanePosition", ImagePositionPatient=place.round(9).tolist()),
+            **({} if own is None else own[k]),
         )
         for k, place in enumerate(where)
     ]
@@ -80,7 +102,10 @@ def enhanced(frames, where, *, own=None, axes=AXES, **measures):
 
 
 def one_slice(pixels, place, **tags):
-    where = {"ImagePositionPatient": place.round(9).tolist(), "ImageOrientationPatient": AXES.ravel().tolist()}
+    where = {
+        "ImagePositionPatient": place.round(9).tolist(),
+        "ImageOrientationPatient": AXES.ravel().tolist(),
+    }
     return file_of(CT, pixels, PixelSpacing=[BETWEEN_ROWS, BETWEEN_COLUMNS], **where, **tags)
 
 
@@ -100,7 +125,9 @@ def affine_of(step=STEP * NORMAL):
 
 def assert_placed(image, pixels=RAMP, affine=None):
     np.testing.assert_array_equal(image.data, pixels.T)
-    np.testing.assert_allclose(image.affine, affine_of() if affine is None else affine, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(
+        image.affine, affine_of() if affine is None else affine, rtol=0, atol=1e-7
+    )
 
 
 def assert_refused(path, match, **options):
@@ -117,7 +144,9 @@ ORDER = np.array([3, 0, 5, 1, 4, 2])
 
 @pytest.mark.apart
 def test_frames_in_any_order(tmp_path):
-    """The reader sorts them; rows and columns have spacings of their own, and the world is oblique."""
+    """The reader sorts them; rows and columns have spacings of their own, and the world is
+    oblique.
+    """
     assert_placed(load_image(saved(tmp_path / "a.dcm", enhanced(RAMP[ORDER], places()[ORDER]))))
 
 
@@ -135,13 +164,18 @@ def test_several_files_of_one_series_are_one_volume(tmp_path):
     assert_placed(load_image(tmp_path))
     assert_refused(tmp_path / "a.dcm", "volume from 0 to 0", volume=1)
     saved(tmp_path / "again.dcm", enhanced(RAMP[3:4], places()[3:4]))
-    assert_refused(tmp_path, "7 slices of this DICOM series have 6 positions: .* several volumes .* separate folder")
+    assert_refused(
+        tmp_path,
+        "7 slices of this DICOM series have 6 positions: .* several volumes .* separate folder",
+    )
 
 
 def test_several_volumes_in_files_of_their_own(tmp_path):
     for name in "ab":
         saved(tmp_path / f"{name}.dcm", enhanced(RAMP, places()))
-    assert_refused(tmp_path, "12 slices of this DICOM series have 6 positions: .* give one of its files")
+    assert_refused(
+        tmp_path, "12 slices of this DICOM series have 6 positions: .* give one of its files"
+    )
 
 
 def turned(k):
@@ -160,8 +194,14 @@ def of_times(*times):
 @pytest.mark.parametrize(
     ("data", "match"),
     [
-        (lambda: enhanced(RAMP, places(7)[[0, 1, 2, 3, 6, 5]]), "a step of 6 mm between slices 3 and 4"),
-        (lambda: enhanced(RAMP, places()[[0, 1, 2, 3, 4, 4]]), "6 slices of .* have 5 positions: .*; convert it"),
+        (
+            lambda: enhanced(RAMP, places(7)[[0, 1, 2, 3, 6, 5]]),
+            "a step of 6 mm between slices 3 and 4",
+        ),
+        (
+            lambda: enhanced(RAMP, places()[[0, 1, 2, 3, 4, 4]]),
+            "6 slices of .* have 5 positions: .*; convert it",
+        ),
         (lambda: enhanced(RAMP, places(step=AXES[0])), "beside each other"),
         (lambda: enhanced(RAMP, places(), own=turned(2)), "not parallel .*frame 3 of the file"),
         (lambda: enhanced(RAMP, places(), own=[*[{}] * 5, SQUARE]), "frame 6 .*different sizes"),
@@ -170,14 +210,16 @@ def of_times(*times):
         (lambda: enhanced(RAMP, places(), own=of_times(1, 2, 1, 2, 1, 2)), "2 volumes"),
     ],
     ids=["missing", "double", "beside", "turned", "pixels", "fewer", "axes", "times"],
-)  # fmt: skip
+)
 def test_frames_that_are_no_volume(tmp_path, data, match):
     """The faults that a series of slices is refused for."""
     assert_refused(saved(tmp_path / "a.dcm", data()), match)
 
 
 def test_a_volume_of_several_is_chosen(tmp_path):
-    """By stack and time; or by another dimension, such as the echo, where frames have one position."""
+    """By stack and time; or by another dimension, such as the echo, where frames have one
+    position.
+    """
     both = np.concatenate([RAMP, RAMP[::-1] + 500])
     where = np.concatenate([places(), places()[::-1]])
     path = saved(tmp_path / "t.dcm", enhanced(both, where, own=of_times(*[2] * 6, *[1] * 6)))
@@ -185,21 +227,34 @@ def test_a_volume_of_several_is_chosen(tmp_path):
     assert_placed(load_image(path, volume=0), RAMP + 500)
     own = [group("FrameContent", DimensionIndexValues=[k % 6 + 1, 1 + k // 6]) for k in range(12)]
     data = enhanced(both, where, own=own)
-    data.DimensionIndexSequence = [tagged(DimensionIndexPointer=tag) for tag in (0x00200032, 0x00189082)]
+    data.DimensionIndexSequence = [
+        tagged(DimensionIndexPointer=tag) for tag in (0x00200032, 0x00189082)
+    ]
     assert_placed(load_image(saved(tmp_path / "e.dcm", data), volume=1), RAMP + 500)
 
 
 def test_each_frame_has_its_own_scale(tmp_path):
     scales = [(1, 0), (0.5, 3), (2, -1024), (1, 0), (1.25, 0), (3, 7)]
     own = [group("PixelValueTransformation", RescaleSlope=a, RescaleIntercept=b) for a, b in scales]
-    path = saved(tmp_path / "a.dcm", enhanced(RAMP[ORDER], places()[ORDER], own=[own[k] for k in ORDER]))
-    assert_placed(load_image(path), np.array([a * plane + b for (a, b), plane in zip(scales, RAMP, strict=True)]))
+    path = saved(
+        tmp_path / "a.dcm", enhanced(RAMP[ORDER], places()[ORDER], own=[own[k] for k in ORDER])
+    )
+    assert_placed(
+        load_image(path),
+        np.array([a * plane + b for (a, b), plane in zip(scales, RAMP, strict=True)]),
+    )
 
 
 def test_slices_have_their_own_scales(tmp_path):
     """As PET has; SimpleITK converts all to the first one's type, which may have no fractions."""
     for k in range(6):
-        slices_of(tmp_path / "d", RAMP[k:][:1], places()[k:][:1], RescaleSlope=1 + k / 4, RescaleIntercept=-k)
+        slices_of(
+            tmp_path / "d",
+            RAMP[k:][:1],
+            places()[k:][:1],
+            RescaleSlope=1 + k / 4,
+            RescaleIntercept=-k,
+        )
         (tmp_path / "d" / "s0.dcm").rename(tmp_path / "d" / f"k{k}.dcm")
     k = np.arange(6)[:, None, None]
     assert_placed(load_image(tmp_path / "d"), RAMP * (1 + k / 4) - k)
@@ -207,7 +262,10 @@ def test_slices_have_their_own_scales(tmp_path):
 
 def test_contradicting_distance_is_told(tmp_path):
     path = saved(tmp_path / "a.dcm", enhanced(RAMP, places(), SpacingBetweenSlices=1))
-    with pytest.warns(UserWarning, match="3 mm apart by their positions, which are used; SpacingBetweenSlices is 1 mm"):
+    with pytest.warns(
+        UserWarning,
+        match="3 mm apart by their positions, which are used; SpacingBetweenSlices is 1 mm",
+    ):
         assert_placed(load_image(path))
 
 
@@ -216,7 +274,10 @@ def test_contradicting_distance_is_told(tmp_path):
 
 
 def stack(kind, **tags):
-    where = {"ImagePositionPatient": ORIGIN.tolist(), "ImageOrientationPatient": AXES.ravel().tolist()}
+    where = {
+        "ImagePositionPatient": ORIGIN.tolist(),
+        "ImageOrientationPatient": AXES.ravel().tolist(),
+    }
     return file_of(kind, RAMP, PixelSpacing=[BETWEEN_ROWS, BETWEEN_COLUMNS], **where | tags)
 
 
@@ -229,22 +290,32 @@ def test_dose_is_placed_by_its_offsets(tmp_path):
     affine = affine_of()
     affine[:3, 3] -= 5 * affine[:3, 2]
     assert_placed(image, 0.25 * RAMP[::-1], affine)
-    data = stack(dose, ImageOrientationPatient=AXIAL, GridFrameOffsetVector=[30.0 + each for each in offsets])
-    assert load_image(saved(tmp_path / "b.dcm", data)).to_world([0, 0, 5]) == pytest.approx([-10, 20, 45])
+    data = stack(
+        dose, ImageOrientationPatient=AXIAL, GridFrameOffsetVector=[30.0 + each for each in offsets]
+    )
+    assert load_image(saved(tmp_path / "b.dcm", data)).to_world([0, 0, 5]) == pytest.approx(
+        [-10, 20, 45]
+    )
     data.GridFrameOffsetVector = [each + 5.0 for each in offsets]
-    assert_refused(saved(tmp_path / "c.dcm", data), "GridFrameOffsetVector that is not of its position")
+    assert_refused(
+        saved(tmp_path / "c.dcm", data), "GridFrameOffsetVector that is not of its position"
+    )
 
 
 def test_distance_that_a_file_states_is_used(tmp_path):
     """With its sign, as nuclear medicine has it; and told."""
-    nm = stack("1.2.840.10008.5.1.4.1.1.20", SpacingBetweenSlices=-STEP, FrameIncrementPointer=0x00540080)
+    nm = stack(
+        "1.2.840.10008.5.1.4.1.1.20", SpacingBetweenSlices=-STEP, FrameIncrementPointer=0x00540080
+    )
     nm.SliceVector = [1, 2, 3, 4, 5, 6]
     where = {each: nm[each].value for each in ("ImagePositionPatient", "ImageOrientationPatient")}
     nm.DetectorInformationSequence = [tagged(**where)]
     del nm.ImagePositionPatient, nm.ImageOrientationPatient
     affine = affine_of()
     affine[:3, 3] -= 5 * affine[:3, 2]
-    with pytest.warns(UserWarning, match="-3 mm apart along the slices' normal, as SpacingBetweenSlices states"):
+    with pytest.warns(
+        UserWarning, match="-3 mm apart along the slices' normal, as SpacingBetweenSlices states"
+    ):
         assert_placed(load_image(saved(tmp_path / "a.dcm", nm)), RAMP[::-1], affine)
 
 
@@ -259,7 +330,8 @@ def test_distance_that_a_file_states_is_used(tmp_path):
 )
 def test_frames_that_lie_nowhere(tmp_path, tags):
     assert_refused(
-        saved(tmp_path / "a.dcm", stack("1.2.840.10008.5.1.4.1.1.7.3", **tags)), "does not state where its 6"
+        saved(tmp_path / "a.dcm", stack("1.2.840.10008.5.1.4.1.1.7.3", **tags)),
+        "does not state where its 6",
     )
 
 
@@ -268,7 +340,10 @@ def test_frames_that_lie_nowhere(tmp_path, tags):
 
 
 def test_one_slice_has_the_thickness_that_it_states(tmp_path):
-    for tags, expected in ({"SliceThickness": 5}, 5), ({"SpacingBetweenSlices": 4, "SliceThickness": 5}, 4):
+    for tags, expected in (
+        ({"SliceThickness": 5}, 5),
+        ({"SpacingBetweenSlices": 4, "SliceThickness": 5}, 4),
+    ):
         path = slices_of(tmp_path / "d", RAMP[:1], **tags) / "s0.dcm"
         with warnings.catch_warnings():
             warnings.simplefilter("error")
@@ -291,9 +366,13 @@ def test_a_localizer_of_another_size_is_named(tmp_path):
     folder = slices_of(tmp_path / "d")
     saved(
         folder / "loc.dcm",
-        file_of(CT, np.zeros((9, 8)), ImagePositionPatient=[0, 0, 0], ImageOrientationPatient=AXIAL),
+        file_of(
+            CT, np.zeros((9, 8)), ImagePositionPatient=[0, 0, 0], ImageOrientationPatient=AXIAL
+        ),
     )
-    said = assert_refused(folder, r"the DICOM file loc\.dcm has 8 x 9 pixels, and 6 others of its series have 5 x 4")
+    said = assert_refused(
+        folder, r"the DICOM file loc\.dcm has 8 x 9 pixels, and 6 others of its series have 5 x 4"
+    )
     assert "damaged" not in said
 
 
@@ -311,14 +390,23 @@ def changed(**tags):
 @pytest.mark.parametrize(
     ("data", "match"),
     [
-        (without_voxels(ROIContourSequence=[]), "RT Structure Set Storage: contours, no voxels; convert them"),
+        (
+            without_voxels(ROIContourSequence=[]),
+            "RT Structure Set Storage: contours, no voxels; convert them",
+        ),
         (without_voxels("1.2.840.10008.5.1.4.1.1.88.11"), "Basic Text SR Storage, without voxels"),
-        (without_voxels("1.2.840.10008.1.3.10", DirectoryRecordSequence=[]), "DICOMDIR, a list of files"),
+        (
+            without_voxels("1.2.840.10008.1.3.10", DirectoryRecordSequence=[]),
+            "DICOMDIR, a list of files",
+        ),
         (without_voxels(CT, Rows=4, Columns=5), "has no pixel data"),
         (changed(SamplesPerPixel=3), "3 numbers per voxel"),
         (changed(PhotometricInterpretation="PALETTE COLOR"), "colours from a palette"),
         (changed(ImageType=["ORIGINAL", "PRIMARY", "M", "MOSAIC"]), "is a mosaic"),
-        (changed(ImageOrientationPatient=[1, 0, 0]), "expected 6 finite numbers for its ImageOrientationPatient"),
+        (
+            changed(ImageOrientationPatient=[1, 0, 0]),
+            "expected 6 finite numbers for its ImageOrientationPatient",
+        ),
         (changed(Rows=400), "declares 1 x 400 x 5 voxels"),
         (changed(NumberOfFrames=10**9), "declares 1000000000 x 4 x 5 voxels"),
         (changed(Rows=0), "declares 1 x 0 x 5 voxels"),
@@ -344,7 +432,9 @@ def test_objects_beside_a_series_are_skipped(tmp_path):
     saved(folder / "rs.dcm", without_voxels(ROIContourSequence=[]))
     (folder / "DICOMDIR").write_bytes(b"anything")
     (folder / "notes.txt").write_text("anything")
-    with pytest.warns(UserWarning, match=r"skipped rs\.dcm, which is of the kind RT Structure Set Storage"):
+    with pytest.warns(
+        UserWarning, match=r"skipped rs\.dcm, which is of the kind RT Structure Set Storage"
+    ):
         assert_placed(load_image(folder))
 
 
@@ -369,26 +459,36 @@ def test_bits_beyond_those_stored_are_ignored(tmp_path):
     """Signed numbers of 12 bits, below others' bits."""
     data = one_slice((np.array([[-5, 7, -2048]]) & 0xFFF) | 0x5000, ORIGIN, SliceThickness=3)
     data.BitsStored, data.HighBit = 12, 11
-    np.testing.assert_array_equal(load_image(saved(tmp_path / "a.dcm", data)).data[:, 0, 0], [-5, 7, -2048])
+    np.testing.assert_array_equal(
+        load_image(saved(tmp_path / "a.dcm", data)).data[:, 0, 0], [-5, 7, -2048]
+    )
 
 
 def test_values_in_the_upper_bits(tmp_path):
     """As HighBit states: 12 bits above 4 others, with a sign."""
     data = one_slice(np.array([[-5, 7, -2048]]) * 16 + 3, ORIGIN, SliceThickness=3)
     data.BitsStored = 12
-    with pytest.warns(UserWarning, match="HighBit is 15: the lowest 4 bits of its values are left out"):
+    with pytest.warns(
+        UserWarning, match="HighBit is 15: the lowest 4 bits of its values are left out"
+    ):
         image = load_image(saved(tmp_path / "a.dcm", data))
     np.testing.assert_array_equal(image.data[:, 0, 0], [-5, 7, -2048])
     data.HighBit = 9
-    assert_refused(saved(tmp_path / "a.dcm", data), "BitsStored 12 and HighBit 9, which contradict each other")
+    assert_refused(
+        saved(tmp_path / "a.dcm", data), "BitsStored 12 and HighBit 9, which contradict each other"
+    )
 
 
 def test_slices_of_two_frames_of_reference(tmp_path):
     folder = slices_of(tmp_path / "d", RAMP[:3], FrameOfReferenceUID="1.2.5")
     assert load_image(folder).shape == (5, 4, 3)
     for k in (1, 2):
-        saved(folder / f"t{k}.dcm", one_slice(RAMP[k], places()[2 + k], FrameOfReferenceUID="1.2.7"))
-    assert_refused(folder, r"t1\.dcm and .*s0\.dcm have different frames of reference \(1\.2\.7 and 1\.2\.5\)")
+        saved(
+            folder / f"t{k}.dcm", one_slice(RAMP[k], places()[2 + k], FrameOfReferenceUID="1.2.7")
+        )
+    assert_refused(
+        folder, r"t1\.dcm and .*s0\.dcm have different frames of reference \(1\.2\.7 and 1\.2\.5\)"
+    )
 
 
 def test_compressed_voxels(tmp_path):
@@ -400,7 +500,9 @@ def test_compressed_voxels(tmp_path):
     assert_placed(load_image(path))
     whole = path.read_bytes()
     path = saved(tmp_path / "b.dcm", data, "1.2.840.10008.1.2.4.100")
-    assert "damaged" not in assert_refused(path, "compressed as MPEG2 .*cannot be decoded here; .*gdcmconv")
+    assert "damaged" not in assert_refused(
+        path, "compressed as MPEG2 .*cannot be decoded here; .*gdcmconv"
+    )
     path.write_bytes(whole[:-40])
     assert_refused(path, "truncated or damaged")
 
@@ -409,7 +511,9 @@ def test_more_voxels_than_the_header_declares(tmp_path):
     data = one_slice(RAMP[0], ORIGIN, SliceThickness=3)
     data.PixelData = RAMP.tobytes()
     with pytest.warns(UserWarning, match="more bytes of voxels than its header declares"):
-        np.testing.assert_array_equal(load_image(saved(tmp_path / "a.dcm", data)).data[:, :, 0], RAMP[0].T)
+        np.testing.assert_array_equal(
+            load_image(saved(tmp_path / "a.dcm", data)).data[:, :, 0], RAMP[0].T
+        )
 
 
 # --------------------------------------------------------------------------------------------------
@@ -422,7 +526,9 @@ def hd():
 
 
 def blobs(shape=(9, 8, 7)):
-    """Voxels (slices, rows, columns, segments) of three segments: the second overlaps the first, the third is apart."""
+    """Voxels (slices, rows, columns, segments) of three segments: the second overlaps the first,
+    the third is apart.
+    """
     k, j, i = np.indices(shape)
     first, second = (k >= 1) & (k <= 3) & (j < 6), (k == 3) & (j >= 4) & (i < 5)
     return np.stack([first, second, (k == 7) & (i > 2)], axis=-1)
@@ -433,12 +539,23 @@ COLOURS = [(128, 174, 128), (255, 0, 0), (20, 60, 200)]
 
 def segmentation(hd, path, voxels, kind="BINARY", **options):
     """A segmentation of an oblique CT of single slices, 3 mm apart, without its empty frames."""
-    about = {"PatientName": "A^B", "StudyInstanceUID": "1.2.4", "FrameOfReferenceUID": "1.2.5", "Modality": "CT"}
-    about |= dict.fromkeys(("PatientBirthDate", "PatientSex", "StudyID", "StudyDate", "StudyTime"), "")
+    about = {
+        "PatientName": "A^B",
+        "StudyInstanceUID": "1.2.4",
+        "FrameOfReferenceUID": "1.2.5",
+        "Modality": "CT",
+    }
+    about |= dict.fromkeys(
+        ("PatientBirthDate", "PatientSex", "StudyID", "StudyDate", "StudyTime"), ""
+    )
     about |= {"AccessionNumber": "", "ReferringPhysicianName": "", "SliceThickness": STEP}
     source = []
     for k, place in enumerate(places(len(voxels))):
-        source.append(one_slice(np.zeros(voxels.shape[1:3]), place, InstanceNumber=k + 1, PatientID="1", **about))
+        source.append(
+            one_slice(
+                np.zeros(voxels.shape[1:3]), place, InstanceNumber=k + 1, PatientID="1", **about
+            )
+        )
         source[-1].file_meta = FileMetaDataset()
         source[-1].file_meta.TransferSyntaxUID = EXPLICIT
     tissue = hd.sr.CodedConcept("85756007", "SCT", "Tissue")
@@ -446,16 +563,20 @@ def segmentation(hd, path, voxels, kind="BINARY", **options):
         hd.seg.SegmentDescription(
             number, label, tissue, tissue, "MANUAL", display_color=hd.color.CIELabColor.from_rgb(*c)
         )
-        for number, (label, c) in enumerate(zip(("liver", "tumour", "tumour"), COLOURS, strict=True), 1)
+        for number, (label, c) in enumerate(
+            zip(("liver", "tumour", "tumour"), COLOURS, strict=True), 1
+        )
     ]
-    hd.seg.Segmentation(source, voxels, kind, segments, "1.2.6", 1, "1.2.8", 1, "m", "m", "1", "1", **options).save_as(
-        path
-    )
+    hd.seg.Segmentation(
+        source, voxels, kind, segments, "1.2.6", 1, "1.2.8", 1, "m", "m", "1", "1", **options
+    ).save_as(path)
     return path
 
 
 def assert_segments(image, labels):
-    """Labels (slices, rows, columns) lie where they were; slices from the first to the last frame, of 1 to 7."""
+    """Labels (slices, rows, columns) lie where they were; slices from the first to the last
+    frame, of 1 to 7.
+    """
     affine = affine_of()
     affine[:3, 3] += affine[:3, 2]
     assert_placed(image, labels[1:8], affine)
@@ -466,11 +587,15 @@ NUMBERS = np.array([1, 2, 3])
 
 @pytest.mark.apart
 def test_segments_by_number(tmp_path, hd):
-    """Empty slices between frames stay empty; of overlapping segments, the larger number is kept, and told."""
+    """Empty slices between frames stay empty; of overlapping segments, the larger number is
+    kept, and told.
+    """
     voxels = blobs()
     path = segmentation(hd, tmp_path / "a.dcm", voxels)
     assert len(pydicom.dcmread(path).PerFrameFunctionalGroupsSequence) == 5
-    with pytest.warns(UserWarning, match=r"larger number is kept: 1 \(liver\) and 2 \(tumour\) in 10 voxels$"):
+    with pytest.warns(
+        UserWarning, match=r"larger number is kept: 1 \(liver\) and 2 \(tumour\) in 10 voxels$"
+    ):
         assert_segments(load_image(path), (voxels * NUMBERS).max(axis=-1))
 
 
@@ -496,23 +621,33 @@ def test_label_map_of_segments(tmp_path, hd):
     data.PixelPaddingValue = 255
     assert_segments(load_image(saved(path, data)), labels)
     del data.PixelPaddingValue
-    with pytest.warns(UserWarning, match=r"voxels have values of no segment \(\[255\]\) and get label 0"):
+    with pytest.warns(
+        UserWarning, match=r"voxels have values of no segment \(\[255\]\) and get label 0"
+    ):
         assert_segments(load_image(saved(path, data)), labels)
 
 
 def test_fractions_of_segments(tmp_path, hd):
     """A voxel belongs to the largest fraction of a half or more."""
     voxels = blobs()
-    path = segmentation(hd, tmp_path / "a.dcm", voxels * [0.8, 0.6, 0.49] + voxels[..., ::-1] * 0.01, "FRACTIONAL")
-    with pytest.warns(UserWarning, match=r"larger fraction, or number is kept: 1 \(liver\) and 2 .* in 10 voxels"):
+    path = segmentation(
+        hd, tmp_path / "a.dcm", voxels * [0.8, 0.6, 0.49] + voxels[..., ::-1] * 0.01, "FRACTIONAL"
+    )
+    with pytest.warns(
+        UserWarning, match=r"larger fraction, or number is kept: 1 \(liver\) and 2 .* in 10 voxels"
+    ):
         image = load_image(path)
     labels = np.where(voxels[..., 0], 1, 2 * voxels[..., 1])
     assert_segments(image, labels)
 
 
-@pytest.mark.parametrize(("name", "counts", "slices"), [("overlap", [48, 16], 165), ("single_frame", [1832], 1)])
+@pytest.mark.parametrize(
+    ("name", "counts", "slices"), [("overlap", [48, 16], 165), ("single_frame", [1832], 1)]
+)
 def test_public_segmentations(data_dir, hd, name, counts, slices):
-    """Of highdicom's tests: 64 and 16 voxels, 16 of them in both; the first frame is 162 slices from the second."""
+    """Of highdicom's tests: 64 and 16 voxels, 16 of them in both; the first frame is 162 slices
+    from the second.
+    """
     path = data_dir / f"seg_image_ct_binary_{name}.dcm"
     image = load_image(path)
     there = hd.seg.segread(path).get_volume(combine_segments=False, allow_missing_positions=True)
@@ -520,7 +655,9 @@ def test_public_segmentations(data_dir, hd, name, counts, slices):
     np.testing.assert_array_equal(np.bincount(image.data.astype(int).ravel())[1:], counts)
     is_in = there.array.any(axis=-1)
     world = there.map_indices_to_reference(np.argwhere(is_in)).mean(axis=0) * [-1, -1, 1]
-    np.testing.assert_allclose(image.to_world(np.argwhere(image.data > 0)).mean(axis=0), world, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(
+        image.to_world(np.argwhere(image.data > 0)).mean(axis=0), world, rtol=0, atol=1e-4
+    )
 
 
 def edited(hd, path, edit):
@@ -555,7 +692,9 @@ def test_segments_that_are_no_volume(tmp_path, hd):
 
 def test_distance_of_segments_that_is_not_that_of_their_frames(tmp_path, hd):
     def half(data, where):
-        data.SharedFunctionalGroupsSequence[0].PixelMeasuresSequence[0].SpacingBetweenSlices = STEP / 2
+        data.SharedFunctionalGroupsSequence[0].PixelMeasuresSequence[0].SpacingBetweenSlices = (
+            STEP / 2
+        )
 
     with pytest.warns(UserWarning, match="1.5 mm apart as it states, but its frames 3 mm"):
         assert load_image(edited(hd, tmp_path / "a.dcm", half)).shape == (7, 8, 13)
@@ -564,7 +703,9 @@ def test_distance_of_segments_that_is_not_that_of_their_frames(tmp_path, hd):
         del data.SharedFunctionalGroupsSequence[0].PixelMeasuresSequence[0].SpacingBetweenSlices
         data.SharedFunctionalGroupsSequence[0].PixelMeasuresSequence[0].SliceThickness = STEP / 2
 
-    with pytest.warns(UserWarning, match="3 mm apart by their positions, which are used; SliceThickness is 1.5 mm"):
+    with pytest.warns(
+        UserWarning, match="3 mm apart by their positions, which are used; SliceThickness is 1.5 mm"
+    ):
         assert load_image(edited(hd, tmp_path / "a.dcm", thin)).shape == (7, 8, 7)
 
 
@@ -572,29 +713,40 @@ def test_frames_of_segments_that_lie_far_apart(tmp_path, hd):
     def far(data, where):
         frame = data.PerFrameFunctionalGroupsSequence[-1].PlanePositionSequence[0]
         others = data.PerFrameFunctionalGroupsSequence[0].PlanePositionSequence[0]
-        step = np.array(frame.ImagePositionPatient) - np.array(others.ImagePositionPatient)  # of 4 slices
+        # of 4 slices
+        step = np.array(frame.ImagePositionPatient) - np.array(others.ImagePositionPatient)
         frame.ImagePositionPatient = [*map(float, np.array(frame.ImagePositionPatient) + 10 * step)]
 
-    with pytest.warns(UserWarning, match="frames lie in 4 slices, far apart: 43 slices between them are empty"):
+    with pytest.warns(
+        UserWarning, match="frames lie in 4 slices, far apart: 43 slices between them are empty"
+    ):
         assert load_image(edited(hd, tmp_path / "a.dcm", far)).shape == (7, 8, 47)
 
 
 def test_names_and_colours_of_segments(tmp_path, hd):
-    """As `--label-names` reads them; from the folder, too. Names that two segments share get numbers."""
+    """As `--label-names` reads them; from the folder, too. Names that two segments share get
+    numbers.
+    """
     path = segmentation(hd, tmp_path / "a.dcm", blobs())
     for source in (path, tmp_path):
         table = load_label_table(source)
         assert table.names == {1: "liver", 2: "tumour 2", 3: "tumour 3"}
-        np.testing.assert_allclose(list(table.colours.values()), np.array(COLOURS) / 255, rtol=0, atol=0.004)
+        np.testing.assert_allclose(
+            list(table.colours.values()), np.array(COLOURS) / 255, rtol=0, atol=0.004
+        )
     with pytest.raises(InputError, match="expected names of segments in this file, found none"):
         load_label_table(saved(tmp_path / "b.dcm", enhanced(RAMP, places())))
 
 
 @pytest.mark.full
 def test_mesh_of_a_scan_and_its_segmentation(tmp_path, hd, capsys):
-    """Frames in another order, and a segmentation with fewer slices: labels lie where they were, with their names."""
+    """Frames in another order, and a segmentation with fewer slices: labels lie where they were,
+    with their names.
+    """
     k, j, i = np.indices((16, 30, 20))
-    world = ORIGIN + i[..., None] * BETWEEN_COLUMNS * AXES[0] + j[..., None] * BETWEEN_ROWS * AXES[1]
+    world = (
+        ORIGIN + i[..., None] * BETWEEN_COLUMNS * AXES[0] + j[..., None] * BETWEEN_ROWS * AXES[1]
+    )
     world = world + k[..., None] * STEP * NORMAL
     centre = ORIGIN + 7 * AXES[0] + 7 * AXES[1] + 22 * NORMAL
     far = np.linalg.norm(world - centre, axis=-1)
@@ -604,7 +756,9 @@ def test_mesh_of_a_scan_and_its_segmentation(tmp_path, hd, capsys):
     data.FrameOfReferenceUID = "1.2.5"
     scan = saved(tmp_path / "ct.dcm", data)
     labels = segmentation(hd, tmp_path / "seg.dcm", voxels)
-    assert exit_code("mesh", scan, "--labels", labels, "-o", tmp_path / "a.vtu", "--nodes", 900) == 0
+    assert (
+        exit_code("mesh", scan, "--labels", labels, "-o", tmp_path / "a.vtu", "--nodes", 900) == 0
+    )
     loaded = tetopt.load_mesh(tmp_path / "a.vtu")
     assert loaded.label_table.names == {1: "liver", 2: "tumour 2", 3: "tumour 3"}
     assert "frame of reference" not in capsys.readouterr().err
@@ -619,4 +773,7 @@ def test_mesh_of_a_scan_and_its_segmentation(tmp_path, hd, capsys):
     other = saved(tmp_path / "other.dcm", data)
     words = ["-o", tmp_path / "b.vtu", "--nodes", 50, "--iterations", 0]
     assert exit_code("mesh", other, "--labels", labels, *words) in (0, 1)
-    assert "seg.dcm: its positions are in another frame of reference" in capsys.readouterr().err.replace("\n  ", " ")
+    assert (
+        "seg.dcm: its positions are in another frame of reference"
+        in capsys.readouterr().err.replace("\n  ", " ")
+    )

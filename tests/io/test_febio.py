@@ -1,4 +1,5 @@
-"""FEBio files read back as XML by the rules of FEBio 4's own reader, and checked against pyfebio's models of the spec.
+"""FEBio files read back as XML by the rules of FEBio 4's own reader, and checked against pyfebio's
+models of the spec.
 
 No FEBio is at hand to run them.
 """
@@ -29,7 +30,11 @@ def with_moduli(nu):
 
 def sample(kind):
     """Few materials, or one for each cell and ratios that vary, too."""
-    return sample_model() if kind == "parts" else with_moduli(np.linspace(0.1, 0.45, len(sample_model().mesh.cells)))
+    return (
+        sample_model()
+        if kind == "parts"
+        else with_moduli(np.linspace(0.1, 0.45, len(sample_model().mesh.cells)))
+    )
 
 
 KINDS = ["parts", "maps"]
@@ -61,14 +66,20 @@ class Feb:
         for part in mesh.findall("Elements"):
             self.type = part.get("type")
             self.parts[part.get("name")], table = rows_of(part, "elem")
-            nodes_of_id |= dict(zip(self.parts[part.get("name")].tolist(), table.astype(np.int64), strict=True))
+            nodes_of_id |= dict(
+                zip(self.parts[part.get("name")].tolist(), table.astype(np.int64), strict=True)
+            )
         self.cells = np.array([nodes_of_id[k + 1] for k in range(len(nodes_of_id))]) - 1
         self.surfaces = {
             surface.get("name"): rows_of(surface, surface[0].tag)[1].astype(np.int64) - 1
             for surface in mesh.findall("Surface")
         }
-        self.node_sets = {element.get("name"): listed(element) - 1 for element in mesh.findall("NodeSet")}
-        self.cell_sets = {element.get("name"): listed(element) - 1 for element in mesh.findall("ElementSet")}
+        self.node_sets = {
+            element.get("name"): listed(element) - 1 for element in mesh.findall("NodeSet")
+        }
+        self.cell_sets = {
+            element.get("name"): listed(element) - 1 for element in mesh.findall("ElementSet")
+        }
         self.data = {}
         for entry in self.root.findall("MeshData/ElementData"):
             lid, values = rows_of(entry, "elem", "lid")
@@ -80,9 +91,14 @@ class Feb:
         material_of = {m.get("name"): m for m in self.root.find("Material")}
         result = np.full(len(self.cells), np.nan)
         for domain in self.root.find("MeshDomains"):
-            parameter, ids = material_of[domain.get("mat")].find(tag), self.parts[domain.get("name")]
+            parameter, ids = (
+                material_of[domain.get("mat")].find(tag),
+                self.parts[domain.get("name")],
+            )
             result[ids - 1] = (
-                self.data[parameter.text][ids - 1] if parameter.get("type") == "map" else float(parameter.text)
+                self.data[parameter.text][ids - 1]
+                if parameter.get("type") == "map"
+                else float(parameter.text)
             )
         return result
 
@@ -118,7 +134,9 @@ def test_everything_comes_back(kind, space):
 
 
 def test_no_name_is_taken_twice():
-    """FEBio refuses a second node or element set of a name, and Nodes and Elements make one each."""
+    """FEBio refuses a second node or element set of a name, and Nodes and Elements make one
+    each.
+    """
     for kind in KINDS:
         mesh = ET.fromstring(febio(sample(kind))).find("Mesh")
         for tags in (("Nodes", "NodeSet"), ("Elements", "ElementSet"), ("Surface",)):
@@ -153,11 +171,17 @@ def test_conditions_move_each_node_of_each_load():
     prescribed = {}
     for bc in root.find("Boundary"):
         if bc.get("type") == "zero displacement":
-            assert [(dof.tag, dof.text) for dof in bc] == [("x_dof", "1"), ("y_dof", "1"), ("z_dof", "1")]
+            assert [(dof.tag, dof.text) for dof in bc] == [
+                ("x_dof", "1"),
+                ("y_dof", "1"),
+                ("z_dof", "1"),
+            ]
             prescribed[bc.get("node_set")] = [0.0, 0.0, 0.0]
         else:
             assert bc.get("type") == "prescribed displacement"
-            assert bc.find("value").get("lc") == "1" == root.find("LoadData/load_controller").get("id")
+            assert (
+                bc.find("value").get("lc") == "1" == root.find("LoadData/load_controller").get("id")
+            )
             assert bc.find("dof").text == "xyz"[len(prescribed.setdefault(bc.get("node_set"), []))]
             prescribed[bc.get("node_set")].append(float(bc.find("value").text))
     assert prescribed == {load.set_name: load.numbers.tolist() for load in model.loads}
@@ -167,10 +191,11 @@ def test_conditions_move_each_node_of_each_load():
 
 
 def test_sections_are_those_of_pyfebio():
-    """Sections, parameters, types and the forms of numbers, none unknown to the spec as pyfebio models it.
+    """Sections, parameters, types and the forms of numbers, none unknown to the spec as pyfebio
+    models it.
 
-    pyfebio knows neither <units> nor names of conditions, which FEBio Studio writes, and reads no 0 or 1 back: what has
-    them is compared with what it writes.
+    pyfebio knows neither <units> nor names of conditions, which FEBio Studio writes, and reads no 0
+    or 1 back: what has them is compared with what it writes.
     """
     pyfebio = pytest.importorskip("pyfebio")
     for kind in KINDS:
@@ -181,7 +206,11 @@ def test_sections_are_those_of_pyfebio():
         root.remove(control)
         root.remove(boundary)
         read = pyfebio.model.Model.from_xml(ET.tostring(root))
-        assert len(read.mesh_.elements) == len(read.meshdomains_.solid_domains) == len(read.material_.all_materials)
+        assert (
+            len(read.mesh_.elements)
+            == len(read.meshdomains_.solid_domains)
+            == len(read.material_.all_materials)
+        )
         assert read.mesh_.nodes[0].all_nodes[-1].id == len(model.mesh.points)
         known = ET.fromstring(pyfebio.control.Control().to_xml())
         assert {e.tag for e in control.iter()} <= {e.tag for e in known.iter()}
@@ -196,17 +225,21 @@ def test_sections_are_those_of_pyfebio():
         expected = []
         for load in model.loads:
             if not load.numbers.any():
-                condition = pyfebio.boundary.BCZeroDisplacement(node_set=load.set_name, x_dof=1, y_dof=1, z_dof=1)
+                condition = pyfebio.boundary.BCZeroDisplacement(
+                    node_set=load.set_name, x_dof=1, y_dof=1, z_dof=1
+                )
                 expected.append(condition.to_xml())
                 continue
             for dof, value in zip("xyz", load.numbers.tolist(), strict=True):
                 moved = pyfebio.boundary.Value(lc=1, text=value)
                 expected.append(
-                    pyfebio.boundary.BCPrescribedDisplacement(node_set=load.set_name, dof=dof, value=moved).to_xml()
+                    pyfebio.boundary.BCPrescribedDisplacement(
+                        node_set=load.set_name, dof=dof, value=moved
+                    ).to_xml()
                 )
-        assert [ET.canonicalize(ET.tostring(bc, encoding="unicode").strip()) for bc in boundary] == [
-            ET.canonicalize(text.decode()) for text in expected
-        ]
+        assert [
+            ET.canonicalize(ET.tostring(bc, encoding="unicode").strip()) for bc in boundary
+        ] == [ET.canonicalize(text.decode()) for text in expected]
 
 
 def test_units_are_consistent_with_mm():
@@ -259,7 +292,9 @@ def test_what_it_cannot_carry(model, message):
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize("case", LOAD_CASES)
 def test_what_the_file_says_is_what_fem_solves(case, order):
-    """Pressures on the file's own surfaces, forces, springs at small displacements, conditions; by our own matrix."""
+    """Pressures on the file's own surfaces, forces, springs at small displacements, conditions;
+    by our own matrix.
+    """
     model = loaded_model(case, order=order)
     root = ET.fromstring(febio(model))
     nodes = {node.get("id"): numbers(node) for nodes in root.iter("Nodes") for node in nodes}
@@ -267,7 +302,11 @@ def test_what_the_file_says_is_what_fem_solves(case, order):
     sets = {each.get("name"): listed(each) - 1 for each in root.iter("NodeSet")}
     is_prescribed, prescribed = np.zeros(points.shape, dtype=bool), np.zeros(points.shape)
     for bc in root.find("Boundary") or ():
-        dofs = [0, 1, 2] if bc.get("type") == "zero displacement" else ["xyz".index(bc.find("dof").text)]
+        dofs = (
+            [0, 1, 2]
+            if bc.get("type") == "zero displacement"
+            else ["xyz".index(bc.find("dof").text)]
+        )
         for dof in dofs:
             is_prescribed[sets[bc.get("node_set")], dof] = True
             prescribed[sets[bc.get("node_set")], dof] = float(bc.findtext("value") or 0.0)
@@ -275,29 +314,40 @@ def test_what_the_file_says_is_what_fem_solves(case, order):
     for load in root.find("Loads") or ():
         if load.get("type") == "nodal_force":
             assert (load.find("value").get("type"), load.find("value").get("lc")) == ("map", "1")
-            (data,) = (each for each in root.iter("NodeData") if each.get("name") == load.find("value").text)
+            (data,) = (
+                each
+                for each in root.iter("NodeData")
+                if each.get("name") == load.find("value").text
+            )
             assert (data.get("node_set"), data.get("data_type")) == (load.get("node_set"), "vec3")
             assert [node.get("lid") for node in data] == list(map(str, range(1, len(data) + 1)))
             forces[sets[load.get("node_set")]] += np.array([numbers(node) for node in data])
             continue
         assert load.get("type") == "pressure"
-        (surface,) = (each for each in root.iter("Surface") if each.get("name") == load.get("surface"))
+        (surface,) = (
+            each for each in root.iter("Surface") if each.get("name") == load.get("surface")
+        )
         for facet in surface:
             corners = listed(facet) - 1
             a, b, c = points[corners[:3]]
             push = -float(load.findtext("pressure")) * np.cross(b - a, c - a) / 6.0
             forces[corners[-3:]] += push  # corners of a linear facet; midpoints of a quadratic one
     springs = np.zeros((len(points), 3, 3))
-    stiffness = {each.get("id"): float(each.findtext("E")) for each in root.iter("discrete_material")}
+    stiffness = {
+        each.get("id"): float(each.findtext("E")) for each in root.iter("discrete_material")
+    }
     for each in root.iter("discrete"):
-        (pairs,) = (one for one in root.iter("DiscreteSet") if one.get("name") == each.get("discrete_set"))
+        (pairs,) = (
+            one for one in root.iter("DiscreteSet") if one.get("name") == each.get("discrete_set")
+        )
         for pair in pairs:
             here, there = listed(pair) - 1
             along = (points[there] - points[here]) / np.linalg.norm(points[there] - points[here])
             assert is_prescribed[there].all()
             springs[here] += stiffness[each.get("dmat")] * np.outer(along, along)
     n = len(elements(model)[0])
-    np.testing.assert_allclose(springs, springs[:, :1, :1] * np.eye(3), atol=1e-12)  # the same in all directions
+    # the same in all directions
+    np.testing.assert_allclose(springs, springs[:, :1, :1] * np.eye(3), atol=1e-12)
     u = displaced(model, is_prescribed[:n], prescribed[:n], forces[:n], springs[:n, 0, 0])
     np.testing.assert_allclose(u, solve(model).u, atol=1e-9 * np.abs(u).max())
 
@@ -322,7 +372,15 @@ def test_loads_are_those_of_pyfebio():
     assert (force.tag, force[0].tag) == (known.tag, known[-1].tag)
     data = next(root.iter("NodeData"))
     assert pyfebio.meshdata.NodeData.from_xml(ET.tostring(data)).data_type == "vec3"
-    sets = [pyfebio.mesh.DiscreteSet.from_xml(ET.tostring(each)) for each in root.iter("DiscreteSet")]
+    sets = [
+        pyfebio.mesh.DiscreteSet.from_xml(ET.tostring(each)) for each in root.iter("DiscreteSet")
+    ]
     assert (
-        len(sets) == len(pyfebio.discrete.Discrete.from_xml(ET.tostring(root.find("Discrete"))).discrete_materials) > 3
+        len(sets)
+        == len(
+            pyfebio.discrete.Discrete.from_xml(
+                ET.tostring(root.find("Discrete"))
+            ).discrete_materials
+        )
+        > 3
     )

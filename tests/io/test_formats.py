@@ -28,7 +28,8 @@ from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.model.sets import Sets
 
 CORNER = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]]), np.array([[0, 1, 2, 3]])
-# What every format with a place for names can hold, and what none can: by what that is called instead.
+# What every format with a place for names can hold, and what none can: by what that is called
+# instead.
 KEPT = [
     "<x>",
     'a"b',
@@ -45,9 +46,16 @@ KEPT = [
     "\\n",
 ]
 SHOWN = {
-    "x\x1b[31m": r"x\x1b[31m", "z\0q": r"z\x00q", "line\nbreak\r\t": r"line\nbreak\r\t", "\u202egnp": r"\u202egnp",
-    "a\u2028b": r"a\u2028b", "\udcff": r"\udcff", "\ufffe": r"\ufffe", "": "unnamed", " ": "unnamed_2",
-}  # fmt: skip
+    "x\x1b[31m": r"x\x1b[31m",
+    "z\0q": r"z\x00q",
+    "line\nbreak\r\t": r"line\nbreak\r\t",
+    "\u202egnp": r"\u202egnp",
+    "a\u2028b": r"a\u2028b",
+    "\udcff": r"\udcff",
+    "\ufffe": r"\ufffe",
+    "": "unnamed",
+    " ": "unnamed_2",
+}
 IMAGE = 'a"<b>&-->\n*NODE\n$EndComments\r\0\x1b]0;title\x07\u202e\udcff é ' + 300 * "x" + ".nii"
 
 
@@ -56,12 +64,20 @@ def hostile_model(suffix):
     names = [*KEPT, *SHOWN]
     values = np.arange(len(model.mesh.cells), dtype=float)
     cell_data = {name: values + number for number, name in enumerate(names)}
-    point_data = {} if suffix == ".feb" else {name: model.mesh.points[:, 0] + k for k, name in enumerate(names)}
-    return model._replace(cell_data=cell_data, point_data=point_data, about={"tetopt": "0.1.0\n!", "image": IMAGE})
+    point_data = (
+        {}
+        if suffix == ".feb"
+        else {name: model.mesh.points[:, 0] + k for k, name in enumerate(names)}
+    )
+    return model._replace(
+        cell_data=cell_data, point_data=point_data, about={"tetopt": "0.1.0\n!", "image": IMAGE}
+    )
 
 
 def found(path, model):
-    """How many points and cells a reader finds in a file, and the names of the sets of facets and cells."""
+    """How many points and cells a reader finds in a file, and the names of the sets of facets
+    and cells.
+    """
     suffix = path.suffix
     if suffix == ".inp":
         file, sets = meshio.read(path), input_sets(path, model.mesh)
@@ -71,8 +87,14 @@ def found(path, model):
         return len(feb.points), len(feb.cells), feb.surfaces, feb.cell_sets
     if suffix == ".xdmf":
         parts = grids(path.read_bytes())
-        points, cells = (item(parts["mesh"].find(f"{each}/DataItem")) for each in ("Geometry", "Topology"))
-        return len(points), len(cells), *(named(parts[each]) if each in parts else () for each in ("facets", "cells"))
+        points, cells = (
+            item(parts["mesh"].find(f"{each}/DataItem")) for each in ("Geometry", "Topology")
+        )
+        return (
+            len(points),
+            len(cells),
+            *(named(parts[each]) if each in parts else () for each in ("facets", "cells")),
+        )
     if suffix == ".mfem":
         mfem = Mfem(path.read_bytes())
         return len(mfem.points), len(mfem.cells), mfem.facet_sets, mfem.cell_sets
@@ -107,14 +129,26 @@ def saved(path, model):
 
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_no_name_breaks_a_file(suffix, tmp_path):
-    """Each file is of text without control characters but line breaks, or tells no name at all but in bytes."""
+    """Each file is of text without control characters but line breaks, or tells no name at all
+    but in bytes.
+    """
     model = hostile_model(suffix)
     text = saved(tmp_path / f"a{suffix}", model)
     assert_whole(tmp_path / f"a{suffix}", model)
-    head = text[: text.index(b"CELLS")] if suffix == ".vtk" else text[:80] if suffix == ".stl" else text
+    head = (
+        text[: text.index(b"CELLS")]
+        if suffix == ".vtk"
+        else text[:80]
+        if suffix == ".stl"
+        else text
+    )
     head = head[: head.index(b"end_header")] if suffix == ".ply" else head
     if suffix == ".vtk":
-        head = b"\n".join(re.findall(rb"\n([\x20-\x7e]+ \d+ \d+ (?:double|vtktypeint64|unsigned_char|int))\n", text))
+        head = b"\n".join(
+            re.findall(
+                rb"\n([\x20-\x7e]+ \d+ \d+ (?:double|vtktypeint64|unsigned_char|int))\n", text
+            )
+        )
     shown = head.decode()
     assert plain(shown.replace("\n", "")) == shown.replace("\n", "")
     if suffix == ".xdmf":
@@ -126,7 +160,10 @@ def test_no_name_breaks_a_file(suffix, tmp_path):
 def test_braces_in_names_end_no_process(name, tmp_path):
     """VTK's writer of legacy files reads them as marks of its own, and ends the process."""
     model = sample_model()._replace(loads=())
-    values = {name: np.arange(len(model.mesh.cells), dtype=float), "a": np.ones(len(model.mesh.cells))}
+    values = {
+        name: np.arange(len(model.mesh.cells), dtype=float),
+        "a": np.ones(len(model.mesh.cells)),
+    }
     at_nodes = {name: model.mesh.points[:, 0], f"{name}2": model.mesh.points}
     model = model._replace(cell_data=values, point_data=at_nodes, about={name: "x"})
     with warnings.catch_warnings():
@@ -139,7 +176,9 @@ def test_braces_in_names_end_no_process(name, tmp_path):
 @pytest.mark.full
 @pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".msh"])
 def test_names_come_back(suffix, tmp_path):
-    """As they were where they are printable text, else as Python escapes them; gmsh has no quotes."""
+    """As they were where they are printable text, else as Python escapes them; gmsh has no
+    quotes.
+    """
     model = hostile_model(suffix)
     saved(tmp_path / f"a{suffix}", model)
     back = tetopt.load_mesh(tmp_path / f"a{suffix}")
@@ -149,13 +188,19 @@ def test_names_come_back(suffix, tmp_path):
     assert {*expected.values()} == back.cell_data.keys() - {"young", "nu", "material"}
     assert {*expected.values()} == back.point_data.keys()
     for name, new in expected.items():
-        for values, written in ((back.cell_data, model.cell_data), (back.point_data, model.point_data)):
-            assert np.array_equal(np.sort(values[new]), np.sort(written[name]))  # .msh has another order
+        for values, written in (
+            (back.cell_data, model.cell_data),
+            (back.point_data, model.point_data),
+        ):
+            # .msh has another order
+            assert np.array_equal(np.sort(values[new]), np.sort(written[name]))
     assert {name: len(rows) for name, rows in back.sets.facets.items()} == {
         name: len(rows) for name, rows in model.sets.facets.items()
     }
     image = back.text("image")
-    assert image == (plain(" ".join(IMAGE.split())) if suffix == ".msh" else IMAGE.replace("\udcff", "\\udcff"))
+    assert image == (
+        plain(" ".join(IMAGE.split())) if suffix == ".msh" else IMAGE.replace("\udcff", "\\udcff")
+    )
 
 
 def test_two_names_never_become_one():
@@ -167,7 +212,9 @@ def test_two_names_never_become_one():
     long = {300 * "é" + str(k): values + k for k in range(3)}
     model = sample_model()._replace(cell_data=data | long, loads=())
     with pytest.warns(UserWarning, match=r"support: a\\n_2"):
-        names = set(re.findall(r'\$ElementData\n1\n"([^"]*)"', file_bytes(Path("a.msh"), model).decode()))
+        names = set(
+            re.findall(r'\$ElementData\n1\n"([^"]*)"', file_bytes(Path("a.msh"), model).decode())
+        )
     assert len(names - {"young", "nu", "material", *model.sets.cells}) == 10
 
 
@@ -176,11 +223,18 @@ def test_names_of_any_length(suffix, tmp_path):
     mesh = sample_model().mesh
     values = np.arange(len(mesh.cells), dtype=float)
     names = ["x" * 240, "x" * 241, "x" * 100_000, "名" * 100]
-    model = sample_model()._replace(cell_data={name: values + k for k, name in enumerate(names)}, loads=())
+    model = sample_model()._replace(
+        cell_data={name: values + k for k, name in enumerate(names)}, loads=()
+    )
     saved(tmp_path / f"a{suffix}", model)
     if suffix != ".feb":
         back = tetopt.load_mesh(tmp_path / f"a{suffix}").cell_data
-        assert [each for each in back if each[0] in "x名"] == ["x" * 240, "x" * 240 + "_2", "x" * 240 + "_3", "名" * 26]
+        assert [each for each in back if each[0] in "x名"] == [
+            "x" * 240,
+            "x" * 240 + "_2",
+            "x" * 240 + "_3",
+            "名" * 26,
+        ]
 
 
 @pytest.mark.parametrize("name", ["a b", "", "1a", "x" * 73, "a\n", "ä"])
@@ -212,9 +266,17 @@ def test_a_mesh_is_written_by_its_suffix(suffix, tmp_path):
         return
     save_mesh(path, mesh)
     heads = {
-        ".vtu": b"<?xml", ".vtk": b"# vtk", ".xdmf": b"<?xml", ".msh": b"$MeshFormat\n4.1", ".inp": b"** tetopt",
-        ".msh2": b"$MeshFormat\n2.2", ".mfem": b"MFEM", ".mesh": b"MeshVersion", ".stl": b"tetopt", ".ply": b"ply",
-    }  # fmt: skip
+        ".vtu": b"<?xml",
+        ".vtk": b"# vtk",
+        ".xdmf": b"<?xml",
+        ".msh": b"$MeshFormat\n4.1",
+        ".inp": b"** tetopt",
+        ".msh2": b"$MeshFormat\n2.2",
+        ".mfem": b"MFEM",
+        ".mesh": b"MeshVersion",
+        ".stl": b"tetopt",
+        ".ply": b"ply",
+    }
     assert path.read_bytes().startswith(heads[suffix.lower()])
 
 
@@ -237,7 +299,9 @@ def test_labels_of_a_surface_that_its_file_cannot_name_are_refused(tmp_path):
     for suffix in (".ply", ".vtp", ".vtk"):
         with pytest.raises(InputError, match=r'got "a\\nproperty int b"'):
             save_surface(
-                tmp_path / f"a{suffix}", surface, labels={"a\nproperty int b": np.zeros(len(surface.triangles), int)}
+                tmp_path / f"a{suffix}",
+                surface,
+                labels={"a\nproperty int b": np.zeros(len(surface.triangles), int)},
             )
     assert list(tmp_path.iterdir()) == []
 
@@ -245,7 +309,17 @@ def test_labels_of_a_surface_that_its_file_cannot_name_are_refused(tmp_path):
 @pytest.mark.full
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_names_that_are_words_of_a_format(suffix, tmp_path):
-    words = ["METADATA", "SCALARS", "POINTS", "CELL_DATA", "FIELD", "LOOKUP_TABLE", "$EndNodes", "*NODE", "End"]
+    words = [
+        "METADATA",
+        "SCALARS",
+        "POINTS",
+        "CELL_DATA",
+        "FIELD",
+        "LOOKUP_TABLE",
+        "$EndNodes",
+        "*NODE",
+        "End",
+    ]
     words += ["NumberOfPoints='1e99'", '<Piece NumberOfCells="7">', "last"]
     model = sample_model()
     fields = {name: np.arange(len(model.mesh.cells)) + 0.5 * k for k, name in enumerate(words)}
@@ -264,7 +338,9 @@ def test_names_that_are_words_of_a_format(suffix, tmp_path):
 def registered(monkeypatch):
     """Points as text under `.pts`; formats are as they were afterwards."""
     monkeypatch.setitem(FORMATS, ".pts", None)
-    tetopt.register_format(".PTS", lambda model: f"é {model.units} {model.mesh.points.tolist()}\n", "points")
+    tetopt.register_format(
+        ".PTS", lambda model: f"é {model.units} {model.mesh.points.tolist()}\n", "points"
+    )
 
 
 @pytest.mark.filterwarnings("ignore")  # of a mesh as coarse as this
@@ -278,8 +354,12 @@ def test_a_registered_format_is_written_alike_by_all(registered, tmp_path, capsy
     assert "points, RAS+ mm" in capsys.readouterr().out
     assert (tmp_path / "b.pts").read_text("utf-8") == whole
     tetopt.save_image(tmp_path / "a.nii.gz", tetopt.load_phantom("sphere").image(voxel_mm=8))
-    tetopt.run(tetopt.Job(images=tmp_path / "a.nii.gz", output=tmp_path / "c.pts", nodes=60, iterations=0))
-    tetopt.run(tetopt.Job(images=tmp_path / "a.nii.gz", output=tmp_path / "c.vtu", nodes=60, iterations=0))
+    tetopt.run(
+        tetopt.Job(images=tmp_path / "a.nii.gz", output=tmp_path / "c.pts", nodes=60, iterations=0)
+    )
+    tetopt.run(
+        tetopt.Job(images=tmp_path / "a.nii.gz", output=tmp_path / "c.vtu", nodes=60, iterations=0)
+    )
     points = tetopt.load_mesh(tmp_path / "c.vtu").mesh.points
     assert (tmp_path / "c.pts").read_text("utf-8") == f"é kPa {points.tolist()}\n"
 
@@ -304,7 +384,9 @@ def test_a_format_that_fails_leaves_the_old_file(registered, tmp_path):
 
 @pytest.mark.parametrize("suffix", [".INP", "pts", "", ".a/b", ".p\n"])
 def test_suffixes_that_no_format_can_have(suffix):
-    with pytest.raises(InputError, match=r"^suffix: (\.\w+ is a built-in format|expected a dot)") as caught:
+    with pytest.raises(
+        InputError, match=r"^suffix: (\.\w+ is a built-in format|expected a dot)"
+    ) as caught:
         tetopt.register_format(suffix, str)
     assert "\n" not in str(caught.value)
     assert suffix not in FORMATS.keys() - formats.BUILT_IN
@@ -315,7 +397,10 @@ def test_the_order_of_bytes_in_memory_is_not_the_file_s(suffix):
     """Data that come big-endian, as from NIfTI and MGH."""
     model = sample_model()
     swapped = model._replace(
-        cell_data={name: values.astype(values.dtype.newbyteorder(">")) for name, values in model.cell_data.items()}
+        cell_data={
+            name: values.astype(values.dtype.newbyteorder(">"))
+            for name, values in model.cell_data.items()
+        }
     )
     assert file_bytes(Path(f"a{suffix}"), swapped) == file_bytes(Path(f"a{suffix}"), model)
 
@@ -338,7 +423,9 @@ def test_a_disk_that_loses_bytes_is_noticed(suffix, tmp_path, monkeypatch):
     path, model = tmp_path / f"a{suffix}", sample_model()
     path.write_bytes(b"old")
     write = Path.write_bytes
-    monkeypatch.setattr(Path, "write_bytes", lambda self, whole: write(self, whole[:-1] + bytes([whole[-1] ^ 1])))
+    monkeypatch.setattr(
+        Path, "write_bytes", lambda self, whole: write(self, whole[:-1] + bytes([whole[-1] ^ 1]))
+    )
     with pytest.raises(OSError, match="the file reads back differently"):
         save_model(path, model)
     assert path.read_bytes() == b"old"
@@ -350,25 +437,48 @@ def bad_models():
     n_cells, n_points, table = len(model.mesh.cells), len(model.mesh.points), model.materials
     ones, rows = np.ones(n_cells), model.sets.facets["left"]
     for values in (
-        ones[1:], np.append(ones, 1.0), 3.0, np.array(3.0), None, ones[:, None][:, :0], ones * 1j,
-        np.full(n_cells, "a"), np.full(n_cells, None), np.zeros(n_cells, "M8[s]"), [10**30] * n_cells,
-        [[1, 2], *[[1]] * (n_cells - 1)], np.ma.masked_less(np.arange(n_cells), 2),
-    ):  # fmt: skip
+        ones[1:],
+        np.append(ones, 1.0),
+        3.0,
+        np.array(3.0),
+        None,
+        ones[:, None][:, :0],
+        ones * 1j,
+        np.full(n_cells, "a"),
+        np.full(n_cells, None),
+        np.zeros(n_cells, "M8[s]"),
+        [10**30] * n_cells,
+        [[1, 2], *[[1]] * (n_cells - 1)],
+        np.ma.masked_less(np.arange(n_cells), 2),
+    ):
         yield "cell_data: 'a': ", model._replace(cell_data={"a": values})
     yield "cell_data: expected strings as names", model._replace(cell_data={3: ones})
     yield "cell_data: expected a dict", model._replace(cell_data=[ones])
     for values in (np.ones(n_points - 1), np.ones(n_points + 1), np.full(n_points, "a"), 3.0):
         yield "point.data: ", model._replace(point_data={"a": values})
     for values in (
-        rows + np.array([n_cells, 0]), rows - np.array([n_cells, 0]), rows + np.array([0, 4]), rows[:, 0],
-        rows[::-1], rows[[0, 0]], rows[:0],
-        rows.astype(float), rows == 1, np.column_stack([rows, rows[:, 1]]), 3,
-    ):  # fmt: skip
+        rows + np.array([n_cells, 0]),
+        rows - np.array([n_cells, 0]),
+        rows + np.array([0, 4]),
+        rows[:, 0],
+        rows[::-1],
+        rows[[0, 0]],
+        rows[:0],
+        rows.astype(float),
+        rows == 1,
+        np.column_stack([rows, rows[:, 1]]),
+        3,
+    ):
         yield "set 'a': expected facets", model._replace(sets=Sets({"a": values}, {}), loads=())
     for values in ([], [n_cells], [-1], [2, 1], [1, 1], ones == 1.0, [0.5], [[1]], 3, "a"):
         yield "set 'a': expected cells", model._replace(sets=Sets({}, {"a": values}), loads=())
     yield "load: ", model._replace(sets=Sets({}, {}))
-    for of_cell in (table.of_cell[1:], table.of_cell + 1, table.of_cell - 1, table.of_cell.astype(float)):
+    for of_cell in (
+        table.of_cell[1:],
+        table.of_cell + 1,
+        table.of_cell - 1,
+        table.of_cell.astype(float),
+    ):
         yield "materials: ", model._replace(materials=table._replace(of_cell=of_cell))
     for name in ("young", "nu", "density"):
         yield (
@@ -381,7 +491,9 @@ def bad_models():
 
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_data_that_do_not_fit_leave_the_old_file(suffix, tmp_path):
-    """In every format, also in those that do not hold them: no file that cannot be read, and no cut rows."""
+    """In every format, also in those that do not hold them: no file that cannot be read, and no
+    cut rows.
+    """
     path = tmp_path / f"a{suffix}"
     path.write_bytes(b"old")
     for words, model in bad_models():

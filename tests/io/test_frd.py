@@ -1,4 +1,6 @@
-"""CalculiX's results come back onto the mesh: displacements are our own, and strains and stresses follow from them."""
+"""CalculiX's results come back onto the mesh: displacements are our own, and strains and
+stresses follow from them.
+"""
 
 import re
 import sys
@@ -27,7 +29,9 @@ def assert_printed(values, expected, digits=PRINTED):
 
 
 def slopes_at(places, u, degree):
-    """Derivatives (A, 3, 3), by component and axis, at places (A, 3) of the polynomial that is u (A, 3) there."""
+    """Derivatives (A, 3, 3), by component and axis, at places (A, 3) of the polynomial that is u
+    (A, 3) there.
+    """
     x = places - places.mean(axis=0)
     powers = np.array([p for p in product(range(degree + 1), repeat=3) if sum(p) <= degree])
     weights = np.linalg.solve((x[:, None] ** powers).prod(axis=2), u)
@@ -37,7 +41,9 @@ def slopes_at(places, u, degree):
 
 
 def nodal_means(order, u):
-    """Strain and stress (K, 9), kPa, at the nodes: the plain mean over the cells around, each of its own there."""
+    """Strain and stress (K, 9), kPa, at the nodes: the plain mean over the cells around, each of
+    its own there.
+    """
     model = solved_model(order)
     mesh = model.mesh
     points, cells = quadratic(mesh.points, mesh.cells) if order == 2 else (mesh.points, mesh.cells)
@@ -65,7 +71,8 @@ def test_displacement_strain_and_stress_of_each_step(order):
         expected = our_displacement(order, step)
         assert_printed(u, expected)
         strain_means, stress_means = nodal_means(order, expected)
-        digits = 2e-5 if order == 2 else PRINTED  # its constants that extrapolate from the Gauss points have six digits
+        # its constants that extrapolate from the Gauss points have six digits
+        digits = 2e-5 if order == 2 else PRINTED
         assert_printed(strain, strain_means, digits)
         assert_printed(stress, stress_means, digits)
         xx, xy, xz, _, yy, yz, _, _, zz = stress_means.T
@@ -76,7 +83,9 @@ def test_displacement_strain_and_stress_of_each_step(order):
 
 def test_a_binary_file_is_read_as_well(tmp_path):
     pyvista_frd.convert(path_of(1), tmp_path / "b.frd", binary=True)
-    text, binary = (read_frd(path, solved_model(1).mesh) for path in (path_of(1), tmp_path / "b.frd"))
+    text, binary = (
+        read_frd(path, solved_model(1).mesh) for path in (path_of(1), tmp_path / "b.frd")
+    )
     assert list(binary.point_data) == list(text.point_data)
     for name, values in text.point_data.items():
         np.testing.assert_allclose(binary.point_data[name], values, rtol=1e-12, atol=1e-15)
@@ -94,10 +103,16 @@ def test_of_increments_the_last_is_taken(tmp_path):
 def test_what_the_head_does_not_say_is_assumed(tmp_path):
     """Stresses in kPa; the axes are those that fit."""
     (tmp_path / "a.frd").write_text(re.sub("1Utetopt; [^\n]*", "1Utest", path_of(2).read_text()))
-    results, known = (read_frd(path, solved_model(2).mesh) for path in (tmp_path / "a.frd", path_of(2)))
+    results, known = (
+        read_frd(path, solved_model(2).mesh) for path in (tmp_path / "a.frd", path_of(2))
+    )
     assert results.notes == ("a.frd does not state its units: assuming mm and kPa",)
-    np.testing.assert_array_equal(results.point_data["displacement"], known.point_data["displacement"])
-    np.testing.assert_allclose(1e3 * results.point_data["stress_nodes"], known.point_data["stress_nodes"], rtol=1e-12)
+    np.testing.assert_array_equal(
+        results.point_data["displacement"], known.point_data["displacement"]
+    )
+    np.testing.assert_allclose(
+        1e3 * results.point_data["stress_nodes"], known.point_data["stress_nodes"], rtol=1e-12
+    )
 
 
 def refused(tmp_path, words, text=None, mesh=None):
@@ -112,16 +127,28 @@ def refused(tmp_path, words, text=None, mesh=None):
 def test_results_of_another_mesh_are_refused(tmp_path):
     mesh = solved_model(1).mesh
     other = Mesh(mesh.points * [1.0, 1.0, 1.001], mesh.cells)
-    refused(tmp_path, "belongs to another mesh: 14 of 14 nodes are displaced by up to 0.121 mm", mesh=other)
     refused(
-        tmp_path, "expected 5 cells and 8 nodes .order 2: 26., got 24 cells and 14 nodes", mesh=solved_model(2).mesh
+        tmp_path,
+        "belongs to another mesh: 14 of 14 nodes are displaced by up to 0.121 mm",
+        mesh=other,
+    )
+    refused(
+        tmp_path,
+        "expected 5 cells and 8 nodes .order 2: 26., got 24 cells and 14 nodes",
+        mesh=solved_model(2).mesh,
     )
     refused(tmp_path, "expected 23 cells and 14 nodes", mesh=Mesh(mesh.points, mesh.cells[:-1]))
-    refused(tmp_path, "its nodes are connected differently", mesh=Mesh(mesh.points, mesh.cells[::-1]))
+    refused(
+        tmp_path, "its nodes are connected differently", mesh=Mesh(mesh.points, mesh.cells[::-1])
+    )
     numbers = path_of(1).read_text().replace(" -1        14", " -1        99")
-    refused(tmp_path, "its nodes are not numbered from 1 to 14", re.sub(r"(?<=\s)14\b", "99", numbers))
+    refused(
+        tmp_path, "its nodes are not numbered from 1 to 14", re.sub(r"(?<=\s)14\b", "99", numbers)
+    )
     plane = Mesh([[0.0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
-    refused(tmp_path, "expected a tetrahedral mesh for CalculiX's results, got triangles", mesh=plane)
+    refused(
+        tmp_path, "expected a tetrahedral mesh for CalculiX's results, got triangles", mesh=plane
+    )
 
 
 def test_files_without_whole_results_are_refused(tmp_path):
@@ -132,7 +159,11 @@ def test_files_without_whole_results_are_refused(tmp_path):
     refused(tmp_path, "the file is truncated", text.replace(" 9999", ""))
     refused(tmp_path, "has no results", text[: text.index("    1PSTEP")] + " 9999\n")
     refused(tmp_path, "has no displacements in step 1; request U", text.replace("DISP  ", "DISPR "))
-    refused(tmp_path, "has results at 13 of 14 nodes in step 1", text.replace("          14    ", "          13    "))
+    refused(
+        tmp_path,
+        "has results at 13 of 14 nodes in step 1",
+        text.replace("          14    ", "          13    "),
+    )
     refused(tmp_path, "DISP of step 1 is not finite at some nodes", _nan(text))
     with pytest.raises(InputError, match="no such file"):
         read_frd(tmp_path / "b.frd", solved_model(1).mesh)

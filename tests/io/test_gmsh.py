@@ -1,4 +1,6 @@
-"""gmsh files: read by a parser after gmsh's manual, by meshio and by gmsh; all of the model is there, bit by bit."""
+"""gmsh files: read by a parser after gmsh's manual, by meshio and by gmsh; all of the model is
+there, bit by bit.
+"""
 
 import importlib.util
 import json
@@ -45,7 +47,9 @@ class Read:
     """What a file holds: points; elements by number; groups by dimension and name; views."""
 
     def __init__(self, raw):
-        self.sections = [block.split("\n$End")[0].split("\n") for block in f"\n{raw.decode()}".split("\n$")[1:]]
+        self.sections = [
+            block.split("\n$End")[0].split("\n") for block in f"\n{raw.decode()}".split("\n$")[1:]
+        ]
         self.sections = [lines for lines in self.sections if not lines[0].startswith("End")]
         (self.version, is_binary, size), *_ = self.section("MeshFormat")
         assert (is_binary, size) == ("0", "8")
@@ -105,7 +109,11 @@ class Read:
                 self.add(kind, int(number), entity, self.entities[dim, entity][1], nodes)
             del lines[:count]
         assert not lines
-        assert [int(x) for x in head[1:]] == [len(self.elements), min(self.elements), max(self.elements)]
+        assert [int(x) for x in head[1:]] == [
+            len(self.elements),
+            min(self.elements),
+            max(self.elements),
+        ]
 
     def read_22(self):
         (count,), *lines = self.section("Nodes")
@@ -134,7 +142,11 @@ class Read:
         lines = [re.fullmatch(rf"entity of {what} (\d+): (.*)", line) for line in self.comments]
         entities = {int(line[1]) for line in lines if line and name in line[2].split()}
         n = max(dim for dim, _ in self.groups) - (what == "facets")
-        return [k for k, (kind, entity, _) in self.elements.items() if DIM_OF_TYPE[kind] == n and entity in entities]
+        return [
+            k
+            for k, (kind, entity, _) in self.elements.items()
+            if DIM_OF_TYPE[kind] == n and entity in entities
+        ]
 
 
 def cell_numbers(model):
@@ -152,9 +164,12 @@ def test_each_cell_without_label_is_in_the_one_group_of_its_material(version, n,
     groups = {name: members for (dim, name), members in read.groups.items() if dim == n}
     of_cell = model.materials.of_cell
     assert {name: sorted(members) for name, members in groups.items()} == {
-        f"material_{k + 1}": (np.flatnonzero(of_cell == k) + 1).tolist() for k in range(len(model.materials.young))
+        f"material_{k + 1}": (np.flatnonzero(of_cell == k) + 1).tolist()
+        for k in range(len(model.materials.young))
     }
-    assert [read.names[n, k + 1] for k in range(len(groups))] == [f"material_{k + 1}" for k in range(len(groups))]
+    assert [read.names[n, k + 1] for k in range(len(groups))] == [
+        f"material_{k + 1}" for k in range(len(groups))
+    ]
 
 
 @pytest.mark.parametrize("version", WRITERS)
@@ -178,11 +193,16 @@ def test_materials_and_sets_that_divide_a_label_leave_its_group_whole(version):
     model = labelled_model()
     table = materials(1.0 + np.arange(len(model.mesh.cells)) % 2, 0.3, len(model.mesh.cells))
     within = np.flatnonzero(model.cell_data["label"] == 3)[::3]
-    model = model._replace(materials=table, sets=model.sets._replace(cells=model.sets.cells | {"within": within}))
+    model = model._replace(
+        materials=table, sets=model.sets._replace(cells=model.sets.cells | {"within": within})
+    )
     read = Read(WRITERS[version](model))
     numbers = {}
     for number, name in ((2, "label_2"), (3, "label_3"), (7, "Right_kidney"), (8, "label_0")):
-        assert sorted(read.groups[3, name]) == (np.flatnonzero(model.cell_data["label"] == number % 8) + 1).tolist()
+        assert (
+            sorted(read.groups[3, name])
+            == (np.flatnonzero(model.cell_data["label"] == number % 8) + 1).tolist()
+        )
         numbers[number] = {read.elements[k][1] for k in read.groups[3, name]}
     assert min(numbers[3]) > 1000
     assert len(numbers[3]) == (2 if version == "4.1" else 4)
@@ -193,7 +213,9 @@ def test_materials_and_sets_that_divide_a_label_leave_its_group_whole(version):
 @pytest.mark.parametrize("suffix", [".msh", ".msh2", ".mesh", ".mfem"])
 def test_labels_too_large_for_numbers_are_numbered_from_1_with_a_table(suffix, tmp_path):
     model = labelled_model()
-    labels = np.arange(len(model.mesh.cells)) % 3 * 1_073_741_823 + (np.arange(len(model.mesh.cells)) % 3 == 2)
+    labels = np.arange(len(model.mesh.cells)) % 3 * 1_073_741_823 + (
+        np.arange(len(model.mesh.cells)) % 3 == 2
+    )
     assert np.unique(labels).tolist() == [0, 1_073_741_823, 2**31 - 1]
     model = model._replace(cell_data={"label": labels}, sets=Sets({}, {}), materials=None)
     save_model(tmp_path / f"a{suffix}", model)
@@ -216,19 +238,31 @@ def test_numbers_of_facet_groups_are_free_and_do_not_depend_on_the_mesh(version,
     assert set(numbers) == set(model.sets.facets)
     sides = [name for pair in FACE_NAMES[n] for name in pair]
     assert {name: numbers[name] for name in ("boundary", *sides)} == {
-        "boundary": 1999, **dict(zip(sides, range(1998 - len(sides), 1998), strict=True))
-    }  # fmt: skip
-    assert [numbers[f"interface_{pair}"] for pair in ("0_2", "2_3", "3_Right_kidney")] == [1001, 1002, 1003]
-    fewer = model._replace(sets=model.sets._replace(facets={"boundary": model.sets.facets["boundary"]}))
+        "boundary": 1999,
+        **dict(zip(sides, range(1998 - len(sides), 1998), strict=True)),
+    }
+    assert [numbers[f"interface_{pair}"] for pair in ("0_2", "2_3", "3_Right_kidney")] == [
+        1001,
+        1002,
+        1003,
+    ]
+    fewer = model._replace(
+        sets=model.sets._replace(facets={"boundary": model.sets.facets["boundary"]})
+    )
     assert (n - 1, 1999) in Read(WRITERS[version](fewer)).names
-    high = model._replace(cell_data={"label": model.cell_data["label"] * 400}, sets=fewer.sets._replace(cells={}))
-    assert (n - 1, 19999) in Read(WRITERS[version](high)).names  # labels up to 2800 have the numbers below
+    high = model._replace(
+        cell_data={"label": model.cell_data["label"] * 400}, sets=fewer.sets._replace(cells={})
+    )
+    # labels up to 2800 have the numbers below
+    assert (n - 1, 19999) in Read(WRITERS[version](high)).names
 
 
 @pytest.mark.parametrize("version", WRITERS)
 @pytest.mark.parametrize(("n", "bins"), MODELS)
 def test_facet_sets_are_groups(version, n, bins):
-    """In 2.2 a facet is in the smallest of its sets; what a set is made up of, the comments tell."""
+    """In 2.2 a facet is in the smallest of its sets; what a set is made up of, the comments
+    tell.
+    """
     model = sample_model(n, bins)
     read = Read(WRITERS[version](model))
     sets = model.sets.facets
@@ -245,14 +279,20 @@ def test_facet_sets_are_groups(version, n, bins):
 @pytest.mark.parametrize("n", [3, 2])
 def test_41_facets_face_out_of_the_cell_of_the_first_set(n):
     model = sample_model(n)
-    faces = {tuple(nodes) for nodes in facet_triples(model.mesh.cells, model.sets.facets["boundary"]).tolist()}
+    faces = {
+        tuple(nodes)
+        for nodes in facet_triples(model.mesh.cells, model.sets.facets["boundary"]).tolist()
+    }
     read = Read(gmsh41(model))
     assert {tuple(nodes) for nodes in read.nodes(read.groups[n - 1, "boundary"]).tolist()} == faces
 
     a = model.sets.facets["interface_0_1"]
     inner = each_once(facet_triples(model.mesh.cells, a))
     every = np.argwhere(np.ones(model.mesh.cells.shape))
-    is_inner = [nodes in inner for nodes in map(tuple, np.sort(facet_triples(model.mesh.cells, every)).tolist())]
+    is_inner = [
+        nodes in inner
+        for nodes in map(tuple, np.sort(facet_triples(model.mesh.cells, every)).tolist())
+    ]
     both = every[is_inner]
     b = both[~(both[:, None] == a).all(axis=2).any(axis=1)]  # the same facets from the other side
     assert len(b) == len(a)
@@ -278,8 +318,13 @@ def test_views_hold_cell_data_and_materials(n, bins):
     for name, values in expected.items():
         assert [read.views[name][number] for number in numbers] == values.tolist()
         assert list(read.views[name]) == list(read.elements)  # in their order, as meshio wants it
-    of_facet = {tuple(sorted(nodes)): number for number, (_, _, nodes) in read.elements.items() if len(nodes) == n}
-    for name in set(model.sets.facets) - {"dark_surface"}:  # whose facets within are held by other sets before
+    of_facet = {
+        tuple(sorted(nodes)): number
+        for number, (_, _, nodes) in read.elements.items()
+        if len(nodes) == n
+    }
+    # whose facets within are held by other sets before
+    for name in set(model.sets.facets) - {"dark_surface"}:
         rows = model.sets.facets[name]
         values = [
             read.views["mean"][of_facet[nodes]]
@@ -294,7 +339,9 @@ def test_comments_tell_image_units_constants_and_loads(version):
     comments = Read(WRITERS[version](model)).comments
     assert "coordinates: RAS+, mm" in comments
     assert f"image: {ABOUT['image']}, sha256 {ABOUT['image_sha256']}" in comments
-    for k, (young, nu) in enumerate(zip(model.materials.young.tolist(), model.materials.nu.tolist(), strict=True), 1):
+    for k, (young, nu) in enumerate(
+        zip(model.materials.young.tolist(), model.materials.nu.tolist(), strict=True), 1
+    ):
         assert f"material_{k}: young {young!r} MPa, nu {nu!r}" in comments
     for load in model.loads:
         assert f"load (not supported by this format): {load_words(load)}" in "\n".join(comments)
@@ -307,7 +354,9 @@ def test_boxes_of_entities_hold_their_elements():
     model = sample_model()
     read = Read(gmsh41(model))
     for (dim, tag), (box, _) in read.entities.items():
-        numbers = [k for k, (kind, e, _) in read.elements.items() if (DIM_OF_TYPE[kind], e) == (dim, tag)]
+        numbers = [
+            k for k, (kind, e, _) in read.elements.items() if (DIM_OF_TYPE[kind], e) == (dim, tag)
+        ]
         corners = read.points[np.unique(read.nodes(numbers))]
         assert np.array_equal(box, [*corners.min(axis=0), *corners.max(axis=0)])
 
@@ -317,7 +366,9 @@ def test_boxes_of_entities_hold_their_elements():
 
 @pytest.mark.parametrize("version", WRITERS)
 def test_cells_of_no_set_are_unnamed(version):
-    sets = Sets({"a": np.array([[0, 0]])}, {"a": np.array([5]), "b": np.array([7, 9]), "c": np.array([9])})
+    sets = Sets(
+        {"a": np.array([[0, 0]])}, {"a": np.array([5]), "b": np.array([7, 9]), "c": np.array([9])}
+    )
     model = unlabelled(sample_model())._replace(materials=None, sets=sets)
     read = Read(WRITERS[version](model))
     groups = {name: sorted(members) for (dim, name), members in read.groups.items() if dim == 3}
@@ -335,7 +386,8 @@ def test_many_materials_are_views_only(monkeypatch):
     assert [read.views["young"][number] for number in cell_numbers(model)] == young
     assert "4 materials: in the views young, kPa, and nu; not groups" in read.comments
     with pytest.raises(
-        InputError, match="at most 3 materials, as each becomes a group, got 4; group them with `bins` 32"
+        InputError,
+        match="at most 3 materials, as each becomes a group, got 4; group them with `bins` 32",
     ):
         gmsh22(model)
 
@@ -347,7 +399,8 @@ def test_names_that_are_taken(version, kind):
     members = next(iter(getattr(model.sets, kind).values()))
     model = model._replace(sets=model.sets._replace(**{kind: {"Material_2": members}}))
     with pytest.raises(
-        InputError, match=r'^set Material_2: the file uses the name "Material_2" for something else; rename the set'
+        InputError,
+        match=r'^set Material_2: the file uses the name "Material_2" for something else; rename the set',
     ):
         WRITERS[version](model)
 
@@ -355,7 +408,9 @@ def test_names_that_are_taken(version, kind):
 def test_moduli_by_label_are_read_back(tmp_path):
     """Where groups are labels and materials at once; users of meshio find them as a view."""
     sample = sample_model()
-    model = build_model(sample.mesh, young="1=10,*=2", cell_data={"label": sample.cell_data["label"]})
+    model = build_model(
+        sample.mesh, young="1=10,*=2", cell_data={"label": sample.cell_data["label"]}
+    )
     save_model(tmp_path / "a.msh", model)
     back = load_mesh(tmp_path / "a.msh").cell_data
     np.testing.assert_array_equal(back["young"], np.where(back["label"] == 1, 10.0, 2.0))
@@ -364,7 +419,9 @@ def test_moduli_by_label_are_read_back(tmp_path):
 
 def test_a_set_and_cell_data_may_have_one_name(tmp_path):
     model = sample_model()
-    save_model(tmp_path / "a.msh", model._replace(sets=model.sets._replace(cells={"mean": np.array([1])})))
+    save_model(
+        tmp_path / "a.msh", model._replace(sets=model.sets._replace(cells={"mean": np.array([1])}))
+    )
     back = load_mesh(tmp_path / "a.msh")
     (cell,) = back.sets.cells["mean"]  # of another number there, sorted by entity
     assert np.sort(back.mesh.cells[cell]).tolist() == np.sort(model.mesh.cells[1]).tolist()
@@ -380,8 +437,13 @@ SUFFIX = {"4.1": ".msh", "2.2": ".msh2"}
 @pytest.mark.parametrize(("n", "space"), [(2, "ras"), (3, "ras"), (3, "lps")])
 @pytest.mark.parametrize(("bins", "order"), [(3, 1), ("none", 1), ("many", 1), (3, 2)])
 def test_our_reader_finds_the_model(version, n, space, bins, order, tmp_path, monkeypatch):
-    """Points, cells, sets, moduli in their units, where the file came from; in 4.1 in another order of cells."""
-    model, path = (sample_model if order == 1 else quadratic_model)(n), tmp_path / f"a{SUFFIX[version]}"
+    """Points, cells, sets, moduli in their units, where the file came from; in 4.1 in another
+    order of cells.
+    """
+    model, path = (
+        (sample_model if order == 1 else quadratic_model)(n),
+        tmp_path / f"a{SUFFIX[version]}",
+    )
     if bins == "none":
         model = model._replace(materials=None)
     if bins == "many" and version == "4.1":  # then they are no groups
@@ -390,26 +452,35 @@ def test_our_reader_finds_the_model(version, n, space, bins, order, tmp_path, mo
     back = load_mesh(path)
     assert (back.space, back.n_turned, back.notes, back.order) == (space, 0, (), order)
     if order == 2 and version == "4.1":
-        assert np.array_equal(back.point_data["warmth"], all_nodes(model.point_data["warmth"], model.mesh))
+        assert np.array_equal(
+            back.point_data["warmth"], all_nodes(model.point_data["warmth"], model.mesh)
+        )
         if n == 3:
             assert np.array_equal(back.point_data["displacement"], model.point_data["displacement"])
     assert back.mesh.points.tobytes() == model.mesh.points.tobytes()
     assert {name: values.tolist() for name, values in back.field_data.items()} == {
-        "units": ["MPa"], "image": [ABOUT["image"]], "image_sha256": [ABOUT["image_sha256"]]
-    }  # fmt: skip
+        "units": ["MPa"],
+        "image": [ABOUT["image"]],
+        "image_sha256": [ABOUT["image_sha256"]],
+    }
     place = {tuple(cell): k for k, cell in enumerate(model.mesh.cells.tolist())}
     of_cell = np.array([place[tuple(cell)] for cell in back.mesh.cells.tolist()])
     assert sorted(of_cell) == list(range(len(place)))
     expected = dict(model.cell_data) if version == "4.1" else {"label": model.cell_data["label"]}
     if bins != "none":
         scaled = in_units(model, "MPa").materials
-        expected |= {"young": scaled.young[scaled.of_cell] * 1000.0, "nu": scaled.nu[scaled.of_cell]}
+        expected |= {
+            "young": scaled.young[scaled.of_cell] * 1000.0,
+            "nu": scaled.nu[scaled.of_cell],
+        }
     assert set(back.cell_data) == set(expected)
     for name, values in expected.items():
         np.testing.assert_array_equal(back.cell_data[name], values[of_cell])
     assert set(back.sets.cells) == set(model.sets.cells)
     for name, members in model.sets.cells.items():
-        np.testing.assert_array_equal(back.sets.cells[name], np.flatnonzero(np.isin(of_cell, members)))
+        np.testing.assert_array_equal(
+            back.sets.cells[name], np.flatnonzero(np.isin(of_cell, members))
+        )
     assert set(back.sets.facets) == set(model.sets.facets)
     for name, rows in model.sets.facets.items():
         triples = facet_triples(back.mesh.cells, back.sets.facets[name])
@@ -425,7 +496,9 @@ def test_numbers_and_names_survive_a_round_trip(version, tmp_path):
     assert told[0].names == told[1].names
     for name, members in told[0].groups.items():
         others = told[1].groups[name]
-        assert sorted(map(sorted, told[0].nodes(members))) == sorted(map(sorted, told[1].nodes(others))), name
+        assert sorted(map(sorted, told[0].nodes(members))) == sorted(
+            map(sorted, told[1].nodes(others))
+        ), name
         assert {told[0].elements[k][1] for k in members} == {told[1].elements[k][1] for k in others}
 
 
@@ -445,7 +518,12 @@ def test_numbers_of_others_are_labels(names, tmp_path):
     save_model(tmp_path / "b.msh2", build_model(back))
     read = Read((tmp_path / "b.msh2").read_bytes())
     of_cells = {number: name for (dim, number), name in read.names.items() if dim == 3}
-    assert of_cells == {2: "volume_2", 5: "grey_matter" if names else "volume_5", 7: "volume_7", 8: "volume_8"}
+    assert of_cells == {
+        2: "volume_2",
+        5: "grey_matter" if names else "volume_5",
+        7: "volume_7",
+        8: "volume_8",
+    }
     for number, name in of_cells.items():
         assert len(read.groups[3, name]) == np.count_nonzero(back.cell_data["label"] == number)
 
@@ -453,9 +531,19 @@ def test_numbers_of_others_are_labels(names, tmp_path):
 def test_results_come_back_in_our_axes_and_units(tmp_path):
     """Tensors stay whole, or else nobody knows by their names which axes and units they are in."""
     model, rng = quadratic_model(3), np.random.default_rng(1)
-    cell_data = {"stress": rng.normal(size=(len(model.mesh.cells), 9)), "von_mises": rng.random(len(model.mesh.cells))}
-    point_data = {"stress_nodes": rng.normal(size=(len(model.point_data["displacement"]), 9))} | model.point_data
-    save_model(tmp_path / "a.msh", model._replace(cell_data=cell_data, point_data=point_data), space="lps", units="MPa")
+    cell_data = {
+        "stress": rng.normal(size=(len(model.mesh.cells), 9)),
+        "von_mises": rng.random(len(model.mesh.cells)),
+    }
+    point_data = {
+        "stress_nodes": rng.normal(size=(len(model.point_data["displacement"]), 9))
+    } | model.point_data
+    save_model(
+        tmp_path / "a.msh",
+        model._replace(cell_data=cell_data, point_data=point_data),
+        space="lps",
+        units="MPa",
+    )
     back = load_mesh(tmp_path / "a.msh")
     place = {tuple(cell): k for k, cell in enumerate(model.mesh.cells.tolist())}
     of_cell = np.array([place[tuple(cell)] for cell in back.mesh.cells.tolist()])
@@ -471,7 +559,11 @@ def test_comments_that_gmsh_has_put_at_the_end(tmp_path):
     model = sample_model(3)
     before, _, rest = gmsh22(in_space(model, "lps")).decode().partition("$Comments\n")
     comments, _, after = rest.partition("$EndComments\n")
-    more = comments + "entity of cells 999: dark\nentity of cells 998: gone\nmaterial_9: young 1.0 kPa, nu 0.3\n"
+    more = (
+        comments
+        + "entity of cells 999: dark\nentity of cells 998: gone\nmaterial_9: young 1.0 kPa, nu "
+        "0.3\n"
+    )
     (tmp_path / "a.msh").write_text(f"{before}{after}$Comments\n{more}$EndComments\n")
     back = load_mesh(tmp_path / "a.msh")
     assert back.space == "lps"
@@ -479,7 +571,9 @@ def test_comments_that_gmsh_has_put_at_the_end(tmp_path):
     np.testing.assert_array_equal(back.sets.cells["dark"], model.sets.cells["dark"])
     np.testing.assert_array_equal(back.cell_data["young"], young_of(model))
     # Without the constants of a material there are no moduli: what is left are the groups' names.
-    without = "".join(f"{line}\n" for line in more.splitlines() if not line.startswith("material_1:"))
+    without = "".join(
+        f"{line}\n" for line in more.splitlines() if not line.startswith("material_1:")
+    )
     (tmp_path / "a.msh").write_text(f"{before}{after}$Comments\n{without}$EndComments\n")
     back = load_mesh(tmp_path / "a.msh")
     assert "young" not in back.cell_data
@@ -493,9 +587,9 @@ def test_comments_of_others_are_not_ours():
     assert own_comments([]) is None
     assert own_comments(["made by hand", "coordinates: LPS+, mm"]) is None
     assert own_comments(["tetopt was here"]) is None
-    assert own_comments(["tetopt", "coordinates: of the slice's plane, mm", "image: a, b.nii, sha256 unknown"]) == (
-        "ras", {"image": "a, b.nii"}, {}, {}, {}, None, {}
-    )  # fmt: skip
+    assert own_comments(
+        ["tetopt", "coordinates: of the slice's plane, mm", "image: a, b.nii, sha256 unknown"]
+    ) == ("ras", {"image": "a, b.nii"}, {}, {}, {}, None, {})
 
 
 # Others' readers
@@ -526,9 +620,14 @@ def test_meshio_reads_it(version, n, bins, order, tmp_path):
     mean = np.concatenate([read.cell_data["mean"][k] for k in blocks])
     assert np.array_equal(mean[theirs], model.cell_data["mean"][ours])
     if order == 2:
-        assert np.array_equal(read.point_data["warmth"], all_nodes(model.point_data["warmth"], model.mesh))
+        assert np.array_equal(
+            read.point_data["warmth"], all_nodes(model.point_data["warmth"], model.mesh)
+        )
     for name, rows in model.sets.facets.items():
-        members = [block.data[chosen] for block, chosen in zip(read.cells, read.cell_sets[name], strict=True)]
+        members = [
+            block.data[chosen]
+            for block, chosen in zip(read.cells, read.cell_sets[name], strict=True)
+        ]
         triples = np.concatenate([nodes for nodes in members if len(nodes)])
         assert each_once(triples) == each_once(element_facets(own, rows))
 
@@ -572,13 +671,19 @@ print(json.dumps([order.tolist(), points.tolist(), groups, nodes, views, said, d
 @pytest.mark.parametrize("version", WRITERS)
 @pytest.mark.parametrize(("n", "bins", "order"), [(3, 3, 1), (2, None, 1), (3, 3, 2), (2, None, 2)])
 def test_gmsh_reads_it(version, n, bins, order, tmp_path):
-    """Cells, facets and their groups; that all cells are as large as ours, anywhere within, tells their edges apart."""
+    """Cells, facets and their groups; that all cells are as large as ours, anywhere within,
+    tells their edges apart.
+    """
     model = (sample_model if order == 1 else quadratic_model)(n, bins)
     own_points, own = elements(model)
     path = tmp_path / "model.msh"
     path.write_bytes(WRITERS[version](model))
-    child = subprocess.run([sys.executable, "-c", GMSH, str(path)], capture_output=True, text=True, check=True)
-    numbers, points, groups, nodes, views, said, determinants, tags = json.loads(child.stdout.splitlines()[-1])
+    child = subprocess.run(
+        [sys.executable, "-c", GMSH, str(path)], capture_output=True, text=True, check=True
+    )
+    numbers, points, groups, nodes, views, said, determinants, tags = json.loads(
+        child.stdout.splitlines()[-1]
+    )
     assert said == []
     points = np.array(points).reshape(-1, 3)[np.argsort(numbers)]
     assert np.array_equal(points[:, :n], own_points)
@@ -588,9 +693,13 @@ def test_gmsh_reads_it(version, n, bins, order, tmp_path):
     smaller = set()
     for name, rows in sorted(model.sets.facets.items(), key=lambda item: len(item[1])):
         triples = [each for _, each in groups.pop(f"{n - 1} {name}", [])]
-        expected = set(each_once(element_facets(own, rows))) - (smaller if version == "2.2" else set())
+        expected = set(each_once(element_facets(own, rows))) - (
+            smaller if version == "2.2" else set()
+        )
         assert (each_once(np.array(triples) - 1) if triples else []) == sorted(expected)
-        assert sorted(nodes.get(f"{n - 1} {name}", [])) == sorted({node + 1 for each in expected for node in each})
+        assert sorted(nodes.get(f"{n - 1} {name}", [])) == sorted(
+            {node + 1 for each in expected for node in each}
+        )
         smaller |= expected
     for label, number in ((0, 2), (1, 1)):
         members = np.flatnonzero(model.cell_data["label"] == label)

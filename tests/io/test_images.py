@@ -1,4 +1,6 @@
-"""Files to images: every voxel's value and place, and one line for every file that cannot be used."""
+"""Files to images: every voxel's value and place, and one line for every file that cannot be
+used.
+"""
 
 import gzip
 import hashlib
@@ -17,7 +19,16 @@ import pytest
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io import images
-from tetopt.io.images import cropped, file_shape, image_slice, load_image, parse_crop, parse_slice, save_image, sha256
+from tetopt.io.images import (
+    cropped,
+    file_shape,
+    image_slice,
+    load_image,
+    parse_crop,
+    parse_slice,
+    save_image,
+    sha256,
+)
 from tetopt.io.read_dicom import _unevenness
 
 # Rotated, sheared, anisotropic and flipped (negative determinant), with an origin.
@@ -46,7 +57,9 @@ def save_nifti(path, data, affine=OBLIQUE, **header):
 
 
 def assert_refused(path, match, **options):
-    """`load_image` raises InputError in one line, which starts with the path and goes on to match `match`."""
+    """`load_image` raises InputError in one line, which starts with the path and goes on to
+    match `match`.
+    """
     with pytest.raises(InputError, match=re.escape(f"{path}: ") + ".*" + match) as caught:
         load_image(path, **options)
     assert str(caught.value).startswith(f"{path}: ")
@@ -64,7 +77,8 @@ def test_nifti_keeps_values_and_affine(tmp_path, name):
     image = load_image(path)
     np.testing.assert_array_equal(image.data, data)
     assert image.data.dtype == np.float32
-    np.testing.assert_array_equal(image.affine, OBLIQUE.astype(np.float32))  # the header's precision
+    # the header's precision
+    np.testing.assert_array_equal(image.affine, OBLIQUE.astype(np.float32))
 
 
 @pytest.mark.parametrize("name", ["a.nii", "a.nii.gz", "a.mgz", "a.nrrd", "a.mha", "a.png"])
@@ -90,7 +104,9 @@ def test_shape_without_voxels(tmp_path, name, monkeypatch):
 
 
 def test_ending_in_mixed_case(tmp_path):
-    """nibabel looks for A.nii.GZ; the user is told what to do rather than that the file is missing."""
+    """nibabel looks for A.nii.GZ; the user is told what to do rather than that the file is
+    missing.
+    """
     path = save_nifti(tmp_path / "a.nii.gz", ramp(3, 4, 5)).rename(tmp_path / "A.Nii.GZ")
     assert_refused(path, "rename it to lower case")
 
@@ -110,7 +126,9 @@ def test_flipped_axes(tmp_path, flips):
 
 
 def test_qform_where_there_is_no_sform(tmp_path):
-    affine = np.array([[0.0, -2.0, 0.0, 1.0], [3.0, 0.0, 0.0, 2.0], [0.0, 0.0, 4.0, 3.0], [0.0, 0.0, 0.0, 1.0]])
+    affine = np.array(
+        [[0.0, -2.0, 0.0, 1.0], [3.0, 0.0, 0.0, 2.0], [0.0, 0.0, 4.0, 3.0], [0.0, 0.0, 0.0, 1.0]]
+    )
     file = nibabel.Nifti1Image(ramp(3, 4, 5), None)
     file.set_qform(affine, code=1)
     file.set_sform(None, code=0)
@@ -123,7 +141,9 @@ def test_sform_wins_over_qform(tmp_path):
     file.set_qform(np.diag([9.0, 9.0, 9.0, 1.0]), code=1)
     file.set_sform(np.diag([2.0, 3.0, 4.0, 1.0]), code=1)
     nibabel.save(file, tmp_path / "a.nii")
-    np.testing.assert_array_equal(load_image(tmp_path / "a.nii").affine, np.diag([2.0, 3.0, 4.0, 1.0]))
+    np.testing.assert_array_equal(
+        load_image(tmp_path / "a.nii").affine, np.diag([2.0, 3.0, 4.0, 1.0])
+    )
 
 
 def test_scaled_nifti(tmp_path):
@@ -137,16 +157,22 @@ def test_scaled_nifti(tmp_path):
     assert image.data.max() < 0  # the intercept did arrive
 
 
-@pytest.mark.parametrize(("unit", "mm"), [("unknown", 1.0), ("mm", 1.0), ("meter", 1000.0), ("micron", 0.001)])
+@pytest.mark.parametrize(
+    ("unit", "mm"), [("unknown", 1.0), ("mm", 1.0), ("meter", 1000.0), ("micron", 0.001)]
+)
 def test_spatial_units(tmp_path, unit, mm):
     file = nibabel.Nifti1Image(ramp(3, 4, 5), np.diag([2.0, 3.0, 4.0, 1.0]))
     file.header.set_xyzt_units(unit)
     nibabel.save(file, tmp_path / "a.nii")
-    np.testing.assert_array_equal(load_image(tmp_path / "a.nii").affine, np.diag([2 * mm, 3 * mm, 4 * mm, 1]))
+    np.testing.assert_array_equal(
+        load_image(tmp_path / "a.nii").affine, np.diag([2 * mm, 3 * mm, 4 * mm, 1])
+    )
 
 
 def test_unit_outside_of_the_standard_is_mm(tmp_path):
-    path = save_nifti(tmp_path / "a.nii", ramp(3, 4, 5), np.diag([2.0, 3.0, 4.0, 1.0]), xyzt_units=7)
+    path = save_nifti(
+        tmp_path / "a.nii", ramp(3, 4, 5), np.diag([2.0, 3.0, 4.0, 1.0]), xyzt_units=7
+    )
     np.testing.assert_array_equal(load_image(path).affine, np.diag([2.0, 3.0, 4.0, 1.0]))
 
 
@@ -166,7 +192,9 @@ def test_mgh_of_no_voxels_is_refused(tmp_path):
 @pytest.mark.parametrize("name", ["a.mgz", "a.mgh", "A.MGZ", "a.Mgz"])
 def test_mgh_round_trip(tmp_path, name):
     # MGH holds a rotation, voxel sizes and the centre; no shear.
-    affine = np.array([[-1.0, 0.0, 0.0, 10.0], [0.0, 0.0, 2.0, 20.0], [0.0, -0.5, 0.0, 30.0], [0, 0, 0, 1.0]])
+    affine = np.array(
+        [[-1.0, 0.0, 0.0, 10.0], [0.0, 0.0, 2.0, 20.0], [0.0, -0.5, 0.0, 30.0], [0, 0, 0, 1.0]]
+    )
     data = ramp(3, 4, 6, dtype=np.float32)
     nibabel.save(nibabel.MGHImage(data, affine), tmp_path / name.lower())
     (tmp_path / name.lower()).rename(tmp_path / name)
@@ -208,7 +236,10 @@ def test_one_volume_of_a_4d_file(data_dir, k):
 
 
 def test_4d_file_needs_a_volume(data_dir):
-    assert_refused(data_dir / "example4d.nii.gz", "has 2 volumes; choose one from 0 to 1: `volume=k`, `volume` K")
+    assert_refused(
+        data_dir / "example4d.nii.gz",
+        "has 2 volumes; choose one from 0 to 1: `volume=k`, `volume` K",
+    )
 
 
 @pytest.mark.parametrize("k", [-1, 2])
@@ -270,7 +301,10 @@ def sitk():
 def assert_placed_as_in_itk(image, reference):
     """Each corner voxel and a middle one: ITK's value and ITK's LPS point turned to RAS."""
     assert image.shape == reference.GetSize()
-    for index in [*itertools.product(*((0, s - 1) for s in image.shape)), tuple(s // 2 for s in image.shape)]:
+    for index in [
+        *itertools.product(*((0, s - 1) for s in image.shape)),
+        tuple(s // 2 for s in image.shape),
+    ]:
         point = np.array(reference.TransformIndexToPhysicalPoint(index)) * [-1, -1, 1]
         np.testing.assert_allclose(image.to_world(index), point, rtol=0, atol=1e-9)
         assert image.data[index] == reference.GetPixel(index)
@@ -295,7 +329,9 @@ def oblique_sitk_image(sitk, data):
 def rotation():
     """A rotation by 0.3 about z after one by 0.4 about x."""
     c, s, d, t = np.cos(0.3), np.sin(0.3), np.cos(0.4), np.sin(0.4)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ np.array([[1, 0, 0], [0, d, -t], [0, t, d]])
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ np.array(
+        [[1, 0, 0], [0, d, -t], [0, t, d]]
+    )
 
 
 @pytest.mark.parametrize("name", ["a.nrrd", "a.nhdr", "a.mha", "a.mhd", "A.MHA", "A.NRRD"])
@@ -309,7 +345,9 @@ def test_oblique_itk_formats(tmp_path, sitk, name):
 
 @pytest.mark.parametrize("suffix", [".nrrd", ".mha"])
 def test_same_world_as_nifti(tmp_path, sitk, suffix):
-    """ITK writes one image in both formats; we read it back through two libraries to the same place."""
+    """ITK writes one image in both formats; we read it back through two libraries to the same
+    place.
+    """
     for name in (f"a{suffix}", "a.nii"):
         sitk.WriteImage(oblique_sitk_image(sitk, ramp(4, 5, 6)), str(tmp_path / name))
     ours, theirs = load_image(tmp_path / f"a{suffix}"), load_image(tmp_path / "a.nii")
@@ -327,7 +365,9 @@ def test_volume_of_a_4d_metaimage(tmp_path, sitk):
     for k in (0, 1):
         loaded = load_image(path, volume=k)
         np.testing.assert_array_equal(loaded.data, data[..., k])
-        np.testing.assert_array_equal(loaded.affine, [[-2, 0, 0, -10], [0, -3, 0, -20], [0, 0, 4, 30], [0, 0, 0, 1]])
+        np.testing.assert_array_equal(
+            loaded.affine, [[-2, 0, 0, -10], [0, -3, 0, -20], [0, 0, 4, 30], [0, 0, 0, 1]]
+        )
     assert_refused(path, "has 2 volumes")
     assert_refused(path, "got 2: the file has 2 volumes", volume=2)
 
@@ -343,7 +383,9 @@ def test_2d_metaimage(tmp_path, sitk):
 @pytest.mark.parametrize("suffix", [".nrrd", ".mha"])
 def test_vector_pixels_are_refused(tmp_path, sitk, suffix):
     path = tmp_path / f"a{suffix}"
-    sitk.WriteImage(sitk.GetImageFromArray(np.zeros((3, 4, 5, 3), np.uint8), isVector=True), str(path))
+    sitk.WriteImage(
+        sitk.GetImageFromArray(np.zeros((3, 4, 5, 3), np.uint8), isVector=True), str(path)
+    )
     assert_refused(path, "one number per voxel, got 3")
 
 
@@ -374,7 +416,9 @@ def test_garbage_itk_file(tmp_path, suffix):
 @pytest.mark.usefixtures("sitk")
 def test_header_without_its_data_file(tmp_path):
     path = tmp_path / "a.mhd"
-    path.write_text("NDims = 3\nDimSize = 3 4 5\nElementType = MET_SHORT\nElementDataFile = gone.raw\n")
+    path.write_text(
+        "NDims = 3\nDimSize = 3 4 5\nElementType = MET_SHORT\nElementDataFile = gone.raw\n"
+    )
     assert_refused(path, DAMAGED)
 
 
@@ -450,29 +494,41 @@ def test_single_dicom_file(tmp_path, sitk):
     for source in (path, tmp_path / "d"):
         image = load_image(source)
         np.testing.assert_array_equal(image.data, ramp(6, 5, 4)[:, :, 3:])
-        np.testing.assert_allclose(image.to_world([0, 0, 0]), (affine @ [0, 0, 3, 1])[:3], rtol=0, atol=1e-7)
+        np.testing.assert_allclose(
+            image.to_world([0, 0, 0]), (affine @ [0, 0, 3, 1])[:3], rtol=0, atol=1e-7
+        )
         np.testing.assert_allclose(image.affine[:3, :2], affine[:3, :2], rtol=0, atol=1e-7)
 
 
 def test_missing_dicom_slice(tmp_path, sitk):
     write_dicom(sitk, tmp_path / "d", ramp(6, 5, 5), skip=(3,))
-    said = r"a step of 6 mm between slices 2 and 3, counted from 0, and 3 mm elsewhere: one is missing"
+    said = (
+        r"a step of 6 mm between slices 2 and 3, counted from 0, and 3 mm elsewhere: one is missing"
+    )
     assert_refused(tmp_path / "d", rf"not evenly spaced \({said}")
 
 
 def test_uneven_dicom_slices_in_words():
-    points = np.column_stack([np.zeros(5), [0.0, 1.0, 2.0, 1.0, 0.0], 3.0 * np.arange(5)])  # even, but not on a line
+    # even, but not on a line
+    points = np.column_stack([np.zeros(5), [0.0, 1.0, 2.0, 1.0, 0.0], 3.0 * np.arange(5)])
     off = np.abs(points[:, 1])
-    assert _unevenness(points, off) == "slice 2, counted from 0, is 2 mm off its even place between first and last"
+    assert (
+        _unevenness(points, off)
+        == "slice 2, counted from 0, is 2 mm off its even place between first and last"
+    )
     points = np.outer([0.0, 3.0, 6.0, 9.0, 15.0, 24.0, 27.0], [0.0, 0.0, 1.0])
-    assert "9 mm between slices 4 and 5, counted from 0, and 3 mm at most places" in _unevenness(points, off)
+    assert "9 mm between slices 4 and 5, counted from 0, and 3 mm at most places" in _unevenness(
+        points, off
+    )
 
 
 @pytest.mark.parametrize(("places", "words"), [(1, "1 position"), (2, "2 positions")])
 def test_dicom_series_of_several_volumes(tmp_path, sitk, places, words):
     """Of one slice in time the first and last place are the same, which is no singular affine."""
     write_dicom(sitk, tmp_path / "d", ramp(6, 5, 4), places=places)
-    assert_refused(tmp_path / "d", f"the 4 slices of this DICOM series have {words}: it has several volumes")
+    assert_refused(
+        tmp_path / "d", f"the 4 slices of this DICOM series have {words}: it has several volumes"
+    )
 
 
 def test_dicom_slices_that_are_not_parallel(tmp_path, sitk):
@@ -492,7 +548,8 @@ def test_several_dicom_series(tmp_path, sitk):
     write_dicom(sitk, tmp_path / "d", ramp(6, 5, 4))
     write_dicom(sitk, tmp_path / "d", ramp(6, 5, 3), uid="1.2.3.5")
     assert_refused(
-        tmp_path / "d", r"expected one DICOM series, got 2; .*1\.2\.3\.4 \(4 files\), 1\.2\.3\.5 \(3 files\)"
+        tmp_path / "d",
+        r"expected one DICOM series, got 2; .*1\.2\.3\.4 \(4 files\), 1\.2\.3\.5 \(3 files\)",
     )
 
 
@@ -501,7 +558,9 @@ def test_a_folder_above_dicom_series_lists_them(tmp_path, sitk):
         (tmp_path / "scan").mkdir(exist_ok=True)
         write_dicom(sitk, tmp_path / "scan" / name, ramp(6, 5, count))
     (tmp_path / "report.txt").write_text("nothing to see")
-    assert_refused(tmp_path, r"choose one of its subfolders: scan.flair \(3 files\), scan.t1 \(4 files\)$")
+    assert_refused(
+        tmp_path, r"choose one of its subfolders: scan.flair \(3 files\), scan.t1 \(4 files\)$"
+    )
 
 
 @pytest.mark.usefixtures("sitk")
@@ -527,7 +586,8 @@ def test_grey_picture(tmp_path, name):
 
 @pytest.mark.parametrize("name", ["a.jpg", "a.jpeg"])
 def test_jpeg_picture(tmp_path, name):
-    rows = np.repeat(np.array([[0], [255]], np.uint8), 8, axis=0).repeat(16, axis=1)  # blocks of 8: no loss
+    # blocks of 8: no loss
+    rows = np.repeat(np.array([[0], [255]], np.uint8), 8, axis=0).repeat(16, axis=1)
     PIL.Image.fromarray(rows).save(tmp_path / name, quality=100)
     np.testing.assert_array_equal(load_image(tmp_path / name).data, rows)
 
@@ -590,7 +650,9 @@ def test_frames_of_a_tiff(tmp_path):
     assert_refused(path, "got 3: the file has 3 volumes", volume=3)
 
 
-@pytest.mark.parametrize("name", ["a.png", pytest.param("a.tif", marks=pytest.mark.apart), "a.jpg", "a.bmp"])
+@pytest.mark.parametrize(
+    "name", ["a.png", pytest.param("a.tif", marks=pytest.mark.apart), "a.jpg", "a.bmp"]
+)
 def test_truncated_picture(tmp_path, name):
     rows = np.random.default_rng(0).integers(0, 255, (64, 64)).astype(np.uint8)
     PIL.Image.fromarray(rows).save(tmp_path / name)
@@ -616,7 +678,10 @@ def test_missing_file(tmp_path, name):
 def test_unknown_suffix(tmp_path):
     path = tmp_path / "a.xyz"
     path.write_bytes(b"hello")
-    known = ".nii.gz, .nii, .mgz, .mgh, .nrrd, .nhdr, .mha, .mhd, .dcm, .png, .tif, .tiff, .jpg, .jpeg, .bmp, .zarr"
+    known = (
+        ".nii.gz, .nii, .mgz, .mgh, .nrrd, .nhdr, .mha, .mhd, .dcm, .png, .tif, .tiff, "
+        ".jpg, .jpeg, .bmp, .zarr"
+    )
     assert_refused(path, f"unknown image format.*{re.escape(known)}, or a folder of DICOM files")
 
 
@@ -628,7 +693,8 @@ def test_empty_file(tmp_path, suffix):
 
 
 @pytest.mark.parametrize(
-    "suffix", [".nii", ".mgh", ".png", pytest.param(".tif", marks=pytest.mark.apart), ".jpg", ".bmp"]
+    "suffix",
+    [".nii", ".mgh", ".png", pytest.param(".tif", marks=pytest.mark.apart), ".jpg", ".bmp"],
 )
 def test_garbage(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
@@ -714,7 +780,9 @@ def test_rgb_nifti(tmp_path):
 def test_not_finite(tmp_path, bad):
     data = ramp(3, 4, 5, dtype=np.float32)
     data[1, 2, 3] = bad
-    assert_refused(save_nifti(tmp_path / "a.nii", data), r"1 voxels are NaN or infinite, .*\(1, 2, 3\)")
+    assert_refused(
+        save_nifti(tmp_path / "a.nii", data), r"1 voxels are NaN or infinite, .*\(1, 2, 3\)"
+    )
 
 
 @pytest.mark.parametrize("shape", [(3, 0, 5), (3, 4, 5, 0)])
@@ -757,7 +825,9 @@ def test_cifti_has_no_grid(tmp_path):
 
 def test_constant_image_warns(tmp_path):
     path = save_nifti(tmp_path / "a.nii", np.full((3, 4, 5), 7, np.int16))
-    with pytest.warns(UserWarning, match=re.escape(f"{path}: the image is 7 everywhere, so E_D is 0 everywhere")):
+    with pytest.warns(
+        UserWarning, match=re.escape(f"{path}: the image is 7 everywhere, so E_D is 0 everywhere")
+    ):
         image = load_image(path)
     assert (image.data == 7).all()
 
@@ -767,14 +837,17 @@ def warnings_of(path):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         load_image(path)
-    return [str(each.message) for each in caught if each.category is UserWarning]  # not nibabel's unclosed files
+    # not nibabel's unclosed files
+    return [str(each.message) for each in caught if each.category is UserWarning]
 
 
 def test_no_orientation_warns(tmp_path):
     file = nibabel.Nifti1Image(ramp(3, 4, 5), None)
     nibabel.save(file, tmp_path / "a.nii.gz")
     (said,) = warnings_of(tmp_path / "a.nii.gz")
-    assert said.startswith(f"{tmp_path / 'a.nii.gz'}: has no orientation: position and left/right are nibabel's guess;")
+    assert said.startswith(
+        f"{tmp_path / 'a.nii.gz'}: has no orientation: position and left/right are nibabel's guess;"
+    )
     nibabel.save(nibabel.MGHImage(ramp(3, 4, 5), np.eye(4)), tmp_path / "a.mgh")
     assert warnings_of(tmp_path / "a.mgh") == []
     raw = bytearray((tmp_path / "a.mgh").read_bytes())
@@ -784,11 +857,15 @@ def test_no_orientation_warns(tmp_path):
     assert "a.mgh: has no orientation: its voxel sizes" in said
 
 
-@pytest.mark.parametrize(("step", "match"), [(800.0, "4000 mm"), (0.1, "0.5 mm"), (600.0, None), (0.2, None)])
+@pytest.mark.parametrize(
+    ("step", "match"), [(800.0, "4000 mm"), (0.1, "0.5 mm"), (600.0, None), (0.2, None)]
+)
 def test_box_of_another_unit_warns(tmp_path, step, match):
     affine = np.diag([step, step, step, 1.0])
     said = warnings_of(save_nifti(tmp_path / "a.nii", ramp(3, 4, 5), affine))
-    assert said == [] if match is None else f"a.nii: the longest side of its box is {match}" in said[0]
+    assert (
+        said == [] if match is None else f"a.nii: the longest side of its box is {match}" in said[0]
+    )
 
 
 def test_size_of_pictures_is_not_doubted(tmp_path):
@@ -804,7 +881,8 @@ def test_mended_header_is_a_warning_of_the_file(tmp_path, capfd):
     path.write_bytes(raw)
     (said,) = warnings_of(path)
     assert said.startswith(
-        f"{path}: nibabel repaired its header (pixdim[1,2,3] should be non-zero; setting 0 dims to 1);"
+        f"{path}: nibabel repaired its header (pixdim[1,2,3] should be non-zero; setting 0 dims "
+        "to 1);"
     )
     raw[70:72] = (999).to_bytes(2, "little")  # datatype
     path.write_bytes(raw)
@@ -840,11 +918,19 @@ def test_aligned_slice_has_two_world_axes(axis):
 
 
 def test_slice_of_permuted_axes():
-    """Array axes along world z, x, y: without axis 0 the plane is (x, y), without axis 2 it is (x, z)."""
-    affine = np.array([[0.0, -2.0, 0.0, 5.0], [0.0, 0.0, 3.0, 6.0], [-4.0, 0.0, 0.0, 7.0], [0.0, 0.0, 0.0, 1.0]])
+    """Array axes along world z, x, y: without axis 0 the plane is (x, y), without axis 2 it is
+    (x, z).
+    """
+    affine = np.array(
+        [[0.0, -2.0, 0.0, 5.0], [0.0, 0.0, 3.0, 6.0], [-4.0, 0.0, 0.0, 7.0], [0.0, 0.0, 0.0, 1.0]]
+    )
     image = Image(ramp(3, 4, 5), affine)
-    np.testing.assert_array_equal(image_slice(image, 0, 1).affine, [[-2, 0, 5], [0, 3, 6], [0, 0, 1]])
-    np.testing.assert_array_equal(image_slice(image, 2, 1).affine, [[0, -2, 5], [-4, 0, 7], [0, 0, 1]])
+    np.testing.assert_array_equal(
+        image_slice(image, 0, 1).affine, [[-2, 0, 5], [0, 3, 6], [0, 0, 1]]
+    )
+    np.testing.assert_array_equal(
+        image_slice(image, 2, 1).affine, [[0, -2, 5], [-4, 0, 7], [0, 0, 1]]
+    )
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -872,7 +958,9 @@ def test_parallel_slices_share_one_frame():
 
 def test_slice_frame_points_along_its_largest_component():
     angle = np.deg2rad(10)
-    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    turn = np.array(
+        [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    )
     affine = np.eye(4)
     affine[:3, :3] = turn @ np.diag([-2.0, 3.0, 1.0])
     plane = image_slice(Image(ramp(3, 4, 5), affine), 2, 0)
@@ -907,10 +995,14 @@ def test_crop_leaves_voxels_where_they_are(bounds):
     image = Image(ramp(3, 4, 5), OBLIQUE)
     small = cropped(image, bounds)
     start = np.array([b[0] or 0 for b in bounds])
-    assert small.shape == tuple(len(range(s)[slice(*b)]) for s, b in zip(image.shape, bounds, strict=True))
+    assert small.shape == tuple(
+        len(range(s)[slice(*b)]) for s, b in zip(image.shape, bounds, strict=True)
+    )
     for index in np.ndindex(small.shape):
         assert small.data[index] == image.data[tuple(index + start)]
-        np.testing.assert_allclose(small.to_world(index), image.to_world(index + start), rtol=0, atol=1e-13)
+        np.testing.assert_allclose(
+            small.to_world(index), image.to_world(index + start), rtol=0, atol=1e-13
+        )
 
 
 def test_crop_of_a_2d_image():
@@ -926,7 +1018,9 @@ def test_open_crop_is_the_image():
     np.testing.assert_array_equal(same.affine, image.affine)
 
 
-@pytest.mark.parametrize("ends", [(2, 2), (3, 2), (-1, 2), (0, 5), (4, None), (None, 0), (None, -1)])
+@pytest.mark.parametrize(
+    "ends", [(2, 2), (3, 2), (-1, 2), (0, 5), (4, None), (None, 0), (None, -1)]
+)
 def test_crop_out_of_range(ends):
     with pytest.raises(InputError, match="expected 0 <= start < stop <= 4 along axis 1"):
         cropped(Image(ramp(3, 4, 5)), [(None, None), ends, (None, None)])
@@ -940,7 +1034,9 @@ def test_crop_with_another_number_of_axes(n):
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_load_with_volume_crop_and_slice(tmp_path, axis):
-    """The same voxels at the same place as slicing the whole volume, with indices of the whole volume."""
+    """The same voxels at the same place as slicing the whole volume, with indices of the whole
+    volume.
+    """
     path = save_nifti(tmp_path / "a.nii", ramp(5, 6, 7, 2))
     bounds = [(1, 4), (2, None), (None, 6)]
     loaded = load_image(path, volume=1, crop=bounds, slice_=(axis, 3))
@@ -957,7 +1053,9 @@ def test_load_with_volume_crop_and_slice(tmp_path, axis):
 
 def test_load_with_crop_alone_or_slice_alone(tmp_path):
     path = save_nifti(tmp_path / "a.nii", ramp(5, 6, 7))
-    np.testing.assert_array_equal(load_image(path, crop=[(1, 4), (2, 3), (None, None)]).data, ramp(5, 6, 7)[1:4, 2:3])
+    np.testing.assert_array_equal(
+        load_image(path, crop=[(1, 4), (2, 3), (None, None)]).data, ramp(5, 6, 7)[1:4, 2:3]
+    )
     np.testing.assert_array_equal(load_image(path, slice_=(2, 6)).data, ramp(5, 6, 7)[..., 6])
 
 
@@ -965,10 +1063,19 @@ def test_load_with_crop_alone_or_slice_alone(tmp_path):
     ("options", "match"),
     [
         ({"slice_": (2, 7)}, "slice: expected an index from 0 to 6 along axis 2, got 7"),
-        ({"crop": [(0, 9), (None, None), (None, None)]}, "crop: expected .* <= 5 along axis 0, got 0:9"),
+        (
+            {"crop": [(0, 9), (None, None), (None, None)]},
+            "crop: expected .* <= 5 along axis 0, got 0:9",
+        ),
         ({"crop": [(None, None), (None, None)]}, "crop: expected 3 ranges"),
-        ({"crop": [(None, None)] * 2 + [(2, 5)], "slice_": (2, 5)}, "index 5 .*outside the crop 2:5"),
-        ({"crop": [(None, None)] * 2 + [(2, 5)], "slice_": (2, 1)}, "index 1 .*outside the crop 2:5"),
+        (
+            {"crop": [(None, None)] * 2 + [(2, 5)], "slice_": (2, 5)},
+            "index 5 .*outside the crop 2:5",
+        ),
+        (
+            {"crop": [(None, None)] * 2 + [(2, 5)], "slice_": (2, 1)},
+            "index 1 .*outside the crop 2:5",
+        ),
     ],
 )
 def test_load_with_bad_parts(tmp_path, options, match):
@@ -991,7 +1098,9 @@ def test_parse_crop(text, bounds):
     assert parse_crop(text) == bounds
 
 
-@pytest.mark.parametrize("text", ["", "5", "1:2,", "-1:2", "1:2:3", "a:b", "1.5:2", "1-2,3-4", "²:3", "1:2;3:4", "\n"])
+@pytest.mark.parametrize(
+    "text", ["", "5", "1:2,", "-1:2", "1:2:3", "a:b", "1.5:2", "1-2,3-4", "²:3", "1:2;3:4", "\n"]
+)
 def test_parse_crop_refuses(text):
     with pytest.raises(InputError, match=re.escape('such as "10:100,:,5:", got "')) as caught:
         parse_crop(text)
@@ -1013,7 +1122,9 @@ def test_parse_slice(text, pair):
     assert parse_slice(text) == pair
 
 
-@pytest.mark.parametrize("text", ["", "2", "3=1", "x=1", "z=90", "2=-1", "2=1.5", "2=", "=5", "ij=1", "2:90", "2=²"])
+@pytest.mark.parametrize(
+    "text", ["", "2", "3=1", "x=1", "z=90", "2=-1", "2=1.5", "2=", "=5", "ij=1", "2:90", "2=²"]
+)
 def test_parse_slice_refuses(text):
     with pytest.raises(InputError, match='such as "2=90" or "k=90", got "'):
         parse_slice(text)
@@ -1021,11 +1132,14 @@ def test_parse_slice_refuses(text):
 
 def test_sha256_of_a_file(tmp_path):
     (tmp_path / "a").write_bytes(b"abc")
-    assert sha256(tmp_path / "a") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    assert (
+        sha256(tmp_path / "a") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    )
 
 
 def test_sha256_of_a_real_file(data_dir):
-    expected = "1c089f37b6597a38bb4157a1e1b3f7f13f1bc9d4e7a8cfdfaf91d85cd8f66594"  # from the data's README
+    # from the data's README
+    expected = "1c089f37b6597a38bb4157a1e1b3f7f13f1bc9d4e7a8cfdfaf91d85cd8f66594"
     assert sha256(str(data_dir / "tiny_anatomical.nii")) == expected
 
 

@@ -1,4 +1,6 @@
-"""Tables of labels' names: each format written here, told apart by what it holds; and what is refused."""
+"""Tables of labels' names: each format written here, told apart by what it holds; and what is
+refused.
+"""
 
 import json
 
@@ -68,16 +70,30 @@ def table_of(tmp_path, text, name="table.txt", encoding="utf-8"):
             },
             {3: (205, 62, 78), 1002: (125, 100, 160)},
         ),
-        (SNAP, {0: "Clear Label", 1: "Rein (gauche) / été", 2: "liver"}, {1: (255, 0, 0), 2: (0, 255, 0)}),
-        (SLICER, {0: "Background", 1: "artery", 2: "connective_tissue"}, {1: (216, 101, 79), 3: (0, 0, 0)}),
+        (
+            SNAP,
+            {0: "Clear Label", 1: "Rein (gauche) / été", 2: "liver"},
+            {1: (255, 0, 0), 2: (0, 255, 0)},
+        ),
+        (
+            SLICER,
+            {0: "Background", 1: "artery", 2: "connective_tissue"},
+            {1: (216, 101, 79), 3: (0, 0, 0)},
+        ),
         (SLICER_CSV, {1: "kidney, left", 2: "tumour"}, {1: (185, 102, 83), 2: (144, 238, 144)}),
-        (BIDS, {0: "Background", 1: "Gray Matter", 2: "White Matter"}, {1: (255, 83, 187), 2: (47, 139, 190)}),
+        (
+            BIDS,
+            {0: "Background", 1: "Gray Matter", 2: "White Matter"},
+            {1: (255, 83, 187), 2: (47, 139, 190)},
+        ),
         (CSV, {1: "spleen", 5: "liver"}, {}),
         (FRACTIONS, {1: "spleen", 5: "liver"}, {5: (127.5, 255, 0)}),
-        ("1 left lung 3 10 20 30 0\n", {1: "left lung 3"}, {1: (10, 20, 30)}),  # the last four are the colour
+        # the last four are the colour
+        ("1 left lung 3 10 20 30 0\n", {1: "left lung 3"}, {1: (10, 20, 30)}),
         ("index,label\n1,spleen\n", {1: "spleen"}, {}),  # nilearn's columns
         ("labels,structures\n1,spleen\n", {1: "spleen"}, {}),  # SynthSeg's
-        ("1 spleen 1 2 3 0\n1 spleen 1 2 3 0\n", {1: "spleen"}, {1: (1, 2, 3)}),  # twice the same is one
+        # twice the same is one
+        ("1 spleen 1 2 3 0\n1 spleen 1 2 3 0\n", {1: "spleen"}, {1: (1, 2, 3)}),
     ],
 )
 def test_names_and_colours(tmp_path, text, names, colours):
@@ -113,11 +129,17 @@ def test_a_background_without_a_colour_has_none(tmp_path):
         ("1,spleen\n", r'line 1: expected a label table .* a row of column names with "label"'),
         ("label,colour\n1,#ffffff\n", "a row of column names"),
         ("label,name\n1,spleen\n\n2\n", 'line 4: expected 2 columns, as in the first row, got "2"'),
-        ("label,name\nx,spleen\n", 'line 2: expected a whole number from 0 in column label, got "x"'),
+        (
+            "label,name\nx,spleen\n",
+            'line 2: expected a whole number from 0 in column label, got "x"',
+        ),
         ("label,name\n-1,spleen\n", 'got "-1"'),
         ("label,name\n1.5,spleen\n", 'got "1.5"'),
         ("index\tname\tcolor\n1\tspleen\tred\n", 'line 2: expected a colour as #rrggbb, got "red"'),
-        ("label,name,r,g,b\n1,spleen,1,2,300\n", "line 2: expected red, green and blue from 0 to 255, got 1, 2, 300"),
+        (
+            "label,name,r,g,b\n1,spleen,1,2,300\n",
+            "line 2: expected red, green and blue from 0 to 255, got 1, 2, 300",
+        ),
         ("label,name,r,g,b\n1,spleen,1,2\n", "line 2: expected red, green and blue"),
         ("label,name,r,g,b\n1,spleen,0.1,0.2,2\n", "from 0 to 1, got 0.1, 0.2, 2"),
         ("0 a 0 0 0 0\n1 spleen 256 0 0 0\n", "line 2: expected red, green and blue from 0 to 255"),
@@ -128,7 +150,10 @@ def test_a_background_without_a_colour_has_none(tmp_path):
             'line 4: label 1 is "stomach", but "spleen" on line 2; list each label only once',
         ),
         ("1 (none) 1 2 3 0\n", "expected names of labels, found none"),
-        ("label,name\n1,a\n2147483648,b\n", "line 3: expected a label up to 2147483647, got 2147483648"),
+        (
+            "label,name\n1,a\n2147483648,b\n",
+            "line 3: expected a label up to 2147483647, got 2147483648",
+        ),
         ("label,name\n1," + 200_000 * "x" + "\n", "line 2: "),
     ],
 )
@@ -161,8 +186,9 @@ def test_a_table_goes_through_json(tmp_path):
         for label, colour in table.colours.items():
             assert again.colours[label] == pytest.approx(colour, abs=0.002)
     assert table_words(LabelTable({7: "a"}, {7: (1.0, 0.0, 0.2), 5: (0, 0, 0)})) == {
-        "5": {"colour": "#000000"}, "7": {"name": "a", "colour": "#ff0033"},
-    }  # fmt: skip
+        "5": {"colour": "#000000"},
+        "7": {"name": "a", "colour": "#ff0033"},
+    }
 
 
 def test_names_stay_on_one_line():
@@ -205,16 +231,26 @@ NAMES = {1: "Spleen", 5: "liver", 6: "left lung", 7: "Rib", 8: "Rib", 9: "lung/r
 @pytest.mark.parametrize(
     ("text", "labels"),
     [
-        ("liver", [5]), (" LIVER ", [5]), ("spleen", [1]), ("left lung", [6]), ("left_lung", [6]), ("12", [12]),
-        ("Rib", [7, 8]), ("rib_8", [8]), ("lung/right (é)", [9]), ("lung_right_e", [9]),
+        ("liver", [5]),
+        (" LIVER ", [5]),
+        ("spleen", [1]),
+        ("left lung", [6]),
+        ("left_lung", [6]),
+        ("12", [12]),
+        ("Rib", [7, 8]),
+        ("rib_8", [8]),
+        ("lung/right (é)", [9]),
+        ("lung_right_e", [9]),
     ],
-)  # fmt: skip
+)
 def test_a_name_means_its_labels(text, labels):
     assert labels_named(text, NAMES) == labels
 
 
 def test_names_that_no_label_has():
-    with pytest.raises(InputError, match='label "livre": no label has this name; did you mean liver'):
+    with pytest.raises(
+        InputError, match='label "livre": no label has this name; did you mean liver'
+    ):
         labels_named("livre", NAMES)
     with pytest.raises(InputError, match="known names are Spleen, liver, left lung"):
         labels_named("xyzzy", NAMES)
@@ -229,25 +265,56 @@ def test_names_that_no_label_has():
 
 def test_names_become_names_of_sets():
     names = {
-        1: "left", 2: "Boundary", 3: "3rd-Ventricle", 4: "肝臓", 5: "label_7", 6: "label_6", 7: "interface_1_2",
-        8: "material_1", 9: "a" * 100, 10: "a" * 99, 11: "été/(x)", 12: "Lung", 13: "lung", 14: "lung_12", 15: "",
+        1: "left",
+        2: "Boundary",
+        3: "3rd-Ventricle",
+        4: "肝臓",
+        5: "label_7",
+        6: "label_6",
+        7: "interface_1_2",
+        8: "material_1",
+        9: "a" * 100,
+        10: "a" * 99,
+        11: "été/(x)",
+        12: "Lung",
+        13: "lung",
+        14: "lung_12",
+        15: "",
         16: "all_cells",
-    }  # fmt: skip
+    }
     of_label = label_set_names([0, *names], names)
     assert of_label == {
-        0: "label_0", 1: "left_1", 2: "Boundary_2", 3: "label_3rd-Ventricle", 4: "label_4", 5: "label_7_5",
-        6: "label_6", 7: "label_7", 8: "material_1_8", 9: "a" * (MOST_LETTERS - 2) + "_9",
-        10: "a" * (MOST_LETTERS - 3) + "_10", 11: "ete_x", 12: "label_12", 13: "lung_13", 14: "lung_12", 15: "label_15",
+        0: "label_0",
+        1: "left_1",
+        2: "Boundary_2",
+        3: "label_3rd-Ventricle",
+        4: "label_4",
+        5: "label_7_5",
+        6: "label_6",
+        7: "label_7",
+        8: "material_1_8",
+        9: "a" * (MOST_LETTERS - 2) + "_9",
+        10: "a" * (MOST_LETTERS - 3) + "_10",
+        11: "ete_x",
+        12: "label_12",
+        13: "lung_13",
+        14: "lung_12",
+        15: "label_15",
         16: "all_cells_16",
-    }  # fmt: skip
+    }
     assert len({name.lower() for name in of_label.values()}) == len(of_label)
     assert all(SET_NAME.fullmatch(name) for name in of_label.values())
     assert label_set_names([12], names) == {12: "label_12"}  # whichever others are there
 
 
 def test_names_of_interfaces():
-    of_label = label_set_names(range(7), {1: "a_b", 2: "c", 3: "a", 4: "b_c", 5: "x" * 60, 6: "y" * 40})
+    of_label = label_set_names(
+        range(7), {1: "a_b", 2: "c", 3: "a", 4: "b_c", 5: "x" * 60, 6: "y" * 40}
+    )
     assert interface_names([(0, 1), (1, 2), (3, 4), (2, 3), (5, 6)], of_label) == {
-        (0, 1): "interface_0_a_b", (1, 2): "interface_1_2", (3, 4): "interface_3_4", (2, 3): "interface_c_a",
+        (0, 1): "interface_0_a_b",
+        (1, 2): "interface_1_2",
+        (3, 4): "interface_3_4",
+        (2, 3): "interface_c_a",
         (5, 6): "interface_5_6",
-    }  # fmt: skip
+    }

@@ -1,4 +1,6 @@
-"""medit files: read by a parser after INRIA's description, by meshio and by gmsh; points bit by bit."""
+"""medit files: read by a parser after INRIA's description, by meshio and by gmsh; points bit by
+bit.
+"""
 
 import importlib.util
 import json
@@ -19,12 +21,21 @@ from tetopt.model.model import elements as model_elements
 from tetopt.model.sets import Sets, facet_triples
 
 MODELS = [(3, 3), (3, None), (2, 3), (2, None)]
-WIDTH = {"Edges": 2, "Triangles": 3, "Tetrahedra": 4, "EdgesP2": 3, "TrianglesP2": 6, "TetrahedraP2": 10}
+WIDTH = {
+    "Edges": 2,
+    "Triangles": 3,
+    "Tetrahedra": 4,
+    "EdgesP2": 3,
+    "TrianglesP2": 6,
+    "TetrahedraP2": 10,
+}
 KEYWORD = {1: "Edges", 2: "Triangles", 3: "Tetrahedra"}
 
 
 class Read:
-    """What a file holds: words parted by any space; # begins a comment; entities end with a reference."""
+    """What a file holds: words parted by any space; # begins a comment; entities end with a
+    reference.
+    """
 
     def __init__(self, raw):
         lines = raw.decode().split("\n")
@@ -72,7 +83,9 @@ def test_all_of_the_model_is_there(n, bins):
     for name, members in model.sets.cells.items():
         assert np.array_equal(read.cells_of(name), members)
     for k in range(len(model.materials.young)):
-        assert np.array_equal(read.cells_of(f"material_{k + 1}"), np.flatnonzero(model.materials.of_cell == k))
+        assert np.array_equal(
+            read.cells_of(f"material_{k + 1}"), np.flatnonzero(model.materials.of_cell == k)
+        )
     facets = read.nodes[KEYWORD[n - 1]]
     for name, rows in model.sets.facets.items():
         assert each_once(read.facets_of(name)) == each_once(facet_triples(model.mesh.cells, rows))
@@ -96,7 +109,13 @@ def test_the_reference_is_the_label(n):
     assert any(line.startswith("label 0 is reference 8") for line in read.comments)
     assert read.refs[KEYWORD[n - 1]].min() > 1000
     within = np.flatnonzero(labels == 3)[::3]
-    read = Read(medit(model._replace(sets=Sets({"boundary": model.sets.facets["boundary"]}, {"within": within}))))
+    read = Read(
+        medit(
+            model._replace(
+                sets=Sets({"boundary": model.sets.facets["boundary"]}, {"within": within})
+            )
+        )
+    )
     refs = read.refs[KEYWORD[n]]
     assert np.array_equal(refs[labels != 3], np.where(labels == 0, 8, labels)[labels != 3])
     assert set(refs[labels == 3]) == {2001, 2002}
@@ -116,7 +135,9 @@ def test_order_2(n):
         nodes = read.nodes[f"{KEYWORD[dim]}P2"]
         assert np.array_equal(nodes[:, : dim + 1], linear.nodes[KEYWORD[dim]])
         assert np.array_equal(read.refs[f"{KEYWORD[dim]}P2"], linear.refs[KEYWORD[dim]])
-        for at, edge in enumerate([(0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)][: dim * (dim + 1) // 2], dim + 1):
+        for at, edge in enumerate(
+            [(0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)][: dim * (dim + 1) // 2], dim + 1
+        ):
             assert np.array_equal(points[nodes[:, at]], points[nodes[:, edge]].mean(axis=1))
     assert "point data (not supported by this format): displacement, warmth" in read.comments
     named = [line.replace("P2 ref", " ref") for line in read.comments if " ref " in line]
@@ -126,7 +147,8 @@ def test_order_2(n):
 def test_refused():
     model = sample_model()
     with pytest.raises(
-        InputError, match=r'^set material_1: the file uses the name "material_1" for something else; rename the set'
+        InputError,
+        match=r'^set material_1: the file uses the name "material_1" for something else; rename the set',
     ):
         medit(model._replace(sets=Sets({}, {"material_1": np.array([0])})))
 
@@ -144,7 +166,9 @@ def test_meshio_reads_it(n, bins, tmp_path):
     cells, sides = read.cells
     assert np.array_equal(cells.data, model.mesh.cells)
     assert np.array_equal(sides.data, ours.nodes[KEYWORD[n - 1]])
-    for refs, keyword in zip(read.cell_data["medit:ref"], (KEYWORD[n], KEYWORD[n - 1]), strict=True):
+    for refs, keyword in zip(
+        read.cell_data["medit:ref"], (KEYWORD[n], KEYWORD[n - 1]), strict=True
+    ):
         assert np.array_equal(refs, ours.refs[keyword])
 
 
@@ -172,14 +196,21 @@ print(json.dumps([order.tolist(), points.tolist(), elements, said, determinants]
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize("n", [3, 2])
 def test_gmsh_reads_it(n, order, tmp_path):
-    """And finds cells of order 2 as large as ours, anywhere within, so that their edges are where it has them."""
+    """And finds cells of order 2 as large as ours, anywhere within, so that their edges are
+    where it has them.
+    """
     model = (sample_model if order == 1 else quadratic_model)(n)
     path = tmp_path / "model.mesh"
     path.write_bytes(medit(model))
-    child = subprocess.run([sys.executable, "-c", GMSH, str(path)], capture_output=True, text=True, check=True)
+    child = subprocess.run(
+        [sys.executable, "-c", GMSH, str(path)], capture_output=True, text=True, check=True
+    )
     numbers, points, elements, said, determinants = json.loads(child.stdout.splitlines()[-1])
     assert said == []
-    points, own_points = np.array(points).reshape(-1, 3)[np.argsort(numbers)], model_elements(model)[0]
+    points, own_points = (
+        np.array(points).reshape(-1, 3)[np.argsort(numbers)],
+        model_elements(model)[0],
+    )
     assert np.array_equal(points[:, :n], own_points)
     sizes = np.sort(np.reshape(determinants, (len(model.mesh.cells), -1)) / [0, 0, 2, 6][n], axis=0)
     ours = np.sort(volumes(model.mesh.points, model.mesh.cells))

@@ -1,4 +1,6 @@
-"""Meshes through VTU files: every bit comes back, other readers agree, and one line for every bad file."""
+"""Meshes through VTU files: every bit comes back, other readers agree, and one line for every
+bad file.
+"""
 
 import logging
 import re
@@ -21,23 +23,34 @@ from tetopt.model.sets import MOST_LETTERS
 from tetopt.start.lattice import lattice_mesh
 
 OPTIONS = {"k_D": 0.2, "n_t": None, "crop": "ä"}
-ABOUT = {"tetopt": "0.1.0", "image": "Schädel [1].nii.gz", "image_sha256": "ab" * 32, "options": OPTIONS}
+ABOUT = {
+    "tetopt": "0.1.0",
+    "image": "Schädel [1].nii.gz",
+    "image_sha256": "ab" * 32,
+    "options": OPTIONS,
+}
 FIELDS = ["mean", "variance", "n_voxels", "min", "max", "volume", "rho", "min_dihedral"]
 
 
 def image_of(n):
-    return Image(np.random.default_rng(0).normal(size=(5, 6, 7)[:n]), np.diag([*(0.7, 1.1, 2.3)[:n], 1.0]))
+    return Image(
+        np.random.default_rng(0).normal(size=(5, 6, 7)[:n]), np.diag([*(0.7, 1.1, 2.3)[:n], 1.0])
+    )
 
 
 def bent(n):
     """A lattice with every node moved to coordinates that use all 53 bits."""
     mesh = lattice_mesh(image_of(n), blocks=(2, 2, 2)[:n])
-    return Mesh(mesh.points + np.random.default_rng(1).normal(0.0, 0.05, mesh.points.shape), mesh.cells)
+    return Mesh(
+        mesh.points + np.random.default_rng(1).normal(0.0, 0.05, mesh.points.shape), mesh.cells
+    )
 
 
 def write_grid(path, cells, points):
     """A VTU file of cells by VTK type, as another program might write it."""
-    pyvista.UnstructuredGrid({k: np.asarray(v) for k, v in cells.items()}, np.asarray(points, dtype=float)).save(path)
+    pyvista.UnstructuredGrid(
+        {k: np.asarray(v) for k, v in cells.items()}, np.asarray(points, dtype=float)
+    ).save(path)
 
 
 # Node 4 makes one tetrahedron more on top of the first one; node 5 is used by no cell.
@@ -95,7 +108,12 @@ def test_meshio_reads_the_same(tmp_path, n):
 def test_files_of_meshio(tmp_path, file_format):
     mesh = bent(3)
     path = tmp_path / f"a.{file_format}"
-    meshio.write(path, meshio.Mesh(mesh.points, [("tetra", mesh.cells)], cell_data={"k": [np.arange(len(mesh.cells))]}))
+    meshio.write(
+        path,
+        meshio.Mesh(
+            mesh.points, [("tetra", mesh.cells)], cell_data={"k": [np.arange(len(mesh.cells))]}
+        ),
+    )
     back = load_mesh(path)
     assert back.mesh.points.tobytes() == mesh.points.tobytes()
     np.testing.assert_array_equal(back.mesh.cells, mesh.cells)
@@ -121,7 +139,8 @@ def test_fields_of_a_mesh_without_an_image():
     fields = cell_fields(mesh)
     assert list(fields) == ["volume", "rho", "min_dihedral"]
     np.testing.assert_allclose(fields["volume"], [8 / 6])
-    np.testing.assert_allclose(fields["min_dihedral"], [np.degrees(np.arccos(1 / np.sqrt(3)))])  # 54.7 degrees
+    # 54.7 degrees
+    np.testing.assert_allclose(fields["min_dihedral"], [np.degrees(np.arccos(1 / np.sqrt(3)))])
     # Inradius 2 / (3 + sqrt 3), circumradius sqrt 3.
     np.testing.assert_allclose(fields["rho"], [2 / (3 + np.sqrt(3)) / np.sqrt(3)])
 
@@ -148,8 +167,10 @@ def test_inverted_cells_are_turned_and_counted(tmp_path):
 
 
 def quadratic_grid(n):
-    """A grid of VTK's quadratic cells as another program might number them: middle nodes before corners, from last to
-    first, some cells inverted; and its mesh, with the file's node of each of our nodes."""
+    """A grid of VTK's quadratic cells as another program might number them: middle nodes before
+    corners, from last to first, some cells inverted; and its mesh, with the file's node of each
+    of our nodes.
+    """
     mesh = bent(n)
     ours, of_cell = quadratic(mesh.points, mesh.cells)
     place = len(ours) - 1 - np.arange(len(ours))  # in the file
@@ -164,7 +185,9 @@ def quadratic_grid(n):
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_quadratic_cells_become_their_corners(tmp_path, n):
-    """Point data come back in our order of edges, whatever that of the file, where corners are turned round, too."""
+    """Point data come back in our order of edges, whatever that of the file, where corners are
+    turned round, too.
+    """
     grid, mesh, place = quadratic_grid(n)
     expected = np.random.default_rng(2).normal(size=(len(place), 3))
     field = np.empty_like(expected)
@@ -177,25 +200,33 @@ def test_quadratic_cells_become_their_corners(tmp_path, n):
     assert (back.order, back.n_left, back.n_turned) == (2, 0, len(range(0, grid.n_cells, 3)))
     assert back.notes == ("dropped point data that are not numbers: name",)
     assert back.cell_data["k"].tolist() == list(range(grid.n_cells))
-    nodes = np.argsort(place[: len(mesh.points)])  # the corners in the order of the file, as ours are read
+    # the corners in the order of the file, as ours are read
+    nodes = np.argsort(place[: len(mesh.points)])
     np.testing.assert_array_equal(back.mesh.points, mesh.points[nodes])
     places = quadratic(back.mesh.points, back.mesh.cells)[0]
     own = {
-        tuple(point): row for point, row in zip(quadratic(mesh.points, mesh.cells)[0].round(9), expected, strict=True)
+        tuple(point): row
+        for point, row in zip(quadratic(mesh.points, mesh.cells)[0].round(9), expected, strict=True)
     }
-    assert back.point_data["displacement"].tolist() == [own[tuple(point)].tolist() for point in places.round(9)]
+    assert back.point_data["displacement"].tolist() == [
+        own[tuple(point)].tolist() for point in places.round(9)
+    ]
 
 
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize("n", [2, 3])
 def test_cells_of_vtk_s_lagrange_kinds(tmp_path, n, order):
-    """As dolfinx writes them, whatever the order: with so few nodes they are numbered as the kinds of fixed size."""
+    """As dolfinx writes them, whatever the order: with so few nodes they are numbered as the
+    kinds of fixed size.
+    """
     mesh = bent(n)
     nodes, cells = quadratic(mesh.points, mesh.cells) if order == 2 else (mesh.points, mesh.cells)
     points = np.column_stack([nodes, np.zeros((len(nodes), 3 - n))])
     sides = cells[:2, :2] if order == 1 else np.column_stack([cells[:2, :2], cells[:2, n + 1]])
     blocks = [(sides, 68), (cells, {2: 69, 3: 71}[n])]
-    listed = [np.column_stack([np.full(len(rows), rows.shape[1]), rows]).ravel() for rows, _ in blocks]
+    listed = [
+        np.column_stack([np.full(len(rows), rows.shape[1]), rows]).ravel() for rows, _ in blocks
+    ]
     kinds = np.concatenate([np.full(len(rows), kind) for rows, kind in blocks])
     grid = pyvista.UnstructuredGrid(np.concatenate(listed), kinds, points)
     grid.cell_data["k"] = np.arange(grid.n_cells)
@@ -209,7 +240,9 @@ def test_cells_of_vtk_s_lagrange_kinds(tmp_path, n, order):
 
 def test_cells_of_order_3_are_refused(tmp_path, assert_refused):
     points = np.random.default_rng(0).normal(size=(20, 3))
-    pyvista.UnstructuredGrid(np.array([20, *range(20)]), np.array([71]), points).save(tmp_path / "a.vtu")
+    pyvista.UnstructuredGrid(np.array([20, *range(20)]), np.array([71]), points).save(
+        tmp_path / "a.vtu"
+    )
     assert_refused(tmp_path / "a.vtu", "of order 1 or 2, found lagrange_tetrahedron")
 
 
@@ -221,7 +254,9 @@ def test_quadratic_files_of_meshio(tmp_path, n, file_format):
     points = np.column_stack([nodes, np.zeros((len(nodes), 3 - n))])
     path = tmp_path / f"a.{'msh' if file_format.startswith('gmsh') else file_format}"
     data = {"u": points + 1.0}
-    meshio.write(path, meshio.Mesh(points, [({2: "triangle6", 3: "tetra10"}[n], cells)], data), file_format)
+    meshio.write(
+        path, meshio.Mesh(points, [({2: "triangle6", 3: "tetra10"}[n], cells)], data), file_format
+    )
     back = load_mesh(path)
     assert back.mesh.points.tobytes() == mesh.points.tobytes()
     np.testing.assert_array_equal(back.mesh.cells, mesh.cells)
@@ -259,7 +294,9 @@ def test_curved_edges_are_kept_and_told(tmp_path, n):
     assert note == f"2 of {len(edges)} edges are curved by up to {off} mm"
     in_file = np.asarray(grid.points)[place[first:], :n]
     assert sorted(back.mesh.midpoints.tolist()) == sorted(in_file.tolist())
-    np.testing.assert_allclose(volumes(back.mesh.points, back.mesh.cells).sum(), volumes(mesh.points, mesh.cells).sum())
+    np.testing.assert_allclose(
+        volumes(back.mesh.points, back.mesh.cells).sum(), volumes(mesh.points, mesh.cells).sum()
+    )
 
 
 def test_rounded_midpoints_of_a_file_in_single_precision_are_not_curved(tmp_path):
@@ -285,24 +322,37 @@ def test_two_middle_nodes_of_one_edge_are_told(tmp_path):
 
 LONG = "x" * 77
 NAMES = {
-    (2, 1): "my left", (2, 2): "Skin", (2, 5): f"{LONG}a", (2, 6): f"{LONG}b", (2, 8): "1st", (2, 9): "nothing",
+    (2, 1): "my left",
+    (2, 2): "Skin",
+    (2, 5): f"{LONG}a",
+    (2, 6): f"{LONG}b",
+    (2, 8): "1st",
+    (2, 9): "nothing",
     (2, 10): "my_left",
-    (3, 2): "skin", (3, 3): "Skin", (3, 8): "Höhle", (3, 9): "ok-1",
-}  # fmt: skip
+    (3, 2): "skin",
+    (3, 3): "Skin",
+    (3, 8): "Höhle",
+    (3, 9): "ok-1",
+}
 TRIANGLES = [[0, 1, 2], [1, 2, 4]]  # opposite local node 3 of cell 0 and local node 2 of cell 1
 TETRAHEDRA = [[0, 1, 2, 3], [1, 2, 3, 4]]
-# Of each triangle, and of each tetrahedron, which are an entity each; the sign is an orientation. 4 and 7 have no name.
+# Of each triangle, and of each tetrahedron, which are an entity each; the sign is an orientation. 4
+# and 7 have no name.
 GROUPS = {2: [[1, 2, -4, 5], [2, 6, 8, 10]], 3: [[2, 3, 9], [7, 8]]}
 
 
 def write_msh41(path, is_binary):
-    """The two tetrahedra and triangles of these groups, and a point with its own, after gmsh's manual."""
+    """The two tetrahedra and triangles of these groups, and a point with its own, after gmsh's
+    manual.
+    """
     size, integer, real = np.uint64, np.int32, np.float64
     parts = []
 
     def add(dtype, *values):
         array = np.array(values, dtype=dtype)
-        parts.append(array.tobytes() if is_binary else (" ".join(map(repr, array.tolist())) + "\n").encode())
+        parts.append(
+            array.tobytes() if is_binary else (" ".join(map(repr, array.tolist())) + "\n").encode()
+        )
 
     def text(words):
         parts.append(words.encode())
@@ -311,10 +361,15 @@ def write_msh41(path, is_binary):
     if is_binary:
         add(integer, 1)
     text("\n$EndMeshFormat\n$PhysicalNames\n")
-    text(f"{len(NAMES)}\n" + "".join(f'{dim} {tag} "{name}"\n' for (dim, tag), name in NAMES.items()))
+    text(
+        f"{len(NAMES)}\n" + "".join(f'{dim} {tag} "{name}"\n' for (dim, tag), name in NAMES.items())
+    )
     text("$EndPhysicalNames\n$Entities\n")
     add(size, 1, 0, 2, 2)
-    for dim, tag, groups in [(0, 1, [1]), *((dim, k + 1, GROUPS[dim][k]) for dim in (2, 3) for k in (0, 1))]:
+    for dim, tag, groups in [
+        (0, 1, [1]),
+        *((dim, k + 1, GROUPS[dim][k]) for dim in (2, 3) for k in (0, 1)),
+    ]:
         add(integer, tag)
         add(real, *([0.5, 1e300, 0.0] if dim == 0 else [0.5, -2.5, 0.0, 1e300, 1.0, 1.0]))
         add(size, len(groups))
@@ -344,12 +399,21 @@ def test_every_physical_group_becomes_a_set_of_a_valid_name(tmp_path, is_binary)
     np.testing.assert_array_equal(back.mesh.cells, TETRAHEDRA)
     first, second = [0, 3], [1, 2]  # rows of the triangles
     assert {name: rows.tolist() for name, rows in back.sets.facets.items()} == {
-        "Skin": [first, second], "surface_4": [first], "my_left": [second], "my_left_2": [first],
-        "x" * MOST_LETTERS: [first], f"{'x' * (MOST_LETTERS - 2)}_2": [second], "set_1st": [second],
-    }  # fmt: skip
+        "Skin": [first, second],
+        "surface_4": [first],
+        "my_left": [second],
+        "my_left_2": [first],
+        "x" * MOST_LETTERS: [first],
+        f"{'x' * (MOST_LETTERS - 2)}_2": [second],
+        "set_1st": [second],
+    }
     assert {name: members.tolist() for name, members in back.sets.cells.items()} == {
-        "skin_2": [0], "Skin_3": [0], "ok-1": [0], "volume_7": [1], "H_hle": [1]
-    }  # fmt: skip
+        "skin_2": [0],
+        "Skin_3": [0],
+        "ok-1": [0],
+        "volume_7": [1],
+        "H_hle": [1],
+    }
     assert set(back.notes) == {
         'renamed group "my left" to set my_left_2',
         f'renamed group "{LONG}a" to set {LONG[:MOST_LETTERS]}',
@@ -383,12 +447,18 @@ def write_msh22(path, elements, names=""):
 
 
 def test_groups_without_a_name_in_2d(tmp_path):
-    """A path of three boundary edges and one that is none, two triangles, one of them in no group."""
+    """A path of three boundary edges and one that is none, two triangles, one of them in no
+    group.
+    """
     edges = ["1 1 2 3 1 1 2", "2 1 2 3 1 2 4", "3 1 2 0 1 4 3", "4 1 2 6 1 1 4"]
     write_msh22(tmp_path / "a.msh2", [*edges, "5 2 2 0 1 1 2 3", "6 2 2 4 1 2 4 3"])
     back = load_mesh(tmp_path / "a.msh2")
-    assert {name: rows.tolist() for name, rows in back.sets.facets.items()} == {"edge_3": [[0, 2], [1, 2]]}
-    assert {name: members.tolist() for name, members in back.sets.cells.items()} == {"surface_4": [1]}
+    assert {name: rows.tolist() for name, rows in back.sets.facets.items()} == {
+        "edge_3": [[0, 2], [1, 2]]
+    }
+    assert {name: members.tolist() for name, members in back.sets.cells.items()} == {
+        "surface_4": [1]
+    }
     assert back.notes == ('dropped group "edge_6": it contains no facets of cells',)
 
 
@@ -410,14 +480,19 @@ def test_groups_of_materials_give_way_to_moduli(tmp_path):
 
 @pytest.fixture
 def assert_refused(capfd, caplog):
-    """`load_mesh` raises InputError in one line, and neither VTK nor pyvista says a word of its own.
+    """`load_mesh` raises InputError in one line, and neither VTK nor pyvista says a word of its
+    own.
 
-    Under pytest what pyvista sends to the root logger is caught before it reaches the screen, so look there, too.
+    Under pytest what pyvista sends to the root logger is caught before it reaches the screen, so
+    look there, too.
     """
 
     def check(path, match):
         before = list(logging.getLogger().filters)
-        with warnings.catch_warnings(record=True) as warned, pytest.raises(InputError, match=match) as caught:
+        with (
+            warnings.catch_warnings(record=True) as warned,
+            pytest.raises(InputError, match=match) as caught,
+        ):
             load_mesh(path)
         assert warned == []
         assert str(caught.value).startswith(f"{path}: ")
@@ -501,9 +576,11 @@ def test_other_and_mixed_cells(tmp_path, cells, words, assert_refused):
 
 def test_triangles_on_tetrahedra_are_left_out_and_counted(tmp_path):
     grid = pyvista.UnstructuredGrid(
-        {TRIANGLE: np.array([[0, 1, 2], [1, 2, 3]]), TETRA: np.array([[0, 1, 2, 3]])}, np.array(POINTS[:5], dtype=float)
+        {TRIANGLE: np.array([[0, 1, 2], [1, 2, 3]]), TETRA: np.array([[0, 1, 2, 3]])},
+        np.array(POINTS[:5], dtype=float),
     )
-    grid.cell_data["k"] = np.array([7.0, 8.0, 9.0])  # in the order of the file, which pyvista has sorted
+    # in the order of the file, which pyvista has sorted
+    grid.cell_data["k"] = np.array([7.0, 8.0, 9.0])
     kinds = grid.celltypes.tolist()
     grid.save(tmp_path / "a.vtu")
     back = load_mesh(tmp_path / "a.vtu")

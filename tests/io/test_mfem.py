@@ -1,4 +1,6 @@
-"""MFEM files: read by a parser after MFEM's documentation and by PyMFEM; all of the model is there, bit by bit."""
+"""MFEM files: read by a parser after MFEM's documentation and by PyMFEM; all of the model is
+there, bit by bit.
+"""
 
 from collections import deque
 
@@ -36,12 +38,21 @@ class Read:
         if self.lines[0] != "nodes":
             assert int(self.lines.popleft()) == self.n
         else:  # a grid function that is saved node by node
-            head = ["nodes", "FiniteElementSpace", f"FiniteElementCollection: H1_{self.n}D_P2", f"VDim: {self.n}"]
+            head = [
+                "nodes",
+                "FiniteElementSpace",
+                f"FiniteElementCollection: H1_{self.n}D_P2",
+                f"VDim: {self.n}",
+            ]
             assert [self.lines.popleft() for _ in range(5)] == [*head, "Ordering: 1"]
-            values = np.array([self.lines.popleft().split() for _ in range(len(self.lines) - 1)], dtype=float)
+            values = np.array(
+                [self.lines.popleft().split() for _ in range(len(self.lines) - 1)], dtype=float
+            )
             self.points, self.middles = values[:count], values[count:]
         if not len(self.middles):
-            self.points = np.array([self.lines.popleft().split() for _ in range(count)], dtype=float)
+            self.points = np.array(
+                [self.lines.popleft().split() for _ in range(count)], dtype=float
+            )
         assert list(self.lines) == ["mfem_mesh_end"]
 
     def expect(self, keyword):
@@ -81,11 +92,16 @@ def test_all_of_the_model_is_there(n, bins):
     assert np.array_equal(read.points, model.mesh.points)
     assert np.array_equal(read.cells, model.mesh.cells)
     table = model.materials
-    assert set(read.cell_sets) == {*model.sets.cells, *(f"material_{k + 1}" for k in range(len(table.young)))}
+    assert set(read.cell_sets) == {
+        *model.sets.cells,
+        *(f"material_{k + 1}" for k in range(len(table.young))),
+    }
     for name, members in model.sets.cells.items():
         assert np.array_equal(read.cells_of(name), members)
     for k in range(len(table.young)):
-        assert np.array_equal(read.cells_of(f"material_{k + 1}"), np.flatnonzero(table.of_cell == k))
+        assert np.array_equal(
+            read.cells_of(f"material_{k + 1}"), np.flatnonzero(table.of_cell == k)
+        )
     assert list(read.facet_sets) == list(model.sets.facets)
     for name, rows in model.sets.facets.items():
         assert each_once(read.facets_of(name)) == each_once(facet_triples(model.mesh.cells, rows))
@@ -118,9 +134,13 @@ def test_parts_of_divided_labels_have_attributes_behind_all_others():
     model = labelled_model()
     labels = model.cell_data["label"]
     within = np.flatnonzero(labels == 3)[::3]
-    read = Read(mfem(model._replace(sets=model.sets._replace(cells=model.sets.cells | {"within": within}))))
+    read = Read(
+        mfem(model._replace(sets=model.sets._replace(cells=model.sets.cells | {"within": within})))
+    )
     assert set(read.attributes[labels == 3]) == {2001, 2002}
-    assert np.array_equal(read.attributes[labels != 3], np.where(labels == 0, 8, labels)[labels != 3])
+    assert np.array_equal(
+        read.attributes[labels != 3], np.where(labels == 0, 8, labels)[labels != 3]
+    )
     assert np.array_equal(read.cells_of("within"), within)
     assert any(" 2001 " in line and line.endswith("(label_3)") for line in read.comments)
     table = materials(1.0 + np.arange(len(labels)) % 2, 0.3, len(labels))
@@ -149,7 +169,9 @@ def test_middles_are_in_the_order_of_mfem_s_edges(n, edges):
     """That in which its elements first have them, by the local edges of MFEM's fem/geom.cpp."""
     model = quadratic_model(n)
     mesh = with_bent_edges(model.mesh, 0.05)
-    ends = np.sort([[[cell[int(k)] for k in edge] for edge in edges.split()] for cell in mesh.cells], axis=2)
+    ends = np.sort(
+        [[[cell[int(k)] for k in edge] for edge in edges.split()] for cell in mesh.cells], axis=2
+    )
     number = {tuple(pair): k for k, pair in enumerate(numbered_edges(mesh.cells)[0].tolist())}
     order = [number[pair] for pair in dict.fromkeys(map(tuple, ends.reshape(-1, 2).tolist()))]
     assert np.array_equal(Read(mfem(model._replace(mesh=mesh))).middles, mesh.midpoints[order])
@@ -171,7 +193,10 @@ def test_pymfem_reads_it(n, bins, tmp_path):
         assert np.array_equal(np.flatnonzero(np.isin(attributes, in_set[name])), members)
     for k in range(len(model.materials.young)):
         chosen = read.attribute_sets.GetAttributeSet(f"material_{k + 1}").ToList()
-        assert np.array_equal(np.flatnonzero(np.isin(attributes, chosen)), np.flatnonzero(model.materials.of_cell == k))
+        assert np.array_equal(
+            np.flatnonzero(np.isin(attributes, chosen)),
+            np.flatnonzero(model.materials.of_cell == k),
+        )
     sides = np.array([read.GetBdrElementVertices(k) for k in range(read.GetNBE())])
     attributes = np.array([read.GetBdrAttribute(k) for k in range(read.GetNBE())])
     assert set(read.bdr_attribute_sets.GetAttributeSetNames()) == set(model.sets.facets)
@@ -185,7 +210,9 @@ def test_pymfem_reads_it(n, bins, tmp_path):
 @pytest.mark.parametrize("is_turned", [False, True], ids=["as it is", "turned for refinement"])
 @pytest.mark.parametrize("n", [3, 2])
 def test_pymfem_reads_order_2(n, is_turned, tmp_path):
-    """The nodes of each element are ours, to the last bit; and its cells are as large as ours and anywhere straight."""
+    """The nodes of each element are ours, to the last bit; and its cells are as large as ours
+    and anywhere straight.
+    """
     ser = pytest.importorskip("mfem.ser", reason="no PyMFEM (pip install mfem)")
     model = quadratic_model(n)
     points, cells = quadratic(model.mesh.points, model.mesh.cells)

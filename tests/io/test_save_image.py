@@ -1,4 +1,6 @@
-"""Images out: every voxel and its place come back from the file, bit for bit where NIfTI can hold it."""
+"""Images out: every voxel and its place come back from the file, bit for bit where NIfTI can
+hold it.
+"""
 
 from pathlib import Path
 
@@ -11,7 +13,9 @@ from tetopt.image import Image
 from tetopt.io.images import load_image, save_image
 
 # Columns are rotated, sheared and flipped, of 0.8, 0.8 and 5 mm.
-OBLIQUE = np.array([[-0.75, 0.31, 1.1, 12.5], [0.12, 0.68, -0.9, -33.0], [0.05, -0.22, 5.1, 7.25], [0, 0, 0, 1.0]])
+OBLIQUE = np.array(
+    [[-0.75, 0.31, 1.1, 12.5], [0.12, 0.68, -0.9, -33.0], [0.05, -0.22, 5.1, 7.25], [0, 0, 0, 1.0]]
+)
 SHEARED = np.array([[1.5, 0.4, -7.25], [-0.3, -0.8, 100.1], [0, 0, 1.0]])
 AFFINES = {
     "identity-2": np.eye(3),
@@ -47,7 +51,9 @@ def test_a_plane_lies_at_z_0(tmp_path):
     save_image(tmp_path / "a.nii", Image(values((5, 7), np.float32), SHEARED))
     file = nibabel.load(tmp_path / "a.nii")
     assert file.shape == (5, 7)
-    np.testing.assert_allclose(file.affine @ [2.0, 3.0, 0.0, 1.0], [*(SHEARED @ [2.0, 3.0, 1.0])[:2], 0.0, 1.0])
+    np.testing.assert_allclose(
+        file.affine @ [2.0, 3.0, 0.0, 1.0], [*(SHEARED @ [2.0, 3.0, 1.0])[:2], 0.0, 1.0]
+    )
 
 
 @pytest.mark.parametrize("name", ["a", "a.mha", "a.nii.zip", "a.img", "a.hdr", "a.png", "nii"])
@@ -58,12 +64,16 @@ def test_a_name_of_another_format_is_refused(name, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a.nii.gz", "A.NII"])
-def test_an_image_that_reads_back_otherwise_does_not_replace_the_old_one(name, tmp_path, monkeypatch):
+def test_an_image_that_reads_back_otherwise_does_not_replace_the_old_one(
+    name, tmp_path, monkeypatch
+):
     image = Image(np.arange(24.0).reshape(2, 3, 4))
     save_image(tmp_path / name, image)
     before, write = (tmp_path / name).read_bytes(), Path.write_bytes
     for damaged in (lambda whole: whole[:-5], lambda whole: whole[:-1] + bytes([whole[-1] ^ 1])):
-        monkeypatch.setattr(Path, "write_bytes", lambda self, whole, damaged=damaged: write(self, damaged(whole)))
+        monkeypatch.setattr(
+            Path, "write_bytes", lambda self, whole, damaged=damaged: write(self, damaged(whole))
+        )
         with pytest.raises(OSError, match="reads back differently"):
             save_image(tmp_path / name, image)
         assert (tmp_path / name).read_bytes() == before

@@ -14,8 +14,10 @@ from tetopt.study.compare_files import _label_source
 sitk = pytest.importorskip("SimpleITK")
 
 HEAD = (
-    "NRRD0004\ntype: uint8\ndimension: 4\nspace: left-posterior-superior\nsizes: {sizes}\nspace directions: none "
-    "(1,0,0) (0,2,0) (0,0,3)\nkinds: list domain domain domain\nencoding: raw\nspace origin: (5,6,7)\n"
+    "NRRD0004\ntype: uint8\ndimension: 4\nspace: left-posterior-superior\nsizes: {sizes}\nspace "
+    "directions: none "
+    "(1,0,0) (0,2,0) (0,0,3)\nkinds: list domain domain domain\nencoding: raw\nspace origin: "
+    "(5,6,7)\n"
 )
 LAYERS = np.zeros((2, 6, 5, 4), np.uint8)
 LAYERS[0, 1:5, 1:4, 1:3] = 1  # liver, 24 voxels
@@ -29,7 +31,9 @@ def seg_nrrd(folder, layers=LAYERS, segments=SEGMENTS, more="", name="a.seg.nrrd
     text = HEAD.format(sizes=" ".join(map(str, layers.shape))) + more
     for k, (segment, value, layer) in enumerate(segments):
         text += f"Segment{k}_Name:={segment}\nSegment{k}_ID:=Segment_{k}\n"
-        text += "" if value is None else f"Segment{k}_LabelValue:={value}\nSegment{k}_Layer:={layer}\n"
+        text += (
+            "" if value is None else f"Segment{k}_LabelValue:={value}\nSegment{k}_Layer:={layer}\n"
+        )
     (folder / name).write_bytes(text.encode() + b"\n" + layers.tobytes(order="F"))
     return folder / name
 
@@ -38,7 +42,11 @@ def read(path):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         image = load_image(path)
-    return image, [str(each.message).removeprefix(f"{path}: ") for each in caught if each.category is UserWarning]
+    return image, [
+        str(each.message).removeprefix(f"{path}: ")
+        for each in caught
+        if each.category is UserWarning
+    ]
 
 
 def test_layers_that_share_values(tmp_path):
@@ -67,14 +75,18 @@ def test_values_of_the_file_are_kept(tmp_path):
     np.testing.assert_array_equal(image.data, layer[0])
     assert (said, load_label_table(path).names) == ([], {1: "liver", 77: "bone"})
     layers = LAYERS * np.array([1, 9], np.uint8)[:, None, None, None]
-    image, said = read(seg_nrrd(tmp_path, layers, [("liver", 1, 0), ("bone", 2, 0), ("tumour", 9, 1)]))
+    image, said = read(
+        seg_nrrd(tmp_path, layers, [("liver", 1, 0), ("bone", 2, 0), ("tumour", 9, 1)])
+    )
     assert np.unique(image.data, return_counts=True)[1].tolist() == [120 - 24 - 1 - 6, 12, 1, 18]
     assert [np.unique(image.data).tolist(), len(said)] == [[0, 1, 2, 9], 1]
 
 
 def test_files_of_older_programs(tmp_path):
     """Each segment is a layer of ones, in order."""
-    image, said = read(seg_nrrd(tmp_path, LAYERS & 1, [("liver", None, None), ("tumour", None, None)]))
+    image, said = read(
+        seg_nrrd(tmp_path, LAYERS & 1, [("liver", None, None), ("tumour", None, None)])
+    )
     assert np.unique(image.data, return_counts=True)[1].tolist() == [120 - 30, 12, 18]
     assert "1 liver, 2 tumour" in said[0]
 
@@ -111,16 +123,22 @@ def test_an_nrrd_without_segments(tmp_path):
 
 
 def test_names_come_with_the_labels(tmp_path):
-    """Without --label-names, a run takes the names of the segmentation itself; a table replaces them."""
+    """Without --label-names, a run takes the names of the segmentation itself; a table replaces
+    them.
+    """
     path = seg_nrrd(tmp_path)
     (tmp_path / "t.csv").write_text("label,name\n1,a\n2,b\n3,c\n")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         job = tetopt.Job(images=path, labels=path, output=tmp_path / "a.vtu")
         assert tetopt.read(job).source.table.names == {1: "liver", 2: "bone", 3: "tumour"}
-        job = tetopt.Job(images=path, labels=path, output=tmp_path / "a.vtu", label_names=tmp_path / "t.csv")
+        job = tetopt.Job(
+            images=path, labels=path, output=tmp_path / "a.vtu", label_names=tmp_path / "t.csv"
+        )
         assert tetopt.read(job).source.table.names == {1: "a", 2: "b", 3: "c"}
-        named = seg_nrrd(tmp_path, segments=[("A", 1, 0), ("B", 2, 0), ("C", 1, 1)], name="b.seg.nrrd")
+        named = seg_nrrd(
+            tmp_path, segments=[("A", 1, 0), ("B", 2, 0), ("C", 1, 1)], name="b.seg.nrrd"
+        )
         job = tetopt.Job(images=path, labels=path, output=tmp_path / "a.vtu", label_names=named)
         assert tetopt.read(job).source.table.names == {1: "A", 2: "B", 3: "C"}
 
@@ -128,10 +146,15 @@ def test_names_come_with_the_labels(tmp_path):
 @pytest.mark.full
 def test_real_overlapping_segments(data_dir):
     image, said = read(data_dir / "SegmentationOverlapping.seg.nrrd")
-    raw = sitk.GetArrayFromImage(sitk.ReadImage(str(data_dir / "SegmentationOverlapping.seg.nrrd"))).T
+    raw = sitk.GetArrayFromImage(
+        sitk.ReadImage(str(data_dir / "SegmentationOverlapping.seg.nrrd"))
+    ).T
     np.testing.assert_array_equal(image.data, np.where(raw[1] == 1, 8, raw[0]))
     assert 'segment "overlapping sphere" covers 491 of the 8487 voxels of "ribs", 118' in said[1]
-    assert load_label_table(data_dir / "SegmentationOverlapping.seg.nrrd").names[8] == "overlapping sphere"
+    assert (
+        load_label_table(data_dir / "SegmentationOverlapping.seg.nrrd").names[8]
+        == "overlapping sphere"
+    )
 
 
 def test_a_comparison_names_labels_as_the_file_does(tmp_path):

@@ -19,21 +19,36 @@ def stack(folder, voxels=VOXELS, name="a.tif", **options):
 
 def folder_of(folder, numbers, suffix=".tif"):
     for number in numbers:
-        PIL.Image.fromarray((VOXELS[number % 10] % 256).astype(np.uint8)).save(folder / f"scan_v2_{number}{suffix}")
+        PIL.Image.fromarray((VOXELS[number % 10] % 256).astype(np.uint8)).save(
+            folder / f"scan_v2_{number}{suffix}"
+        )
     return folder
 
 
 IMAGEJ = {"spacing": 30, "unit": "um", "axes": "ZYX"}
 CALIBRATED = {  # options of tifffile, voxel sizes
-    "ImageJ, um": ({"imagej": True, "resolution": (0.05, 0.025), "metadata": IMAGEJ}, [0.02, 0.04, 0.03]),
+    "ImageJ, um": (
+        {"imagej": True, "resolution": (0.05, 0.025), "metadata": IMAGEJ},
+        [0.02, 0.04, 0.03],
+    ),
     "ImageJ, channels": (
-        {"imagej": True, "resolution": (20, 20), "metadata": {"spacing": 0.05, "unit": "mm"}}, [0.05] * 3
+        {"imagej": True, "resolution": (20, 20), "metadata": {"spacing": 0.05, "unit": "mm"}},
+        [0.05] * 3,
     ),
     "OME, um": (
-        {"ome": True, "metadata": {"axes": "ZYX", "PhysicalSizeX": 20, "PhysicalSizeY": 20, "PhysicalSizeZ": 0.03,
-                                   "PhysicalSizeZUnit": "mm"}}, [0.02, 0.02, 0.03],
+        {
+            "ome": True,
+            "metadata": {
+                "axes": "ZYX",
+                "PhysicalSizeX": 20,
+                "PhysicalSizeY": 20,
+                "PhysicalSizeZ": 0.03,
+                "PhysicalSizeZUnit": "mm",
+            },
+        },
+        [0.02, 0.02, 0.03],
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", CALIBRATED)
@@ -50,25 +65,40 @@ def test_calibrated_stack(tmp_path, name):
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"resolution": (500, 500), "resolutionunit": 3},
-     {"imagej": True, "resolution": (20, 20), "metadata": {"unit": "mm", "axes": "ZYX"}},
-     {"imagej": True, "metadata": {"unit": "pixel", "spacing": 2.0, "axes": "ZYX"}}],
-)  # fmt: skip
+    [
+        {},
+        {"resolution": (500, 500), "resolutionunit": 3},
+        {"imagej": True, "resolution": (20, 20), "metadata": {"unit": "mm", "axes": "ZYX"}},
+        {"imagej": True, "metadata": {"unit": "pixel", "spacing": 2.0, "axes": "ZYX"}},
+    ],
+)
 def test_stack_without_voxel_size(tmp_path, options):
     path = stack(tmp_path, **options)
-    with pytest.raises(InputError, match=r"this stack of 10 slices states no voxel size .*unknown mm.*`spacing_mm`"):
+    with pytest.raises(
+        InputError, match=r"this stack of 10 slices states no voxel size .*unknown mm.*`spacing_mm`"
+    ):
         load_image(path)
     if options.get("imagej") is None:
-        assert load_image(path, spacing_mm=[0.02, 0.02, 0.05]).spacing.tolist() == [0.02, 0.02, 0.05]
+        assert load_image(path, spacing_mm=[0.02, 0.02, 0.05]).spacing.tolist() == [
+            0.02,
+            0.02,
+            0.05,
+        ]
 
 
 @pytest.mark.parametrize(
     ("voxels", "options", "match"),
-    [(VOXELS[:, None], {"imagej": True, "metadata": {"axes": "TZYX"}}, "got 10 time points"),
-     (np.stack([VOXELS] * 2, 1), {"imagej": True, "metadata": {"axes": "ZCYX"}}, "got 2 channels"),
-     (np.stack([VOXELS] * 3, -1), {"photometric": "rgb"}, "got 3 colours"),
-     (VOXELS, {"ome": True, "metadata": {"axes": "TYX"}}, "got 10 time points")],
-)  # fmt: skip
+    [
+        (VOXELS[:, None], {"imagej": True, "metadata": {"axes": "TZYX"}}, "got 10 time points"),
+        (
+            np.stack([VOXELS] * 2, 1),
+            {"imagej": True, "metadata": {"axes": "ZCYX"}},
+            "got 2 channels",
+        ),
+        (np.stack([VOXELS] * 3, -1), {"photometric": "rgb"}, "got 3 colours"),
+        (VOXELS, {"ome": True, "metadata": {"axes": "TYX"}}, "got 10 time points"),
+    ],
+)
 def test_stacks_of_no_volume(tmp_path, voxels, options, match):
     with pytest.raises(InputError, match=match):
         load_image(stack(tmp_path, voxels, **options), spacing_mm=1.0)
@@ -91,7 +121,10 @@ def test_folder_of_slices(tmp_path, suffix):
     with pytest.raises(InputError, match="this folder of 4 slices states no voxel size"):
         load_image(path)
     (path / f"scan_v2_10{suffix}").unlink()
-    with pytest.raises(InputError, match=f"got scan_v2_9{suffix} followed by scan_v2_11{suffix}; a slice is missing"):
+    with pytest.raises(
+        InputError,
+        match=f"got scan_v2_9{suffix} followed by scan_v2_11{suffix}; a slice is missing",
+    ):
         load_image(path, spacing_mm=0.02)
 
 
@@ -104,7 +137,8 @@ def sliced(folder, voxels=VOXELS, **options):
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
 @pytest.mark.parametrize(
-    "options", [{"photometric": "miniswhite"}, *({"extratags": [(274, 3, 1, k, True)]} for k in (2, 3, 4))]
+    "options",
+    [{"photometric": "miniswhite"}, *({"extratags": [(274, 3, 1, k, True)]} for k in (2, 3, 4))],
 )
 def test_stack_and_folder_of_the_same_slices_agree(tmp_path, kind, options):
     """Values are as stored, and the first voxel is where Orientation says."""
@@ -124,13 +158,17 @@ def test_stack_and_folder_of_the_same_slices_agree(tmp_path, kind, options):
 def test_order_of_ome_and_its_full_level(tmp_path):
     planes = "".join(f'<TiffData IFD="{k}" FirstZ="{9 - k}" PlaneCount="1"/>' for k in range(10))
     words = (
-        '<?xml version="1.0"?><OME xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06"><Image ID="Image:0">'
-        '<Pixels ID="Pixels:0" DimensionOrder="XYZCT" Type="uint16" SizeX="7" SizeY="5" SizeZ="10" SizeC="1" SizeT="1" '
+        '<?xml version="1.0"?><OME '
+        'xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06"><Image ID="Image:0">'
+        '<Pixels ID="Pixels:0" DimensionOrder="XYZCT" Type="uint16" SizeX="7" SizeY="5" '
+        'SizeZ="10" SizeC="1" SizeT="1" '
         f'PhysicalSizeX="20" PhysicalSizeY="20" PhysicalSizeZ="20">{planes}</Pixels></Image></OME>'
     )
     with tifffile.TiffWriter(tmp_path / "a.ome.tif") as writer:
         for k, plane in enumerate(VOXELS):
-            writer.write(plane, description=words if k == 0 else None, contiguous=False, metadata=None)
+            writer.write(
+                plane, description=words if k == 0 else None, contiguous=False, metadata=None
+            )
     np.testing.assert_array_equal(load_image(tmp_path / "a.ome.tif").data, VOXELS[::-1].T)
     with tifffile.TiffWriter(tmp_path / "b.ome.tif", ome=True) as writer:
         writer.write(VOXELS, subifds=1, metadata={"axes": "ZYX"})
@@ -139,9 +177,15 @@ def test_order_of_ome_and_its_full_level(tmp_path):
 
 
 def test_calibrated_values_of_imagej(tmp_path):
-    """As signed numbers of 16 bits, which ImageJ stores without a sign; a page and a folder have them, too."""
+    """As signed numbers of 16 bits, which ImageJ stores without a sign; a page and a folder have
+    them, too.
+    """
     line = {"cf": 0, "c0": -32768.0, "c1": 2.0}
-    options = {"imagej": True, "resolution": (20, 10), "metadata": IMAGEJ | line | {"unit": "mm", "spacing": 0.5}}
+    options = {
+        "imagej": True,
+        "resolution": (20, 10),
+        "metadata": IMAGEJ | line | {"unit": "mm", "spacing": 0.5},
+    }
     path = stack(tmp_path, **options)
     np.testing.assert_array_equal(load_image(path).data, 2.0 * VOXELS.T - 32768)
     page = load_image(path, volume=3)
@@ -156,10 +200,14 @@ def test_calibrated_values_of_imagej(tmp_path):
     with pytest.raises(InputError, match=r"0\.05 x 0\.1 x 0\.5 mm, but `spacing_mm` is 1 x 1 x 1"):
         load_image(tmp_path / "d", spacing_mm=1)
     stack(tmp_path / "d", VOXELS[2], "s2.tif", **options | {"resolution": (20, 20)})
-    with pytest.raises(InputError, match=r"s2\.tif: expected the pixel size and calibration of s0\.tif"):
+    with pytest.raises(
+        InputError, match=r"s2\.tif: expected the pixel size and calibration of s0\.tif"
+    ):
         load_image(tmp_path / "d")
     options["metadata"] |= IMAGEJ | {"cf": 3}
-    with pytest.warns(UserWarning, match="calibration of them is no straight line and is not applied"):
+    with pytest.warns(
+        UserWarning, match="calibration of them is no straight line and is not applied"
+    ):
         np.testing.assert_array_equal(load_image(stack(tmp_path, **options)).data, VOXELS.T)
 
 
@@ -178,10 +226,14 @@ def test_slices_written_one_by_one(tmp_path):
 def test_slices_that_differ(tmp_path):
     path = folder_of(tmp_path, range(4))
     PIL.Image.fromarray(VOXELS[0].astype(np.uint8)).save(path / "preview.png")
-    with pytest.warns(UserWarning, match="preview.png does not belong to the series of scan_v2_0.tif"):
+    with pytest.warns(
+        UserWarning, match="preview.png does not belong to the series of scan_v2_0.tif"
+    ):
         load_image(path, spacing_mm=1.0)
     PIL.Image.fromarray(VOXELS[0, :3].astype(np.uint8)).save(path / "scan_v2_2.tif")
-    with pytest.raises(InputError, match=r"scan_v2_2.tif: expected 5 x 7 pixels of uint8, .* got 3 x 7"):
+    with pytest.raises(
+        InputError, match=r"scan_v2_2.tif: expected 5 x 7 pixels of uint8, .* got 3 x 7"
+    ):
         load_image(path, spacing_mm=1.0)
     folder_of(path, range(3), ".png")
     with pytest.raises(InputError, match="expected one series of numbered slices"):
@@ -190,7 +242,11 @@ def test_slices_that_differ(tmp_path):
 
 def test_a_command_names_its_option(tmp_path, capfd):
     path = stack(tmp_path)
-    assert_command_refused(capfd, ["mesh", path, "-o", tmp_path / "a.vtu"], "states no voxel size .* --spacing-mm")
     assert_command_refused(
-        capfd, ["mesh", path, "-o", tmp_path / "a.vtu", "--spacing-mm", "x"], 'expected one number or three, .*got "x"'
+        capfd, ["mesh", path, "-o", tmp_path / "a.vtu"], "states no voxel size .* --spacing-mm"
+    )
+    assert_command_refused(
+        capfd,
+        ["mesh", path, "-o", tmp_path / "a.vtu", "--spacing-mm", "x"],
+        'expected one number or three, .*got "x"',
     )

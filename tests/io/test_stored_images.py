@@ -1,4 +1,6 @@
-"""Stored volumes: each voxel with its value and place as where they are read whole; one line for what cannot be."""
+"""Stored volumes: each voxel with its value and place as where they are read whole; one line for
+what cannot be.
+"""
 
 import json
 import os
@@ -26,7 +28,12 @@ zarr = pytest.importorskip("zarr")
 numcodecs = pytest.importorskip("numcodecs")
 
 RAS = {"x": "left-to-right", "y": "posterior-to-anterior", "z": "inferior-to-superior"}
-OBLIQUE = [[-0.75, 0.31, 1.1, 12.5], [0.12, 0.68, -0.9, -33.0], [0.05, -0.22, 5.1, 7.25], [0, 0, 0, 1.0]]
+OBLIQUE = [
+    [-0.75, 0.31, 1.1, 12.5],
+    [0.12, 0.68, -0.9, -33.0],
+    [0.05, -0.22, 5.1, 7.25],
+    [0, 0, 0, 1.0],
+]
 
 
 def ramp(*shape, dtype=np.int16):
@@ -40,12 +47,18 @@ def axes_of(names, unit="micrometer", turned=RAS):
     for axis in axes:
         if axis["type"] == "space":
             axis |= {"unit": unit} if unit else {}
-            axis |= {"orientation": {"type": "anatomical", "value": turned[axis["name"]]}} if turned else {}
+            axis |= (
+                {"orientation": {"type": "anatomical", "value": turned[axis["name"]]}}
+                if turned
+                else {}
+            )
     return axes
 
 
 def transforms(scale, shift=None):
-    return [{"type": "scale", "scale": scale}] + ([{"type": "translation", "translation": shift}] if shift else [])
+    return [{"type": "scale", "scale": scale}] + (
+        [{"type": "translation", "translation": shift}] if shift else []
+    )
 
 
 def write_ome(path, levels, axes, after=None, fmt=3, **options):
@@ -54,11 +67,17 @@ def write_ome(path, levels, axes, after=None, fmt=3, **options):
     for number, (voxels, _) in enumerate(levels):
         options.setdefault("chunks", tuple(min(size, 4) for size in voxels.shape))
         group.create_array(str(number), data=voxels, **options)
-    datasets = [{"path": str(k), "coordinateTransformations": each} for k, (_, each) in enumerate(levels)]
+    datasets = [
+        {"path": str(k), "coordinateTransformations": each} for k, (_, each) in enumerate(levels)
+    ]
     scales = {"axes": axes, "datasets": datasets}
     if after:
         scales["coordinateTransformations"] = after
-    group.attrs.update({"ome": {"version": "0.5", "multiscales": [scales]}} if fmt == 3 else {"multiscales": [scales]})
+    group.attrs.update(
+        {"ome": {"version": "0.5", "multiscales": [scales]}}
+        if fmt == 3
+        else {"multiscales": [scales]}
+    )
     return path
 
 
@@ -79,7 +98,9 @@ def test_ome_zarr_keeps_values_and_place(tmp_path, fmt, dtype):
     np.testing.assert_array_equal(image.box((1, 2, 0), (5, 4, 3)).data, voxels[1:5, 2:4, 0:3])
     expected = [[0, 0, 0.1, 0.001], [0, 0.2, 0, 0.002], [0.3, 0, 0, 0.003], [0, 0, 0, 1]]
     np.testing.assert_allclose(image.affine, expected, rtol=1e-15)
-    np.testing.assert_allclose(image.box((1, 2, 0), (5, 4, 3)).affine[:3, 3], image.to_world([1, 2, 0]))
+    np.testing.assert_allclose(
+        image.box((1, 2, 0), (5, 4, 3)).affine[:3, 3], image.to_world([1, 2, 0])
+    )
     assert image.voxels.chunks == (4, 4, 4)
 
 
@@ -90,8 +111,12 @@ def test_uncompressed_nifti_is_as_read_whole(tmp_path, kind, dtype, scaling):
     file = kind(ramp(7, 6, 5, 2, dtype=dtype), np.array(OBLIQUE), dtype=np.dtype(dtype))
     file.header.set_slope_inter(*scaling)
     nibabel.save(file, tmp_path / "a.nii")
-    image, whole = open_stored(tmp_path / "a.nii", volume=1), load_image(tmp_path / "a.nii", volume=1)
-    assert list(np.argsort(image.voxels.strides)) == [0, 1, 2]  # passes go over it as it lies in the file
+    image, whole = (
+        open_stored(tmp_path / "a.nii", volume=1),
+        load_image(tmp_path / "a.nii", volume=1),
+    )
+    # passes go over it as it lies in the file
+    assert list(np.argsort(image.voxels.strides)) == [0, 1, 2]
     assert image.affine.tobytes() == whole.affine.tobytes()
     assert image.box((0, 0, 0), image.shape).data.tobytes() == whole.data.tobytes()
     assert image.read((1, 2, 3), (2, 3, 4)).dtype == image.voxels.dtype
@@ -107,9 +132,13 @@ def test_places_on_the_network_are_refused():
 
 
 def test_chunks_that_are_missing(tmp_path):
-    path = write_ome(tmp_path / "a.zarr", [(ramp(8, 4, 4), transforms([1, 1, 1]))], axes_of("zyx", "millimeter"))
+    path = write_ome(
+        tmp_path / "a.zarr", [(ramp(8, 4, 4), transforms([1, 1, 1]))], axes_of("zyx", "millimeter")
+    )
     (path / "0" / "c" / "1" / "0" / "0").unlink()
-    with pytest.warns(UserWarning, match="1 of its 2 chunks are missing; their voxels get its fill value, 0"):
+    with pytest.warns(
+        UserWarning, match="1 of its 2 chunks are missing; their voxels get its fill value, 0"
+    ):
         open_stored(path)
     shutil.rmtree(path / "0" / "c")
     assert_refused(path, "all of its 2 chunks are missing")
@@ -117,7 +146,10 @@ def test_chunks_that_are_missing(tmp_path):
 
 def test_a_phantom_by_chunks_is_the_one_in_memory(tmp_path, monkeypatch):
     monkeypatch.setattr(zarr_images, "CHUNK_EDGE", 16)
-    phantom, options = load_phantom("layered_oblique"), {"voxel_mm": [2, 2, 3], "blur_mm": 1.0, "noise_sd": 5.0}
+    phantom, options = (
+        load_phantom("layered_oblique"),
+        {"voxel_mm": [2, 2, 3], "blur_mm": 1.0, "noise_sd": 5.0},
+    )
     voxels, path = phantom.voxels(**options), tmp_path / "a.zarr"
     low, high = save_zarr(path, Image.stored(voxels, voxels.affine), voxels, np.int16)
     image, whole = open_stored(path), phantom.image(**options)
@@ -126,7 +158,8 @@ def test_a_phantom_by_chunks_is_the_one_in_memory(tmp_path, monkeypatch):
     assert (low, high) == (stored.min(), stored.max())
     assert image.voxels.chunks == (16, 16, 16)
     assert image.voxels.dtype == np.int16
-    np.testing.assert_array_equal(image.affine, whole.affine)  # sheared, which scale and translation are not
+    # sheared, which scale and translation are not
+    np.testing.assert_array_equal(image.affine, whole.affine)
     assert [each.name for each in tmp_path.iterdir()] == ["a.zarr"]
 
 
@@ -134,7 +167,9 @@ def test_what_does_not_fit_leaves_the_old_folder(tmp_path):
     path = tmp_path / "a.zarr"
     image = Image(ramp(4, 4, 4))
     save_zarr(path, image, image.data, np.int16)
-    with pytest.raises(InputError, match="expected values from -32768 to 32767 for int16, got 1 to 64000"):
+    with pytest.raises(
+        InputError, match="expected values from -32768 to 32767 for int16, got 1 to 64000"
+    ):
         save_zarr(path, image, image.data * 1000.0 - 999.0 * (image.data == 1), np.int16)
     np.testing.assert_array_equal(open_stored(path).read((0, 0, 0), (4, 4, 4)), image.data)
     assert [each.name for each in tmp_path.iterdir()] == ["a.zarr"]
@@ -145,7 +180,11 @@ def test_what_does_not_fit_leaves_the_old_folder(tmp_path):
 @pytest.mark.parametrize("dtype", ["u1", "i2", "f4", "f8"])
 def test_an_image_written_as_zarr_comes_back(tmp_path, dtype):
     """Also what is nothing but the fill value, which zarr leaves out by itself."""
-    data = np.zeros((4, 5, 6)) if dtype == "u1" else ramp(4, 5, 6) * -10.0 + (0.1 if dtype == "f8" else 0)
+    data = (
+        np.zeros((4, 5, 6))
+        if dtype == "u1"
+        else ramp(4, 5, 6) * -10.0 + (0.1 if dtype == "f8" else 0)
+    )
     image = Image(data if dtype != "f4" else np.float32(data) / 4, OBLIQUE)
     save_image(tmp_path / "a.zarr", image)
     stored = open_stored(tmp_path / "a.zarr")
@@ -201,8 +240,16 @@ def test_only_a_folder_of_zarr_is_replaced(tmp_path, monkeypatch, capfd):
     (tmp_path / "b.zarr" / "precious").write_text("mine")
     (tmp_path / "c.zarr").write_text("mine")
     monkeypatch.chdir(tmp_path)
-    command_refused(capfd, [*command[:-1], "c.zarr", "--force"], "expected a folder to write, found something else")
-    command_refused(capfd, [*command[:-1], "b.zarr", "--force"], "expected a file to write, found an unrelated folder")
+    command_refused(
+        capfd,
+        [*command[:-1], "c.zarr", "--force"],
+        "expected a folder to write, found something else",
+    )
+    command_refused(
+        capfd,
+        [*command[:-1], "b.zarr", "--force"],
+        "expected a file to write, found an unrelated folder",
+    )
     command_refused(capfd, [*command[:-1], "no/c.zarr"], "its folder does not exist")
     command_refused(capfd, ["phantom", "disc_2d", "-o", "d.zarr"], "expected a 3-D phantom")
     assert sorted(each.name for each in tmp_path.iterdir()) == ["a.zarr", "b.zarr", "c.zarr"]
@@ -242,7 +289,9 @@ def test_loaded_as_a_nifti_file_of_the_same_voxels(pyramid, tmp_path, options):
 
 
 def test_only_the_box_that_is_asked_for_is_read(pyramid, tmp_path):
-    """A chunk that is damaged is seen only where it is needed, and told with the voxels that cannot be read."""
+    """A chunk that is damaged is seen only where it is needed, and told with the voxels that
+    cannot be read.
+    """
     path = tmp_path / "a.zarr"
     shutil.copytree(pyramid[0], path)
     chunk = path / "0" / "c" / "0" / "1" / "0" / "0"
@@ -264,7 +313,10 @@ def test_only_the_box_that_is_asked_for_is_read(pyramid, tmp_path):
         ({"volume": 0, "crop": [(0, 1)]}, "crop: expected 3 ranges"),
         ({"volume": 0, "slice_": (3, 1)}, "slice: expected axis 0"),
         ({"volume": 0, "slice_": (0, 6)}, "slice: expected an index from"),
-        ({"volume": 0, "slice_": (0, 1), "crop": [(2, 5), (1, 3), (0, 2)]}, "slice: index 1 along axis 0 is outside"),
+        (
+            {"volume": 0, "slice_": (0, 1), "crop": [(2, 5), (1, 3), (0, 2)]},
+            "slice: index 1 along axis 0 is outside",
+        ),
     ],
 )
 def test_bad_parts_of_a_folder(pyramid, options, match):
@@ -326,7 +378,9 @@ def test_coarse_levels(pyramid, tmp_path):
     path, voxels = pyramid
     coarse = coarse_image(path, 119, volume=1)
     np.testing.assert_array_equal(coarse.data, voxels[1, ::2, ::2, ::2])
-    np.testing.assert_array_equal(coarse.affine, [[0, 0, 2, 10], [0, 4, 0, 20], [6, 0, 0, 30], [0, 0, 0, 1]])
+    np.testing.assert_array_equal(
+        coarse.affine, [[0, 0, 2, 10], [0, 4, 0, 20], [6, 0, 0, 30], [0, 0, 0, 1]]
+    )
     np.testing.assert_array_equal(coarse_image(path, 120, volume=1).data, voxels[1])
     assert coarse_image(path, 17, volume=1) is None
     nibabel.save(nibabel.Nifti1Image(ramp(3, 3, 3), np.eye(4)), tmp_path / "a.nii")
@@ -335,13 +389,20 @@ def test_coarse_levels(pyramid, tmp_path):
 
 def test_coarse_levels_of_an_oblique_image(tmp_path):
     """The finest level's own affine turns the others with it."""
-    levels = [(ramp(4, 4, 4), transforms([1, 1, 1])), (ramp(2, 2, 2), transforms([2, 2, 2], [0.5] * 3))]
+    levels = [
+        (ramp(4, 4, 4), transforms([1, 1, 1])),
+        (ramp(2, 2, 2), transforms([2, 2, 2], [0.5] * 3)),
+    ]
     path = write_ome(tmp_path / "a.zarr", levels, axes_of("xyz", "millimeter", turned=None))
     zarr.open(path / "0").attrs["affine"] = OBLIQUE
     np.testing.assert_array_equal(open_stored(path).affine, OBLIQUE)
     coarse = coarse_image(path, 8)
-    np.testing.assert_allclose(coarse.to_world([0, 0, 0]), open_stored(path).to_world([0.5, 0.5, 0.5]))
-    np.testing.assert_allclose(coarse.to_world([1, 1, 1]), open_stored(path).to_world([2.5, 2.5, 2.5]))
+    np.testing.assert_allclose(
+        coarse.to_world([0, 0, 0]), open_stored(path).to_world([0.5, 0.5, 0.5])
+    )
+    np.testing.assert_allclose(
+        coarse.to_world([1, 1, 1]), open_stored(path).to_world([2.5, 2.5, 2.5])
+    )
 
 
 def test_no_more_levels_are_opened_than_halving_gives(tmp_path):
@@ -362,7 +423,9 @@ def changed(path, change):
 
 
 def set_in(*keys):
-    """A function that sets what is under these keys, but for the last, to the last, in a multiscale."""
+    """A function that sets what is under these keys, but for the last, to the last, in a
+    multiscale.
+    """
 
     def change(scales, _):
         *way, key, value = keys
@@ -377,31 +440,58 @@ PLACE = ("datasets", 0, "coordinateTransformations")
 OTHER = r"its OME-Zarr metadata does not follow NGFF 0\.4 or 0\.5 \("
 MISSING = "its Zarr metadata cannot be read .*; copy it again"
 BAD_METADATA = {
-    "no multiscales": (lambda _, table: table["attributes"].clear(), "this Zarr group has no OME-Zarr image .* 0"),
-    "empty": (lambda _, table: table["attributes"]["ome"].update(multiscales=[]), "has no OME-Zarr image"),
-    "attributes of another kind": (lambda _, table: table["attributes"].update(ome=[1]), "has no OME-Zarr image"),
+    "no multiscales": (
+        lambda _, table: table["attributes"].clear(),
+        "this Zarr group has no OME-Zarr image .* 0",
+    ),
+    "empty": (
+        lambda _, table: table["attributes"]["ome"].update(multiscales=[]),
+        "has no OME-Zarr image",
+    ),
+    "attributes of another kind": (
+        lambda _, table: table["attributes"].update(ome=[1]),
+        "has no OME-Zarr image",
+    ),
     "no datasets": (set_in("datasets", []), OTHER),
     "empty datasets": (set_in("datasets", [{}] * 65), f"{OTHER}KeyError: 'path'"),
     "NGFF 0.3": (set_in("axes", ["z", "y", "x"]), OTHER),
     "NGFF 0.2": (lambda scales, _: scales.pop("axes"), f"{OTHER}KeyError: 'axes'"),
-    "too few axes": (set_in("axes", axes_of("xyz")[:2] + axes_of("c")), "expected three spatial axes, got 2"),
+    "too few axes": (
+        set_in("axes", axes_of("xyz")[:2] + axes_of("c")),
+        "expected three spatial axes, got 2",
+    ),
     "too many axes": (set_in("axes", axes_of("txyz")), OTHER),
     "an axis without a scale": (set_in(*PLACE, transforms([1, 1, 1, 1])), OTHER),
     "axes of other names": (
         set_in("axes", [dict(each, name="q", orientation=None) for each in axes_of("xyz")]),
         "axes: expected x, y and z, or three different orientations, got q, q, q",
     ),
-    "one direction twice": (set_in("axes", axes_of("xyx")), "expected x, y and z, or three different orientations"),
-    "unit": (set_in("axes", axes_of("xyz", "second")), 'unit: expected a length such as "mm" or "um", got "second"'),
+    "one direction twice": (
+        set_in("axes", axes_of("xyx")),
+        "expected x, y and z, or three different orientations",
+    ),
+    "unit": (
+        set_in("axes", axes_of("xyz", "second")),
+        'unit: expected a length such as "mm" or "um", got "second"',
+    ),
     "unit of no text": (set_in("axes", axes_of("xyz", ["mm"])), OTHER),
     "no scale": (set_in(*PLACE, []), "has no scale"),
-    "a file of scales": (set_in(*PLACE, [{"type": "scale", "path": "x"}]), f"{OTHER}KeyError: 'scale'"),
+    "a file of scales": (
+        set_in(*PLACE, [{"type": "scale", "path": "x"}]),
+        f"{OTHER}KeyError: 'scale'",
+    ),
     "short scale": (set_in(*PLACE, transforms([1, 1])), OTHER),
     "scale of texts": (set_in(*PLACE, transforms(["a", "1", "1"])), OTHER),
     "scale of nothing": (set_in(*PLACE, transforms([0, 1, 1])), "affine: it is singular"),
-    "scale beyond floats": (set_in(*PLACE, transforms([float("inf"), 1, 1])), "affine: expected finite"),
+    "scale beyond floats": (
+        set_in(*PLACE, transforms([float("inf"), 1, 1])),
+        "affine: expected finite",
+    ),
     "whole number beyond floats": (set_in(*PLACE, transforms([10**400, 1, 1])), OTHER),
-    "rotation": (set_in(*PLACE, [{"type": "rotation"}]), "expected scales and translations, got rotation"),
+    "rotation": (
+        set_in(*PLACE, [{"type": "rotation"}]),
+        "expected scales and translations, got rotation",
+    ),
     "way out": (set_in("datasets", 0, "path", "../b.zarr"), MISSING),
     "absolute": (set_in("datasets", 0, "path", "/etc"), MISSING),
     "no path": (set_in("datasets", 0, {}), f"{OTHER}KeyError: 'path'"),
@@ -421,11 +511,15 @@ def test_metadata_that_is_of_no_image(tmp_path, case):
 
 
 @pytest.mark.deep
-@pytest.mark.parametrize("text", ["", "{", "[]", "null", '{"zarr_format": 9}', "\\0", '{"a": ' + "[" * 100_000])
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "null", '{"zarr_format": 9}', "\\0", '{"a": ' + "[" * 100_000]
+)
 @pytest.mark.parametrize("name", ["zarr.json", "0/zarr.json", "0/.zarray", ".zgroup"])
 def test_metadata_that_is_damaged(tmp_path, name, text):
     fmt = 3 if name.endswith("json") else 2
-    path = write_ome(tmp_path / "a.zarr", [(ramp(3, 3, 3), transforms([1, 1, 1]))], axes_of("xyz"), fmt=fmt)
+    path = write_ome(
+        tmp_path / "a.zarr", [(ramp(3, 3, 3), transforms([1, 1, 1]))], axes_of("xyz"), fmt=fmt
+    )
     (path / name).write_text(text)
     assert_refused(path, ".")
 
@@ -448,7 +542,9 @@ def test_metadata_that_is_damaged(tmp_path, name, text):
 def test_kinds_of_values_and_codecs(tmp_path, options, match):
     """What is packed by a codec that runs what the file says must not be unpacked."""
     path = tmp_path / "a.zarr"
-    array = zarr.create_array(path, shape=(3, 3, 3), zarr_format=2, fill_value=None, **{"chunks": (2, 2, 2)} | options)
+    array = zarr.create_array(
+        path, shape=(3, 3, 3), zarr_format=2, fill_value=None, **{"chunks": (2, 2, 2)} | options
+    )
     array.attrs["affine"] = np.eye(4).tolist()
     if match:
         assert_refused(path, match)
@@ -465,7 +561,9 @@ def test_a_codec_that_is_missing_is_named(tmp_path):
 
 
 def test_arrays_by_themselves(tmp_path):
-    array = zarr.create_array(tmp_path / "a", shape=(3, 4, 5, 2), chunks=(2, 2, 2, 1), dtype="i2", fill_value=0)
+    array = zarr.create_array(
+        tmp_path / "a", shape=(3, 4, 5, 2), chunks=(2, 2, 2, 1), dtype="i2", fill_value=0
+    )
     array[:] = voxels = ramp(3, 4, 5, 2)
     assert_refused(tmp_path / "a", 'this Zarr array has no scale; .* attribute "affine"')
     array.attrs["affine"] = OBLIQUE
@@ -497,7 +595,9 @@ def test_chunks_that_cannot_be(tmp_path, monkeypatch):
     os.mkfifo(chunk)
     assert_refused(path, "its chunk c/1/0/0 is not a regular file")
     chunk.unlink()
-    with pytest.warns(UserWarning, match="1 of its 2 chunks are missing; their voxels get its fill value, nan"):
+    with pytest.warns(
+        UserWarning, match="1 of its 2 chunks are missing; their voxels get its fill value, nan"
+    ):
         image = open_stored(path)
     with pytest.raises(InputError, match="64 voxels are NaN or infinite"):
         image.box((0, 0, 0), image.shape)
@@ -513,9 +613,17 @@ def test_chunks_that_cannot_be(tmp_path, monkeypatch):
 def test_raw_chunks_and_shards_that_are_cut(tmp_path):
     place = transforms([1, 1, 1])
     write_ome(tmp_path / "raw.zarr", [(ramp(4, 4, 4), place)], axes_of("xyz"), compressors=None)
-    write_ome(tmp_path / "shards.zarr", [(ramp(4, 4, 4), place)], axes_of("xyz"), chunks=(2, 2, 2), shards=(4, 4, 4))
+    write_ome(
+        tmp_path / "shards.zarr",
+        [(ramp(4, 4, 4), place)],
+        axes_of("xyz"),
+        chunks=(2, 2, 2),
+        shards=(4, 4, 4),
+    )
     for path in (tmp_path / "raw.zarr", tmp_path / "shards.zarr"):
-        np.testing.assert_array_equal(open_stored(path).read((1, 0, 2), (3, 4, 4)), ramp(4, 4, 4)[1:3, :, 2:])
+        np.testing.assert_array_equal(
+            open_stored(path).read((1, 0, 2), (3, 4, 4)), ramp(4, 4, 4)[1:3, :, 2:]
+        )
         chunk = path / "0" / "c" / "0" / "0" / "0"
         chunk.write_bytes(chunk.read_bytes()[:-5])
         with pytest.raises(InputError, match="cannot be read"):
@@ -544,11 +652,15 @@ def test_what_axes_do_not_say(tmp_path):
     words = " ".join(str(each.message) for each in heard)
     assert "has no orientation: assuming x, y and z are right, anterior and superior" in words
     assert "has no unit on its axes: assuming mm" in words
-    np.testing.assert_array_equal(image.affine, [[0, 0, 2, 9], [0, 4, 0, 8], [6, 0, 0, 7], [0, 0, 0, 1]])
+    np.testing.assert_array_equal(
+        image.affine, [[0, 0, 2, 9], [0, 4, 0, 8], [6, 0, 0, 7], [0, 0, 0, 1]]
+    )
 
 
 def test_orientation_turns_axes_to_ras(tmp_path):
-    """NGFF's RFC-4, whatever the names are: the first axis goes to the back, the second to the left, the third down."""
+    """NGFF's RFC-4, whatever the names are: the first axis goes to the back, the second to the
+    left, the third down.
+    """
     turned = {"x": "anterior-to-posterior", "y": "right-to-left", "z": "superior-to-inferior"}
     levels = [(ramp(3, 4, 5), transforms([1, 2, 3], [7, 8, 9]))]
     path = write_ome(tmp_path / "a.zarr", levels, axes_of("xyz", "millimeter", turned))
@@ -561,7 +673,8 @@ def test_orientation_turns_axes_to_ras(tmp_path):
 def test_files_that_cannot_be_read_in_parts(tmp_path, name):
     (tmp_path / name).write_bytes(b"something")
     assert_refused(
-        tmp_path / name, r"cannot be read in parts; unpack or convert it to \.zarr or uncompressed \.nii first"
+        tmp_path / name,
+        r"cannot be read in parts; unpack or convert it to \.zarr or uncompressed \.nii first",
     )
 
 

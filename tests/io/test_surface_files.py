@@ -1,4 +1,6 @@
-"""Surfaces through files: closed for a reader that welds by place, every bit but in STL, RAS in the header."""
+"""Surfaces through files: closed for a reader that welds by place, every bit but in STL, RAS in
+the header.
+"""
 
 import numpy as np
 import pytest
@@ -21,19 +23,24 @@ from tetopt.start.lattice import lattice_mesh
 
 # Two cells that share the edge 0 1, far from the origin
 EDGE = (
-    np.array([[0, 0, 0], [0, 0, 1], [1, 0, 0], [1, 1, 0], [-1, 0, 0], [-1, -1, 0]]) + np.array([150.1, -230.2, 310.3]),
+    np.array([[0, 0, 0], [0, 0, 1], [1, 0, 0], [1, 1, 0], [-1, 0, 0], [-1, -1, 0]])
+    + np.array([150.1, -230.2, 310.3]),
     np.array([[0, 2, 3, 1], [0, 4, 5, 1]]),
 )
 SUFFIXES = pytest.mark.parametrize("suffix", [".STL", ".ply", ".vtp", ".vtk"])
 
 
 def some_surface(seed, fraction=0.5):
-    """The surface of some cells of a lattice out where coordinates have few bits left, and the cells' volume."""
+    """The surface of some cells of a lattice out where coordinates have few bits left, and the
+    cells' volume.
+    """
     mesh = lattice_mesh(Image(np.zeros((7, 8, 9)), np.diag([1.1, 0.9, 1.3, 1.0])), nodes=100)
     rng = np.random.default_rng(seed)
     points = mesh.points + rng.normal(0.0, 0.05, mesh.points.shape) + rng.uniform(-400.0, 400.0, 3)
     chosen = np.append(np.flatnonzero(rng.random(len(mesh.cells)) < fraction), 0)
-    return extract_surface(points, mesh.cells, chosen), volumes(points, mesh.cells[np.unique(chosen)]).sum()
+    return extract_surface(points, mesh.cells, chosen), volumes(
+        points, mesh.cells[np.unique(chosen)]
+    ).sum()
 
 
 @SUFFIXES
@@ -90,17 +97,27 @@ def test_stl_holds_the_nearest_float32_and_unit_normals(tmp_path):
     save_surface(tmp_path / "a.stl", surface)
     back = trimesh.load_mesh(tmp_path / "a.stl", process=False)
     np.testing.assert_array_equal(
-        np.asarray(back.vertices, dtype=np.float32), surface.points[surface.triangles].reshape(-1, 3).astype(np.float32)
+        np.asarray(back.vertices, dtype=np.float32),
+        surface.points[surface.triangles].reshape(-1, 3).astype(np.float32),
     )
     corners = surface.points[surface.triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    stored = np.frombuffer((tmp_path / "a.stl").read_bytes()[84:], np.uint8).reshape(-1, 50)[:, :12].copy().view("<f4")
+    stored = (
+        np.frombuffer((tmp_path / "a.stl").read_bytes()[84:], np.uint8)
+        .reshape(-1, 50)[:, :12]
+        .copy()
+        .view("<f4")
+    )
     np.testing.assert_allclose(np.linalg.norm(stored, axis=1), 1.0, rtol=1e-6)
-    np.testing.assert_allclose((stored * normals).sum(axis=1), np.linalg.norm(normals, axis=1), rtol=1e-6)
+    np.testing.assert_allclose(
+        (stored * normals).sum(axis=1), np.linalg.norm(normals, axis=1), rtol=1e-6
+    )
 
 
 def test_the_header_says_ras_where_slicer_looks(tmp_path):
-    """3D Slicer reads both with these classes of VTK, and looks in the STL's header and in each PLY comment."""
+    """3D Slicer reads both with these classes of VTK, and looks in the STL's header and in each
+    PLY comment.
+    """
     surface = extract_surface(*CUBE_CORNER, [0])
     about = "solid.nii\nmean below 43, Schädel " + "x" * 90
     save_surface(tmp_path / "a.stl", surface, about)
@@ -116,34 +133,55 @@ def test_the_header_says_ras_where_slicer_looks(tmp_path):
     said = "solid.nii mean below 43, Sch?del " + "x" * 90
     assert stl.GetHeader() == f"tetopt SPACE=RAS mm {said}"[:80]
     comments = ply.GetComments()
-    assert [comments.GetValue(k) for k in range(comments.GetNumberOfValues())] == ["SPACE=RAS", f"tetopt; mm {said}"]
+    assert [comments.GetValue(k) for k in range(comments.GetNumberOfValues())] == [
+        "SPACE=RAS",
+        f"tetopt; mm {said}",
+    ]
 
 
 @pytest.mark.parametrize("space", ["ras", "lps"])
 def test_vtk_files_say_their_space_and_hold_every_bit(tmp_path, space):
     """Where Slicer looks: in the head of a VTK file, in a text SPACE of a VTP file."""
     surface, _ = some_surface(5)
-    labels = {"label_inside": np.arange(len(surface.triangles)), "label_outside": np.full(len(surface.triangles), -1)}
+    labels = {
+        "label_inside": np.arange(len(surface.triangles)),
+        "label_outside": np.full(len(surface.triangles), -1),
+    }
     for suffix in (".vtp", ".vtk"):
-        save_surface(tmp_path / f"a{suffix}", surface, "solid.nii\nmean " + "x" * 300, space, labels)
+        save_surface(
+            tmp_path / f"a{suffix}", surface, "solid.nii\nmean " + "x" * 300, space, labels
+        )
         back = pyvista.read(tmp_path / f"a{suffix}")
         sign = np.array([1.0, 1.0, 1.0]) if space == "ras" else np.array([-1.0, -1.0, 1.0])
         assert np.asarray(back.points).tobytes() == (surface.points * sign).tobytes()
         np.testing.assert_array_equal(back.regular_faces, surface.triangles)
         for name, values in labels.items():
             np.testing.assert_array_equal(back.cell_data[name], values)
-    assert (tmp_path / "a.vtk").read_bytes().splitlines()[1].startswith(f"tetopt, SPACE={space.upper()} mm ".encode())
+    assert (
+        (tmp_path / "a.vtk")
+        .read_bytes()
+        .splitlines()[1]
+        .startswith(f"tetopt, SPACE={space.upper()} mm ".encode())
+    )
     assert list(pyvista.read(tmp_path / "a.vtp").field_data["SPACE"]) == [space.upper()]
 
 
 def test_stl_has_no_room_for_labels(tmp_path):
-    with pytest.raises(InputError, match=r"STL cannot store labels of triangles; use \.ply or \.vtp or \.vtk"):
-        save_surface(tmp_path / "a.stl", extract_surface(*CUBE_CORNER, [0]), labels={"label": np.zeros(4, dtype=int)})
+    with pytest.raises(
+        InputError, match=r"STL cannot store labels of triangles; use \.ply or \.vtp or \.vtk"
+    ):
+        save_surface(
+            tmp_path / "a.stl",
+            extract_surface(*CUBE_CORNER, [0]),
+            labels={"label": np.zeros(4, dtype=int)},
+        )
     assert list(tmp_path.iterdir()) == []
 
 
 def test_one_line_for_every_bad_file(tmp_path):
-    with pytest.raises(InputError, match=r"a\.obj: expected a name ending in \.stl or \.ply or \.vtp or \.vtk"):
+    with pytest.raises(
+        InputError, match=r"a\.obj: expected a name ending in \.stl or \.ply or \.vtp or \.vtk"
+    ):
         save_surface(tmp_path / "a.obj", extract_surface(*CUBE_CORNER, [0]))
     with pytest.raises(InputError, match="no such surface file"):
         checked_surface(tmp_path / "none.stl")
@@ -163,5 +201,7 @@ def test_one_line_for_every_bad_file(tmp_path):
 @SUFFIXES
 def test_a_name_that_is_not_utf8_is_read_back(tmp_path, suffix):
     points, cells = TWO_TETS
-    save_surface(tmp_path / f"caf\udce9{suffix}", extract_surface(points, cells, np.arange(2)), "two")
+    save_surface(
+        tmp_path / f"caf\udce9{suffix}", extract_surface(points, cells, np.arange(2)), "two"
+    )
     assert checked_surface(tmp_path / f"caf\udce9{suffix}").is_watertight

@@ -20,9 +20,13 @@ def test_tags_say_which_sets_an_item_is_in():
         for name, members in sets.items():
             chosen = tags.items[np.isin(tags.tags, tags.tags_of[name])]
             np.testing.assert_array_equal(chosen, members)
-        together = {tuple(name for name in sets if tag in tags.tags_of[name]) for tag in np.unique(tags.tags)}
+        together = {
+            tuple(name for name in sets if tag in tags.tags_of[name])
+            for tag in np.unique(tags.tags)
+        }
         assert len(together) == tags.tags.max()  # no two tags for one combination
-        assert list(dict.fromkeys(tags.tags.tolist())) == list(range(1, tags.tags.max() + 1))  # as they first occur
+        # as they first occur
+        assert list(dict.fromkeys(tags.tags.tolist())) == list(range(1, tags.tags.max() + 1))
     assert tagged({}).tags_of == {}
 
 
@@ -39,11 +43,17 @@ def test_materials_are_called_as_their_labels_are():
     names = {0: "Fat", 2: "left kidney", 3: "right kidney"}
     each = named_model(lambda labels: 1.0 + labels, names)
     assert named_materials(each) == ["Fat", "left_kidney", "right_kidney", "label_5"]
-    some = named_model(lambda labels: np.where(labels == 0, 1.0, np.where(labels == 5, 3.0, 2.0)), names)
+    some = named_model(
+        lambda labels: np.where(labels == 0, 1.0, np.where(labels == 5, 3.0, 2.0)), names
+    )
     assert named_materials(some) == ["Fat", "left_kidney_right_kidney", "label_5"]
-    divided = named_model(lambda labels: np.where(labels == 0, 1.0, np.arange(len(labels)) % 2 + 2.0), names)
+    divided = named_model(
+        lambda labels: np.where(labels == 0, 1.0, np.arange(len(labels)) % 2 + 2.0), names
+    )
     assert named_materials(divided) == ["Fat", "material_2", "material_3"]
-    of_one = named_model(lambda labels: np.where(labels == 0, np.arange(len(labels)) % 2 + 1.0, labels + 1.0), names)
+    of_one = named_model(
+        lambda labels: np.where(labels == 0, np.arange(len(labels)) % 2 + 1.0, labels + 1.0), names
+    )
     assert named_materials(of_one) == ["Fat_1", "Fat_2", "left_kidney", "right_kidney", "label_5"]
     long = named_model(lambda labels: 1.0 + (labels > 0), {2: "a" * 40, 3: "b" * 40})
     assert named_materials(long) == ["label_0", "material_2"]
@@ -53,13 +63,19 @@ def test_input_files_of_solvers_have_these_names():
     model = named_model(lambda labels: 1.0 + labels, {2: "left kidney"})
     lines = abaqus(model).decode().splitlines()
     assert {line for line in lines if line.startswith("*SOLID")} == {
-        f"*SOLID SECTION, ELSET={name}, MATERIAL={name}" for name in ("label_0", "left_kidney", "label_3", "label_5")
+        f"*SOLID SECTION, ELSET={name}, MATERIAL={name}"
+        for name in ("label_0", "left_kidney", "label_3", "label_5")
     }
     assert lines.count("*ELSET, ELSET=left_kidney") == 1  # which is the set of the label, too
     root = ElementTree.fromstring(febio(model))
     assert [each.get("name") for each in root.findall("Material/material")] == [
-        "label_0", "left_kidney", "label_3", "label_5"
-    ]  # fmt: skip
-    domains = {each.get("name"): each.get("mat") for each in root.findall("MeshDomains/SolidDomain")}
+        "label_0",
+        "left_kidney",
+        "label_3",
+        "label_5",
+    ]
+    domains = {
+        each.get("name"): each.get("mat") for each in root.findall("MeshDomains/SolidDomain")
+    }
     assert domains["cells of left_kidney"] == "left_kidney"
     assert set(domains) == {each.get("name") for each in root.findall("Mesh/Elements")}

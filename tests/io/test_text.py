@@ -8,14 +8,19 @@ import pytest
 from tetopt.io.text import last_line, plain
 
 
-@pytest.mark.parametrize("name", ["", "T1w", "Größe µm", "名前", "a\u00a0b", "[red]x[/]", '<x a="b">', "=1+2", "\\n"])
+@pytest.mark.parametrize(
+    "name", ["", "T1w", "Größe µm", "名前", "a\u00a0b", "[red]x[/]", '<x a="b">', "=1+2", "\\n"]
+)
 def test_printable_text_stays(name):
     assert plain(name) == name
 
 
 def test_what_is_not_printed_is_shown():
     assert plain("a\0b\x1b[31m\n\r\t\x7f\x9b") == r"a\x00b\x1b[31m\n\r\t\x7f\x9b"
-    assert plain("\u2028\u2029\u202e\u2066\ufeff\udcff\udc80") == r"\u2028\u2029\u202e\u2066\ufeff\udcff\udc80"
+    assert (
+        plain("\u2028\u2029\u202e\u2066\ufeff\udcff\udc80")
+        == r"\u2028\u2029\u202e\u2066\ufeff\udcff\udc80"
+    )
 
 
 @pytest.mark.full

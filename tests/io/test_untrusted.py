@@ -1,4 +1,6 @@
-"""Untrusted files: whatever they hold, one line, in time, and nothing allocated that a header announces."""
+"""Untrusted files: whatever they hold, one line, in time, and nothing allocated that a header
+announces.
+"""
 
 import gzip
 import os
@@ -47,11 +49,22 @@ def refused(load, path, words):
 
 
 def echo(path, value):
-    return {"path": path, "value": value, "turned": np.arange(24).reshape(2, 3, 4).T, "texts": np.array(["ä", "b\0c"])}
+    return {
+        "path": path,
+        "value": value,
+        "turned": np.arange(24).reshape(2, 3, 4).T,
+        "texts": np.array(["ä", "b\0c"]),
+    }
 
 
 def arrays(path):
-    return [np.empty((0, 3)), np.array(7.5), np.array([True]), np.arange(6, dtype=">i2").reshape(2, 3), np.float32(2.0)]
+    return [
+        np.empty((0, 3)),
+        np.array(7.5),
+        np.array([True]),
+        np.arange(6, dtype=">i2").reshape(2, 3),
+        np.float32(2.0),
+    ]
 
 
 def crash(path):
@@ -80,7 +93,9 @@ def writing(path):
 def limits(path):
     import resource  # not on Windows
 
-    return [resource.getrlimit(getattr(resource, f"RLIMIT_{name}"))[0] for name in ("CPU", "CORE", "AS")]
+    return [
+        resource.getrlimit(getattr(resource, f"RLIMIT_{name}"))[0] for name in ("CPU", "CORE", "AS")
+    ]
 
 
 @pytest.fixture
@@ -96,7 +111,9 @@ def test_what_a_child_reads_comes_back(some_file):
     assert (back["path"], back["value"]) == (str(some_file), [1, None, "ä"])
     np.testing.assert_array_equal(back["turned"], np.arange(24).reshape(2, 3, 4).T)
     assert back["texts"].tolist() == ["ä", "b\0c"]
-    for array, expected in zip(read_apart(arrays, some_file, library="a test"), arrays(""), strict=True):
+    for array, expected in zip(
+        read_apart(arrays, some_file, library="a test"), arrays(""), strict=True
+    ):
         np.testing.assert_array_equal(array, expected)
         assert np.shape(array) == np.shape(expected)
     assert read_apart(writing, some_file, library="a test") == 1
@@ -104,7 +121,9 @@ def test_what_a_child_reads_comes_back(some_file):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits are Linux's")
 def test_a_child_has_limits(some_file):
-    """The time also as the kernel's, since this process may be gone; and a scan is in no core file."""
+    """The time also as the kernel's, since this process may be gone; and a scan is in no core
+    file.
+    """
     seconds, core, n_bytes = read_apart(limits, some_file, library="a test")
     assert (seconds, core) == (60, 0)
     assert 2**31 < n_bytes < 2**33
@@ -132,11 +151,17 @@ def test_modules_of_the_current_folder_are_not_run(tmp_path):
     for name in ("numpy", "json", "vtkmodules", "xml"):
         (tmp_path / f"{name}.py").write_text("open('executed', 'w')\n")
     program = (
-        "import tetopt\ntry:\n    tetopt.load_mesh('a.vtu')\nexcept tetopt.InputError as error:\n    print(error)\n"
+        "import tetopt\ntry:\n    tetopt.load_mesh('a.vtu')\nexcept tetopt.InputError as "
+        "error:\n    print(error)\n"
     )
     environment = os.environ | {"PYTHONPATH": str(Path(tetopt.__file__).parents[1])}
     done = subprocess.run(
-        [sys.executable, "-P", "-c", program], cwd=tmp_path, capture_output=True, text=True, env=environment, check=True
+        [sys.executable, "-P", "-c", program],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        env=environment,
+        check=True,
     )
     assert done.stdout.startswith("a.vtu: damaged")
     assert not (tmp_path / "executed").exists()
@@ -159,14 +184,18 @@ def vtu(*, points="4", compressor="", extra="", data=POINTS, head=b""):
 
 
 ZLIB = 'compressor="vtkZLibDataCompressor"'
-TUPLES = '<FieldData><DataArray type="Float64" Name="a" NumberOfTuples="{}" format="ascii">1</DataArray></FieldData>'
+TUPLES = (
+    '<FieldData><DataArray type="Float64" Name="a" NumberOfTuples="{}" '
+    'format="ascii">1</DataArray></FieldData>'
+)
 
 
 def legacy(points=4, cells=1, numbers=5, more=""):
     """The same as a legacy file."""
     return (
         f"# vtk DataFile Version 3.0\nx\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS {points} double\n"
-        f"0 0 0 1 0 0 0 1 0 0 0 1\nCELLS {cells} {numbers}\n4 0 1 2 3\nCELL_TYPES {cells}\n10\n{more}"
+        f"0 0 0 1 0 0 0 1 0 0 0 1\nCELLS {cells} {numbers}\n4 0 1 2 3\nCELL_TYPES "
+        f"{cells}\n10\n{more}"
     ).encode()
 
 
@@ -180,16 +209,28 @@ VTK_BOMBS = {
     "minus.vtu": (vtu(points=-4, head=struct.pack("<Q", 96)), "damaged"),
     "digits.vtu": (vtu(points="+", head=struct.pack("<Q", 96)), "damaged, or not a VTK mesh"),
     "tuples.vtu": (vtu(extra=TUPLES.format(2**62), head=struct.pack("<Q", 96)), "damaged"),
-    "blocks.vtu": (vtu(compressor=ZLIB, head=struct.pack("<4Q", 2**62, 96, 0, 50), data=PACKED), "VTK crashed on"),
-    "sizes.vtu": (vtu(compressor=ZLIB, head=struct.pack("<4Q", 1, 2**36, 0, 50), data=PACKED), "VTK crashed on"),
+    "blocks.vtu": (
+        vtu(compressor=ZLIB, head=struct.pack("<4Q", 2**62, 96, 0, 50), data=PACKED),
+        "VTK crashed on",
+    ),
+    "sizes.vtu": (
+        vtu(compressor=ZLIB, head=struct.pack("<4Q", 1, 2**36, 0, 50), data=PACKED),
+        "VTK crashed on",
+    ),
     "entity.vtu": (LAUGHS, "damaged"),
     "empty.vtu": (b"", "damaged"),
     "points.vtk": (legacy(points=2**31 - 1), "damaged, or not a VTK mesh .*allocate"),
     "cells.vtk": (legacy(cells=2**60), "damaged"),
     "minus.vtk": (legacy(points=-1), "damaged"),
     "numbers.vtk": (legacy(numbers=2**31 - 1), "damaged"),
-    "field.vtk": (legacy(more="POINT_DATA 4\nFIELD f 1\na 1 2147483647 double\n1 2 3\n"), "damaged"),
-    "name.vtk": (legacy(more=f"FIELD f 1\n{'a' * 100_000} 1 1 double\n1\n"), "VTK crashed on this file .SIG"),
+    "field.vtk": (
+        legacy(more="POINT_DATA 4\nFIELD f 1\na 1 2147483647 double\n1 2 3\n"),
+        "damaged",
+    ),
+    "name.vtk": (
+        legacy(more=f"FIELD f 1\n{'a' * 100_000} 1 1 double\n1\n"),
+        "VTK crashed on this file .SIG",
+    ),
 }
 
 
@@ -200,7 +241,9 @@ def test_vtk_bombs(tmp_path, name):
     refused(load_mesh, tmp_path / name, words)
 
 
-@pytest.mark.parametrize(("name", "raw"), [("a.vtu", vtu(head=struct.pack("<Q", 96))), ("a.vtk", legacy())])
+@pytest.mark.parametrize(
+    ("name", "raw"), [("a.vtu", vtu(head=struct.pack("<Q", 96))), ("a.vtk", legacy())]
+)
 def test_the_bombs_are_else_good(tmp_path, name, raw):
     (tmp_path / name).write_bytes(raw)
     assert len(load_mesh(tmp_path / name).mesh.cells) == 1
@@ -208,7 +251,11 @@ def test_the_bombs_are_else_good(tmp_path, name, raw):
 
 def test_cells_of_another_number_of_nodes(tmp_path):
     (tmp_path / "a.vtk").write_bytes(legacy(numbers=4).replace(b"4 0 1 2 3", b"3 0 1 2"))
-    refused(load_mesh, tmp_path / "a.vtk", r"damaged: tetra cells have 4 nodes each, but some have a different number")
+    refused(
+        load_mesh,
+        tmp_path / "a.vtk",
+        r"damaged: tetra cells have 4 nodes each, but some have a different number",
+    )
     (tmp_path / "a.vtk").write_bytes(legacy().replace(b"\n10\n", b"\n99\n"))
     refused(load_mesh, tmp_path / "a.vtk", "no cells of type 99|damaged")
 
@@ -256,7 +303,10 @@ def mha(ndims="3", sizes="3 4 5", kind="MET_UCHAR", file="LOCAL", more="", data=
 
 
 def nrrd(dimension="3", sizes="3 4 5", kind="uchar", more="", encoding="raw", data=bytes(60)):
-    head = f"NRRD0004\ntype: {kind}\ndimension: {dimension}\nsizes: {sizes}\nencoding: {encoding}\n{more}\n"
+    head = (
+        f"NRRD0004\ntype: {kind}\ndimension: {dimension}\nsizes: {sizes}\nencoding: "
+        f"{encoding}\n{more}\n"
+    )
     return head.encode() + data
 
 
@@ -280,7 +330,10 @@ ITK_BOMBS = {
         r"declares 32767 x 32767 x 32767 voxels, 3.518e\+13 bytes, but the file",
     ),
     "packed.mha": (mha(sizes="32767 32767 32767", more=PACKED_MHA), "declares 32767 x"),
-    "channels.mha": (mha(more="ElementNumberOfChannels = 999999999\n"), "declares 3 x 4 x 5 voxels, 6e.10 bytes"),
+    "channels.mha": (
+        mha(more="ElementNumberOfChannels = 999999999\n"),
+        "declares 3 x 4 x 5 voxels, 6e.10 bytes",
+    ),
     "type.mha": (mha(kind="MET_OTHER"), "unknown voxel type MET_OTHER"),
     "colon.mha": (mha(more="DimSize : 3 2 2 =\n"), "not an image of this kind"),
     "none.mha": (b"NDims = 3\n", "its header has no DimSize"),
@@ -304,7 +357,17 @@ def test_itk_bombs(tmp_path, name):
 
 
 @pytest.mark.parametrize(
-    "name", ["/etc/passwd", "../a.raw", "folder/a.raw", "..", "http://x/a.raw", "a\\b.raw", "a%03d.raw 1 9 1", ""]
+    "name",
+    [
+        "/etc/passwd",
+        "../a.raw",
+        "folder/a.raw",
+        "..",
+        "http://x/a.raw",
+        "a\\b.raw",
+        "a%03d.raw 1 9 1",
+        "",
+    ],
 )
 def test_voxels_lie_beside_their_header(tmp_path, name):
     """Else the bytes of any file of the machine come back to the sender, as cells of a mesh."""
@@ -342,14 +405,24 @@ def test_no_header_hides_where_its_voxels_are(tmp_path, header):
     if header.startswith("#"):
         header = header * 11_000 + "data file: ../a.raw\n"
     (tmp_path / "inner" / "a.nhdr").write_bytes(nrrd(more=header, data=b""))
-    refused(load_image, tmp_path / "inner" / "a.nhdr", "named without a folder|a header of more than 1048576 bytes")
+    refused(
+        load_image,
+        tmp_path / "inner" / "a.nhdr",
+        "named without a folder|a header of more than 1048576 bytes",
+    )
 
 
 def test_no_list_of_files_goes_on_unread(tmp_path):
     pytest.importorskip("SimpleITK")
     (tmp_path / "one.raw").write_bytes(bytes(60))
-    (tmp_path / "a.mhd").write_bytes(mha(file="LIST\n" + "one.raw\n" * 140_000 + "/etc/passwd", data=b""))
-    refused(load_image, tmp_path / "a.mhd", "a header of more than 1048576 bytes with separate data files")
+    (tmp_path / "a.mhd").write_bytes(
+        mha(file="LIST\n" + "one.raw\n" * 140_000 + "/etc/passwd", data=b"")
+    )
+    refused(
+        load_image,
+        tmp_path / "a.mhd",
+        "a header of more than 1048576 bytes with separate data files",
+    )
 
 
 @pytest.mark.parametrize("n_slices", [1, 4])
@@ -359,7 +432,9 @@ def test_slices_of_a_list_that_are_missing(tmp_path, n_slices):
     names = [f"{number}.raw" for number in range(n_slices)]
     for name in names:
         (tmp_path / name).write_bytes(bytes(12))
-    (tmp_path / "a.mhd").write_bytes(mha(sizes="3 4 500", file="\n".join(["LIST", *names]), data=b""))
+    (tmp_path / "a.mhd").write_bytes(
+        mha(sizes="3 4 500", file="\n".join(["LIST", *names]), data=b"")
+    )
     refused(load_image, tmp_path / "a.mhd", "truncated or damaged")
 
 
@@ -367,9 +442,14 @@ def test_slices_of_a_list_that_are_missing(tmp_path, n_slices):
 def test_voxels_beside_their_header_are_read(tmp_path, header):
     pytest.importorskip("SimpleITK")
     (tmp_path / "a b.raw").write_bytes(bytes(range(60)))
-    raw = {"a.mhd": mha(file="a b.raw", data=b""), "a.nhdr": nrrd(more="data file: a b.raw\n", data=b"")}[header]
+    raw = {
+        "a.mhd": mha(file="a b.raw", data=b""),
+        "a.nhdr": nrrd(more="data file: a b.raw\n", data=b""),
+    }[header]
     (tmp_path / header).write_bytes(raw)
-    np.testing.assert_array_equal(load_image(tmp_path / header).data.ravel(order="F"), np.arange(60))
+    np.testing.assert_array_equal(
+        load_image(tmp_path / header).data.ravel(order="F"), np.arange(60)
+    )
     if hasattr(os, "mkfifo"):
         (tmp_path / "a b.raw").unlink()
         os.mkfifo(tmp_path / "a b.raw")
@@ -391,7 +471,11 @@ def nifti(path, shape=(3, 4, 5), offset=352.0, extension=b"\0\0\0\0", data=bytes
 @pytest.mark.filterwarnings("ignore:.*the image is 0 everywhere")
 def test_nifti_bombs(tmp_path, name):
     assert load_image(nifti(tmp_path / name)).shape == (3, 4, 5)
-    refused(load_image, nifti(tmp_path / name, (32767,) * 3), r"declares 32767 x 32767 x 32767 voxels, 3.518e\+13")
+    refused(
+        load_image,
+        nifti(tmp_path / name, (32767,) * 3),
+        r"declares 32767 x 32767 x 32767 voxels, 3.518e\+13",
+    )
     refused(load_image, nifti(tmp_path / name, (3, 4, -5)), "damaged")
     refused(load_image, nifti(tmp_path / name, offset=1e30), "its voxels would begin at byte 1e.30")
     refused(load_image, nifti(tmp_path / name, offset=np.nan), "its voxels would begin at byte nan")
@@ -403,14 +487,24 @@ def test_a_volume_that_does_not_fit_memory(tmp_path, monkeypatch, name):
     path = tmp_path / name
     nifti(path) if name == "a.nii.gz" else path.write_bytes(nrrd())
     monkeypatch.setattr(budget, "available_bytes", lambda: 60 * 9 - 1)
-    refused(load_image, path, "its 3 x 4 x 5 voxels: needs about .* of memory, .* is free; crop or resample it first")
+    refused(
+        load_image,
+        path,
+        "its 3 x 4 x 5 voxels: needs about .* of memory, .* is free; crop or resample it first",
+    )
     if name == "a.nrrd":
-        refused(load_image, path, r"first, or convert it to \.zarr or uncompressed \.nii, which are read in parts$")
+        refused(
+            load_image,
+            path,
+            r"first, or convert it to \.zarr or uncompressed \.nii, which are read in parts$",
+        )
 
 
 @pytest.mark.parametrize("name", ["a.nii.gz", "a.nii"])
 def test_a_file_that_goes_on(tmp_path, name):
-    """Only as much is unpacked, or read for the checksum, as the header tells of, and what may lie behind that."""
+    """Only as much is unpacked, or read for the checksum, as the header tells of, and what may
+    lie behind that.
+    """
     path = nifti(tmp_path / name, data=bytes(2**25))
     refused(load_image, path, "it continues far after the last voxel")
 
@@ -420,14 +514,18 @@ SKIPPED = {"a.mha": "", "a.mhd": f"HeaderSize = {2**25}\n", "a.nrrd": f"byte ski
 
 @pytest.mark.parametrize("name", SKIPPED)
 def test_voxels_after_a_header_that_go_on(tmp_path, name):
-    """A hole takes no place on the disk, and minutes in a checksum; what a header skips may be long."""
+    """A hole takes no place on the disk, and minutes in a checksum; what a header skips may be
+    long.
+    """
     pytest.importorskip("SimpleITK")
     path, data = tmp_path / name, tmp_path / ("a.raw" if name == "a.mhd" else name)
     for more in {SKIPPED[name], ""}:
         if name == "a.mhd":
             data.write_bytes(bytes(60))
         path.write_bytes(
-            nrrd(more=more) if name == "a.nrrd" else mha(file=data.name if name == "a.mhd" else "LOCAL", more=more)
+            nrrd(more=more)
+            if name == "a.nrrd"
+            else mha(file=data.name if name == "a.mhd" else "LOCAL", more=more)
         )
         assert checked_header(path)[0].value_bytes == 60
         os.truncate(data, 2**25 + 400)
@@ -439,7 +537,9 @@ def test_voxels_after_a_header_that_go_on(tmp_path, name):
 
 def test_postscript_in_a_picture(tmp_path):
     """Pillow goes by what a file holds, and gives PostScript to Ghostscript."""
-    (tmp_path / "a.png").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\nshowpage\n")
+    (tmp_path / "a.png").write_bytes(
+        b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\nshowpage\n"
+    )
     refused(load_image, tmp_path / "a.png", "unknown to Pillow")
 
 
@@ -447,9 +547,16 @@ def test_a_picture_of_too_many_pixels(tmp_path):
     chunk = b"IHDR" + struct.pack(">IIBBBBB", 2**20, 2**20, 8, 0, 0, 0, 0)
     body = struct.pack(">I", 13) + chunk + struct.pack(">I", zlib.crc32(chunk))
     data = zlib.compress(b"")
-    body += struct.pack(">I", len(data)) + b"IDAT" + data + struct.pack(">I", zlib.crc32(b"IDAT" + data))
+    body += (
+        struct.pack(">I", len(data))
+        + b"IDAT"
+        + data
+        + struct.pack(">I", zlib.crc32(b"IDAT" + data))
+    )
     (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + body)
-    refused(load_image, tmp_path / "a.png", "expected at most 1073741824 pixels, got 1048576 x 1048576")
+    refused(
+        load_image, tmp_path / "a.png", "expected at most 1073741824 pixels, got 1048576 x 1048576"
+    )
 
 
 # --------------------------------------------------------------------------------------------------
@@ -502,6 +609,13 @@ def test_numbers_of_thousands_of_digits_among_options():
 
 @pytest.mark.parametrize("digits", [30, 400, 5000])
 def test_numbers_of_many_digits_on_the_command_line(tmp_path, capfd, digits):
-    arguments = ["mesh", str(tmp_path / "no.nii"), "-o", str(tmp_path / "a.vtu"), "--nodes", "9" * digits]
+    arguments = [
+        "mesh",
+        str(tmp_path / "no.nii"),
+        "-o",
+        str(tmp_path / "a.vtu"),
+        "--nodes",
+        "9" * digits,
+    ]
     assert main(arguments) == 2
     assert capfd.readouterr().err.count("\n") <= 2

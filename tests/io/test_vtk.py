@@ -1,4 +1,6 @@
-"""Models as VTK's files: every bit, set, material and text comes back, by our reader, pyvista and meshio."""
+"""Models as VTK's files: every bit, set, material and text comes back, by our reader, pyvista
+and meshio.
+"""
 
 import json
 
@@ -18,7 +20,8 @@ from tetopt.model.sets import nodes_of
 
 
 @pytest.mark.parametrize("suffix", ["vtu", "vtk"])
-@pytest.mark.parametrize(("n", "space"), [(2, "ras"), (3, "ras"), (3, "lps")])  # a slice has a plane of its own
+# a slice has a plane of its own
+@pytest.mark.parametrize(("n", "space"), [(2, "ras"), (3, "ras"), (3, "lps")])
 @pytest.mark.parametrize("order", [1, 2])
 def test_every_bit_comes_back(tmp_path, suffix, space, n, order):
     model, path = (sample_model if order == 1 else quadratic_model)(n), tmp_path / f"a.{suffix}"
@@ -26,7 +29,13 @@ def test_every_bit_comes_back(tmp_path, suffix, space, n, order):
     back = load_mesh(path)
     assert back.mesh.points.tobytes() == model.mesh.points.tobytes()
     np.testing.assert_array_equal(back.mesh.cells, model.mesh.cells)
-    assert (back.n_turned, back.n_left, back.space, back.notes, back.order) == (0, 0, space, (), order)
+    assert (back.n_turned, back.n_left, back.space, back.notes, back.order) == (
+        0,
+        0,
+        space,
+        (),
+        order,
+    )
     assert set(back.point_data) == set(model.point_data)
     for name, values in model.point_data.items():
         expected = values if name == "displacement" else all_nodes(values, model.mesh)
@@ -37,14 +46,18 @@ def test_every_bit_comes_back(tmp_path, suffix, space, n, order):
             np.testing.assert_array_equal(back.sets[kind][name], members)
     table = model.materials
     expected = dict(model.cell_data) | {
-        "young": table.young[table.of_cell], "nu": table.nu[table.of_cell], "material": table.of_cell + 1
-    }  # fmt: skip
+        "young": table.young[table.of_cell],
+        "nu": table.nu[table.of_cell],
+        "material": table.of_cell + 1,
+    }
     assert set(back.cell_data) == set(expected)
     for name, values in expected.items():
         np.testing.assert_array_equal(back.cell_data[name], values)
     texts = {name: str(back.field_data[name][0]) for name in (*ABOUT, "units", "space", "loads")}
     words = [
-        load_words(load._replace(numbers=load.numbers * ([-1, -1, 1] if space == "lps" else 1) + 0.0))
+        load_words(
+            load._replace(numbers=load.numbers * ([-1, -1, 1] if space == "lps" else 1) + 0.0)
+        )
         for load in model.loads
     ]
     assert json.loads(texts.pop("loads")) == words
@@ -63,14 +76,17 @@ def test_other_readers_see_the_file_s_own_space_and_units(tmp_path, suffix):
         np.testing.assert_allclose(young, young_of(model) / 1000.0, rtol=1e-15)
     grid = pyvista.read(path)
     for name, rows in model.sets.facets.items():
-        np.testing.assert_array_equal(np.flatnonzero(grid.point_data[f"on_{name}"]), nodes_of(model.mesh, rows))
+        np.testing.assert_array_equal(
+            np.flatnonzero(grid.point_data[f"on_{name}"]), nodes_of(model.mesh, rows)
+        )
 
 
 @pytest.mark.parametrize("suffix", ["vtu", "vtk"])
 @pytest.mark.parametrize("n", [2, 3])
 def test_other_readers_see_quadratic_cells(tmp_path, n, suffix):
-    """VTK finds a quadratic field exactly in the middle of cells, so that nodes and edges go together; sets have their
-    middle nodes, too."""
+    """VTK finds a quadratic field exactly in the middle of cells, so that nodes and edges go
+    together; sets have their middle nodes, too.
+    """
     model, path = quadratic_model(n), tmp_path / f"a.{suffix}"
     nodes, cells = quadratic(model.mesh.points, model.mesh.cells)
     middle = nodes.mean(axis=0)
@@ -90,7 +106,8 @@ def test_other_readers_see_quadratic_cells(tmp_path, n, suffix):
     centres = model.mesh.points[model.mesh.cells].mean(axis=1)
     expected = ((centres - middle) ** 2).sum(axis=1)
     places = pyvista.PolyData(np.column_stack([centres, np.zeros((len(centres), 3 - n))]))
-    # VTK looks for a place in a cell by iteration. Were two edges exchanged, values would be off by 1.
+    # VTK looks for a place in a cell by iteration. Were two edges exchanged, values would be off by
+    # 1.
     np.testing.assert_allclose(places.sample(grid)["square"], expected, rtol=0, atol=0.01)
 
 
@@ -98,17 +115,27 @@ def test_point_data_of_another_length_is_refused():
     model = quadratic_model(3)
     for values in (np.ones(5), np.ones(len(model.point_data["displacement"]) + 1)):
         with pytest.raises(
-            InputError, match=r"^point data: expected one row per corner node \(\d+\) or per node \(\d+\)"
+            InputError,
+            match=r"^point data: expected one row per corner node \(\d+\) or per node \(\d+\)",
         ):
             vtu(model._replace(point_data={"odd": values}))
 
 
 def test_results_are_turned_and_scaled_with_the_file(tmp_path):
-    """In LPS and MPa for whoever reads the file, and back in RAS and kPa for us; also of a second step."""
+    """In LPS and MPa for whoever reads the file, and back in RAS and kPa for us; also of a
+    second step.
+    """
     rng, model = np.random.default_rng(5), sample_model(3)
     tensor = rng.normal(size=(len(model.mesh.cells), 3, 3))
-    cell_data = {"stress": tensor.reshape(-1, 9), "strain_step2": tensor.reshape(-1, 9), "von_mises": tensor[:, 0, 0]}
-    point_data = {"displacement_step2": model.mesh.points + 1.0, "stress_nodes": np.ones((len(model.mesh.points), 9))}
+    cell_data = {
+        "stress": tensor.reshape(-1, 9),
+        "strain_step2": tensor.reshape(-1, 9),
+        "von_mises": tensor[:, 0, 0],
+    }
+    point_data = {
+        "displacement_step2": model.mesh.points + 1.0,
+        "stress_nodes": np.ones((len(model.mesh.points), 9)),
+    }
     model = model._replace(cell_data=cell_data, point_data=point_data, materials=None)
     save_model(tmp_path / "a.vtu", model, space="lps", units="MPa")
     grid, turn = pyvista.read(tmp_path / "a.vtu"), np.diag([-1.0, -1.0, 1.0])
@@ -116,7 +143,9 @@ def test_results_are_turned_and_scaled_with_the_file(tmp_path):
     np.testing.assert_allclose(grid.cell_data["stress"], there.reshape(-1, 9) / 1000.0, rtol=1e-14)
     np.testing.assert_allclose(grid.cell_data["strain_step2"], there.reshape(-1, 9), rtol=1e-14)
     np.testing.assert_allclose(grid.cell_data["von_mises"], tensor[:, 0, 0] / 1000.0, rtol=1e-14)
-    np.testing.assert_allclose(grid.point_data["displacement_step2"], (model.mesh.points + 1.0) @ turn, rtol=1e-14)
+    np.testing.assert_allclose(
+        grid.point_data["displacement_step2"], (model.mesh.points + 1.0) @ turn, rtol=1e-14
+    )
     back = load_mesh(tmp_path / "a.vtu")
     for fields, expected in ((back.cell_data, cell_data), (back.point_data, point_data)):
         assert set(fields) == set(expected)
@@ -127,25 +156,35 @@ def test_results_are_turned_and_scaled_with_the_file(tmp_path):
 def test_stresses_of_an_unknown_unit_are_left_out(tmp_path):
     model = quadratic_model(3)
     ones = np.ones(len(model.mesh.points))
-    grid = pyvista.wrap(model_grid(model._replace(point_data={"von_mises_nodes": ones, "kept": ones})))
+    grid = pyvista.wrap(
+        model_grid(model._replace(point_data={"von_mises_nodes": ones, "kept": ones}))
+    )
     grid.field_data["units"] = ["psi"]
     grid.save(tmp_path / "a.vtu")
     back = load_mesh(tmp_path / "a.vtu")
     assert list(back.point_data) == ["kept"]
     assert not {"young", "nu", "material"} & set(back.cell_data)
-    assert back.notes == ('dropped moduli and stresses, as their unit is none of kPa, MPa, Pa: "psi"',)
+    assert back.notes == (
+        'dropped moduli and stresses, as their unit is none of kPa, MPa, Pa: "psi"',
+    )
 
 
 def test_the_head_of_a_legacy_file_is_what_3d_slicer_looks_for(tmp_path):
     for space in ("ras", "lps"):
         save_model(tmp_path / "a.vtk", sample_model(3), space=space)
         lines = (tmp_path / "a.vtk").read_bytes().split(b"\n")[:3]
-        assert lines == [b"# vtk DataFile Version 4.2", f"tetopt, mm, SPACE={space.upper()}".encode(), b"BINARY"]
+        assert lines == [
+            b"# vtk DataFile Version 4.2",
+            f"tetopt, mm, SPACE={space.upper()}".encode(),
+            b"BINARY",
+        ]
 
 
 @pytest.mark.parametrize("suffix", ["vtu", "vtk"])
 def test_a_file_of_3d_slicer_s_in_lps_is_turned(tmp_path, suffix):
-    """As its vtkMRMLModelStorageNode writes them: a word in the head, or a string among the field data."""
+    """As its vtkMRMLModelStorageNode writes them: a word in the head, or a string among the
+    field data.
+    """
     model, path = sample_model(3), tmp_path / f"a.{suffix}"
     grid = pyvista.UnstructuredGrid({10: model.mesh.cells}, model.mesh.points * [-1, -1, 1])
     if suffix == "vtu":
@@ -194,7 +233,9 @@ def with_cells(grid, cells):
 
 @pytest.mark.parametrize("suffix", ["vtu", "vtk"])
 @pytest.mark.parametrize("change", CHANGES)
-def test_sets_are_dropped_unless_the_cells_are_those_they_were_written_for(tmp_path, change, suffix):
+def test_sets_are_dropped_unless_the_cells_are_those_they_were_written_for(
+    tmp_path, change, suffix
+):
     save_model(tmp_path / f"a.{suffix}", sample_model(3))
     grid = CHANGES[change](pyvista.read(tmp_path / f"a.{suffix}"))
     assert "facets:left" in grid.field_data
@@ -203,7 +244,10 @@ def test_sets_are_dropped_unless_the_cells_are_those_they_were_written_for(tmp_p
     assert back.sets == ({}, {})
     (note,) = back.notes
     assert note.startswith("dropped sets, as the cells may have changed")
-    assert set(note.split(": ")[1].split(", ")) == {*sample_model(3).sets.facets, *sample_model(3).sets.cells}
+    assert set(note.split(": ")[1].split(", ")) == {
+        *sample_model(3).sets.facets,
+        *sample_model(3).sets.cells,
+    }
 
 
 @pytest.mark.parametrize(
@@ -245,15 +289,25 @@ BOX = {"shape": [9, 8, 7], "affine": np.diag([2.0, 2.0, 3.0, 1.0]).tolist()}
         *(
             [json.dumps(each)]
             for each in (
-                [1, 2], 3, None, {"shape": [9, 8, 7]}, BOX | {"shape": 9}, BOX | {"shape": [9, 8]},
-                BOX | {"shape": [9, 8, 0]}, BOX | {"shape": [9.5, 8, 7]}, BOX | {"shape": ["9", "8", "7"]},
-                BOX | {"affine": None}, BOX | {"affine": "x"}, BOX | {"affine": [[1.0]]},
-                BOX | {"affine": np.diag([1.0, 0.0, 1.0, 1.0]).tolist()}, BOX | {"affine": [[10**400] * 4] * 4},
+                [1, 2],
+                3,
+                None,
+                {"shape": [9, 8, 7]},
+                BOX | {"shape": 9},
+                BOX | {"shape": [9, 8]},
+                BOX | {"shape": [9, 8, 0]},
+                BOX | {"shape": [9.5, 8, 7]},
+                BOX | {"shape": ["9", "8", "7"]},
+                BOX | {"affine": None},
+                BOX | {"affine": "x"},
+                BOX | {"affine": [[1.0]]},
+                BOX | {"affine": np.diag([1.0, 0.0, 1.0, 1.0]).tolist()},
+                BOX | {"affine": [[10**400] * 4] * 4},
                 {"shape": [9, 8], "affine": np.eye(3).tolist()},
             )
         ),
     ],
-)  # fmt: skip
+)
 def test_a_box_of_another_program_s_is_none(tmp_path, box):
     grid = sample_model(3).mesh.to_pyvista()
     grid.field_data["box"] = box
@@ -269,9 +323,17 @@ def test_the_box_of_ours_comes_back(tmp_path):
 
 
 def test_meshio_reads_a_legacy_file_of_data_that_came_from_a_vtu_file(tmp_path):
-    """What VTK has read are "long long", which it writes as "vtktypeint64", unknown to meshio 5.3.5."""
-    big = {"big": np.array([2**40, -1] * len(sample_model(3).mesh.cells))[: len(sample_model(3).mesh.cells)]}
-    save_model(tmp_path / "a.vtu", sample_model(3)._replace(cell_data=sample_model(3).cell_data | big))
+    """What VTK has read are "long long", which it writes as "vtktypeint64", unknown to meshio
+    5.3.5.
+    """
+    big = {
+        "big": np.array([2**40, -1] * len(sample_model(3).mesh.cells))[
+            : len(sample_model(3).mesh.cells)
+        ]
+    }
+    save_model(
+        tmp_path / "a.vtu", sample_model(3)._replace(cell_data=sample_model(3).cell_data | big)
+    )
     fields = load_mesh(tmp_path / "a.vtu").cell_data
     assert fields["n_voxels"].dtype == np.int64
     save_model(tmp_path / "b.vtk", sample_model(3)._replace(cell_data=fields, materials=None))

@@ -1,4 +1,6 @@
-"""XDMF files: read back by an XML parser and by VTK, every number and every set the same; dolfinx has its own test."""
+"""XDMF files: read back by an XML parser and by VTK, every number and every set the same;
+dolfinx has its own test.
+"""
 
 from xml.etree import ElementTree
 
@@ -27,7 +29,9 @@ MODELS = {
     "label sets only": lambda: sample_model()._replace(
         sets=standard_sets(sample_model().mesh, labels=sample_model().cell_data["label"]), loads=()
     ),
-    "bare": lambda: sample_model()._replace(cell_data={}, sets=Sets({}, {}), materials=None, loads=(), about={}),
+    "bare": lambda: sample_model()._replace(
+        cell_data={}, sets=Sets({}, {}), materials=None, loads=(), about={}
+    ),
 }
 
 
@@ -46,7 +50,11 @@ def item(node):
 
 def named(node):
     """What a node's Information tells, lists of words by name."""
-    return {each.get("Name"): each.get("Value").split() for each in node.findall("Information") if each.get("Value")}
+    return {
+        each.get("Name"): each.get("Value").split()
+        for each in node.findall("Information")
+        if each.get("Value")
+    }
 
 
 def grids(model):
@@ -100,7 +108,9 @@ def test_mesh_and_cell_data_are_the_models_own(model):
         assert np.array_equal(columns.pop("material"), table.of_cell + 1)
         assert np.array_equal(columns.pop("young"), table.young[table.of_cell])
         assert np.array_equal(columns.pop("nu"), table.nu[table.of_cell])
-        lists = {name: words for name, words in named(mesh).items() if name not in ("about", "load")}
+        lists = {
+            name: words for name, words in named(mesh).items() if name not in ("about", "load")
+        }
         assert {name: [float(word) for word in words] for name, words in lists.items()} == {
             "young": table.young.tolist(),
             "nu": table.nu.tolist(),
@@ -123,12 +133,17 @@ def test_every_facet_set_comes_back_with_its_side(model):
         for k, edge in enumerate([(0, 1), (1, 2), (2, 0)][: 3 if n == 3 else 1], n):
             assert np.array_equal(points[nodes[:, k]], points[nodes[:, edge]].mean(axis=1))
     assert nodes.shape[1] == (n if model.order == 1 else 3 * n - 3)
-    assert len(np.unique(np.sort(triples, axis=1), axis=0)) == len(triples)  # dolfinx knows one tag a facet
-    assert {name for name in named(parts["facets"]) if not name.endswith(" turned")} == set(model.sets.facets)
+    # dolfinx knows one tag a facet
+    assert len(np.unique(np.sort(triples, axis=1), axis=0)) == len(triples)
+    assert {name for name in named(parts["facets"]) if not name.endswith(" turned")} == set(
+        model.sets.facets
+    )
     for name, rows in model.sets.facets.items():
         expected = facet_triples(model.mesh.cells, rows)
         got = facet_set(parts["facets"], name)
-        assert np.array_equal(sorted_rows(from_smallest(got)), sorted_rows(from_smallest(expected))), name
+        assert np.array_equal(
+            sorted_rows(from_smallest(got)), sorted_rows(from_smallest(expected))
+        ), name
 
 
 def test_a_side_is_told_only_where_two_sets_differ():
@@ -168,7 +183,11 @@ def test_point_data_are_on_every_node(n, tmp_path):
     """Of corners alone they are interpolated; vectors of three columns stay together."""
     model = quadratic_model(n)
     columns, displacement = fields(grids(model)["mesh"], "Node"), model.point_data["displacement"]
-    parts = {"displacement": displacement} if n == 3 else {f"displacement_{k}": displacement[:, k] for k in range(n)}
+    parts = (
+        {"displacement": displacement}
+        if n == 3
+        else {f"displacement_{k}": displacement[:, k] for k in range(n)}
+    )
     expected = parts | {"warmth": all_nodes(model.point_data["warmth"], model.mesh)}
     assert list(columns) == list(expected)
     (tmp_path / "model.xdmf").write_bytes(xdmf(model))
@@ -194,7 +213,11 @@ def test_vtk_reads_the_same(model, tmp_path):
     read = pyvista.get_reader(path).read()
     if not isinstance(read, pyvista.MultiBlock):  # of one grid
         read = pyvista.MultiBlock({"mesh": read})
-    assert read.keys() == ["mesh", *(["facets"] if model.sets.facets else []), *(["cells"] if model.sets.cells else [])]
+    assert read.keys() == [
+        "mesh",
+        *(["facets"] if model.sets.facets else []),
+        *(["cells"] if model.sets.cells else []),
+    ]
     n, (points, cells) = model.mesh.ndim, elements(model)
     for name in read.keys():  # noqa: SIM118 - iterating over blocks gives the blocks
         assert np.array_equal(read[name].points[:, :n], points)
@@ -224,7 +247,9 @@ def test_cell_data_of_any_name_shape_and_kind(tmp_path):
     model = model._replace(cell_data=data)
     columns = fields(grids(model)["mesh"])
     expected = {name: data[name] for name in list(data)[:2]}
-    expected |= {f"pair_{k}": data["pair"][:, k] for k in range(2)} | {name: data[name] for name in ("is_in", "large")}
+    expected |= {f"pair_{k}": data["pair"][:, k] for k in range(2)} | {
+        name: data[name] for name in ("is_in", "large")
+    }
     assert list(columns) == ["material", "young", "nu", *expected]
     assert (columns["young"] > 0.0).all()
     (tmp_path / "model.xdmf").write_bytes(xdmf(model))
@@ -237,11 +262,23 @@ def test_cell_data_of_any_name_shape_and_kind(tmp_path):
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_values_that_vtk_cannot_read_are_refused(value):
     model = sample_model()
-    data = {"mean": model.cell_data["mean"], "odd": np.array([value] + [1.0] * (len(model.mesh.cells) - 1))}
-    with pytest.raises(InputError, match=r'^xdmf: expected finite cell data, got 1 invalid values of "odd"; use .vtu$'):
+    data = {
+        "mean": model.cell_data["mean"],
+        "odd": np.array([value] + [1.0] * (len(model.mesh.cells) - 1)),
+    }
+    with pytest.raises(
+        InputError,
+        match=r'^xdmf: expected finite cell data, got 1 invalid values of "odd"; use .vtu$',
+    ):
         xdmf(model._replace(cell_data=data))
-    with pytest.raises(InputError, match=r'^xdmf: expected finite point data, got 1 invalid values of "odd"'):
-        xdmf(model._replace(point_data={"odd": np.array([value] + [1.0] * (len(model.mesh.points) - 1))}))
+    with pytest.raises(
+        InputError, match=r'^xdmf: expected finite point data, got 1 invalid values of "odd"'
+    ):
+        xdmf(
+            model._replace(
+                point_data={"odd": np.array([value] + [1.0] * (len(model.mesh.points) - 1))}
+            )
+        )
 
 
 def test_meshio_reads_the_mesh_and_its_data(model, tmp_path):

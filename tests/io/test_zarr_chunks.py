@@ -1,4 +1,6 @@
-"""Zarr of all codecs, and chunks that lie: of their own length, of what they unpack to, of how many there are."""
+"""Zarr of all codecs, and chunks that lie: of their own length, of what they unpack to, of how
+many there are.
+"""
 
 import json
 import struct
@@ -17,7 +19,10 @@ from tetopt.io.stored_images import open_stored
 
 VALUES = np.arange(1000, dtype="i2").reshape(10, 10, 10)
 PACKERS = ("blosc", "zstd", "lz4", "gzip", "zlib", "bz2", "lzma")
-LINE = "its voxels .* cannot be read|its chunk .* copy it again|zarr crashed|more than 2.1 GB of memory"
+LINE = (
+    "its voxels .* cannot be read|its chunk .* copy it again|zarr crashed|more than 2.1 GB "
+    "of memory"
+)
 SLOW = pytest.mark.slow
 pytestmark = [
     pytest.mark.apart,
@@ -32,9 +37,15 @@ def packer(name):
 def written(path, fmt, **options):
     """An image of 10^3 voxels in chunks of 4^3, and the file of its first chunk."""
     array = zarr.create_array(
-        store=path, shape=VALUES.shape, chunks=(4, 4, 4), dtype="i2", zarr_format=fmt, fill_value=0,
-        attributes={"affine": np.eye(4).tolist()}, **options,
-    )  # fmt: skip
+        store=path,
+        shape=VALUES.shape,
+        chunks=(4, 4, 4),
+        dtype="i2",
+        zarr_format=fmt,
+        fill_value=0,
+        attributes={"affine": np.eye(4).tolist()},
+        **options,
+    )
     array[:] = VALUES
     return path / array.metadata.encode_chunk_key((0, 0, 0))
 
@@ -57,7 +68,9 @@ def test_voxels_come_back(tmp_path, kind):
     fmt, options = KINDS[kind]
     written(tmp_path / "a.zarr", fmt, **options)
     np.testing.assert_array_equal(load_image(tmp_path / "a.zarr").data, VALUES)
-    np.testing.assert_array_equal(open_stored(tmp_path / "a.zarr").read((1, 2, 3), (9, 6, 10)), VALUES[1:9, 2:6, 3:])
+    np.testing.assert_array_equal(
+        open_stored(tmp_path / "a.zarr").read((1, 2, 3), (9, 6, 10)), VALUES[1:9, 2:6, 3:]
+    )
 
 
 def refused(path, words):
@@ -68,13 +81,28 @@ def refused(path, words):
 
 
 @pytest.mark.deep
-@pytest.mark.parametrize("kind", ["2 blosc", *(pytest.param(each, marks=SLOW) for each in ("3 blosc", "3 shards"))])
+@pytest.mark.parametrize(
+    "kind", ["2 blosc", *(pytest.param(each, marks=SLOW) for each in ("3 blosc", "3 shards"))]
+)
 @pytest.mark.parametrize(
     ("offset", "number"),
-    [(3, 0), (4, 2**31 - 1), (4, 2000), (4, 127), (4, 0), (8, 0), (8, 2**31), (12, 2**31 - 1), (12, 100_000), (12, 0)],
+    [
+        (3, 0),
+        (4, 2**31 - 1),
+        (4, 2000),
+        (4, 127),
+        (4, 0),
+        (8, 0),
+        (8, 2**31),
+        (12, 2**31 - 1),
+        (12, 100_000),
+        (12, 0),
+    ],
 )
 def test_a_blosc_header_that_lies(tmp_path, kind, offset, number):
-    """Blosc may read beyond the chunk's end, which only the child survives: a line, or the right voxels."""
+    """Blosc may read beyond the chunk's end, which only the child survives: a line, or the right
+    voxels.
+    """
     fmt, options = KINDS[kind]
     chunk = written(tmp_path / "a.zarr", fmt, **options)
     content = bytearray(chunk.read_bytes())
@@ -88,7 +116,8 @@ def test_a_blosc_header_that_lies(tmp_path, kind, offset, number):
 
 @pytest.mark.deep
 @pytest.mark.parametrize(
-    "name", [pytest.param(each, marks=() if each in ("blosc", "gzip") else SLOW) for each in PACKERS]
+    "name",
+    [pytest.param(each, marks=() if each in ("blosc", "gzip") else SLOW) for each in PACKERS],
 )
 def test_chunks_that_are_cut(tmp_path, name):
     chunk = written(tmp_path / "a.zarr", 2, compressors=packer(name))

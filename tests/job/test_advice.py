@@ -1,4 +1,6 @@
-"""What a run tells of its mesh: requirements that it violates, and what is allowed but hardly meant."""
+"""What a run tells of its mesh: requirements that it violates, and what is allowed but hardly
+meant.
+"""
 
 import numpy as np
 import pytest
@@ -54,7 +56,10 @@ def said():
     ("change", "words"),
     [
         ({}, ""),
-        ({"distance_p95": 8.0, "distance_mean": 2.0}, "8.0 voxels apart at the 95th percentile, 2.0 on average"),
+        (
+            {"distance_p95": 8.0, "distance_mean": 2.0},
+            "8.0 voxels apart at the 95th percentile, 2.0 on average",
+        ),
         ({"reverse_p95": 8.0}, "8.0 voxels apart"),
         ({"distance_p95": np.nan, "reverse_p95": np.nan}, ""),
         ({"mesh_euler": -47}, ""),  # a row of the table
@@ -71,7 +76,10 @@ def test_a_mask_that_the_mesh_does_not_show(said, change, words):
 
 def test_what_background_leaves_is_no_mask(said):
     violated = {"mask": "the mesh and the mask overlap with a Dice of only 0.5"}
-    far = {"mask": NEAR._replace(distance_p95=8.0, components=3, mesh_euler=99), "dropped_components": 2}
+    far = {
+        "mask": NEAR._replace(distance_p95=8.0, components=3, mesh_euler=99),
+        "dropped_components": 2,
+    }
     words = "the mesh and the foreground overlap with a Dice of only 0.5"
     assert told(*unmet(violated, far, "foreground")) == {"mask": words}
     text = said()
@@ -83,7 +91,10 @@ def test_components_that_were_dropped_are_told(said):
     assert told(*unmet({}, {"mask": NEAR, "dropped_components": 0})) == {}
     assert said() == ""
     assert told(*unmet({}, {"mask": NEAR, "dropped_components": 2})) == {}
-    assert "dropped 2 small connected components of the mesh that are not separate in the mask" in said()
+    assert (
+        "dropped 2 small connected components of the mesh that are not separate in the mask"
+        in said()
+    )
     volumes = {"mask": NEAR, "dropped_components": 2, "dropped_volumes": {"3": 1.5, "0": 2.0}}
     told(*unmet({}, volumes))
     assert "as large as 3.5 voxels; " in said()
@@ -98,7 +109,9 @@ def label_of(label, mesh_volume=9.0, is_lost=False, voxels=9):
 
 
 def test_labels_of_twice_or_half_their_volume_are_named_the_worst_first(said):
-    rows = [label_of(k, volume) for k, volume in ((1, 9.0), (2, 18.5), (5, 2.0), (7, 17.9), (8, 4.6))]
+    rows = [
+        label_of(k, volume) for k, volume in ((1, 9.0), (2, 18.5), (5, 2.0), (7, 17.9), (8, 4.6))
+    ]
     told(*unmet({}, {"labels": [*rows, label_of(9, 0.0, True)]}))
     (line,) = (line for line in said().splitlines() if "ratio" in line)
     assert line.startswith("2 labels with more than 2 times the volume")
@@ -108,21 +121,36 @@ def test_labels_of_twice_or_half_their_volume_are_named_the_worst_first(said):
 def test_large_labels_of_another_volume_violate_a_requirement_by_name(said):
     volumes = (1, 9.0), (2, 13.6), (5, 5.3), (7, 13.4), (8, 5.5)
     rows = [label_of(k, volume, voxels=200) for k, volume in volumes]
-    assert told(*unmet({}, {"labels": [label_of(k, volume, voxels=199) for k, volume in volumes]})) == {}
+    assert (
+        told(*unmet({}, {"labels": [label_of(k, volume, voxels=199) for k, volume in volumes]}))
+        == {}
+    )
     assert "labels" not in said()
     names = {"label_names": {5: "wall"}, "labels": rows}
-    words = "the volume of cells is not 0.6 to 1.5 times that of voxels: 0.589 for label 5 (wall), 1.51 for label 2"
+    words = (
+        "the volume of cells is not 0.6 to 1.5 times that of voxels: 0.589 for label 5 "
+        "(wall), 1.51 for label 2"
+    )
     assert told(*unmet({"labels": "by numbers"}, names)) == {"labels": f"{words}; {LABEL_REMEDY}"}
     # With a part of the label in the mesh, the volume is that of the part.
-    half = [row._replace(covered_voxels=300, voxels=600, mesh_volume=0.5 * row.mesh_volume) for row in rows]
+    half = [
+        row._replace(covered_voxels=300, voxels=600, mesh_volume=0.5 * row.mesh_volume)
+        for row in rows
+    ]
     assert told(*unmet({}, names | {"labels": half})) == {"labels": f"{words}; {LABEL_REMEDY}"}
-    few = [row._replace(covered_voxels=199, voxels=398, mesh_volume=0.5 * row.mesh_volume) for row in rows]
+    few = [
+        row._replace(covered_voxels=199, voxels=398, mesh_volume=0.5 * row.mesh_volume)
+        for row in rows
+    ]
     assert told(*unmet({}, names | {"labels": few})) == {}
 
 
 def test_components_without_a_cell_violate_a_requirement_the_largest_first(said):
     lost = tuple(LostComponent(n, (1.0, 2.5, 1234.56)) for n in (99, 60, 50, 50))
-    rows = [label_of(3)._replace(lost_components=lost), label_of(4, is_lost=True)._replace(lost_components=lost[:2])]
+    rows = [
+        label_of(3)._replace(lost_components=lost),
+        label_of(4, is_lost=True)._replace(lost_components=lost[:2]),
+    ]
     words = told(*unmet({}, {"labels": rows}))["labels"]
     assert words.startswith(
         "components of labels of 50 voxels or more without a cell: 99 voxels of label 3 at (1, 2.5,"
@@ -138,16 +166,21 @@ def test_components_without_a_cell_violate_a_requirement_the_largest_first(said)
 
 def test_what_requirements_allow_is_counted_over_all_labels_the_worst_first():
     lost = tuple(LostComponent(n, (1.0, 2.5, 3.0)) for n in (40, 3))
-    rows = [label_of(k, 9.0 * ratio) for k, ratio in enumerate((0.5, 0.86, 0.8, 1.14, 1.3, 0.1, 0.84, 1.2))]
+    rows = [
+        label_of(k, 9.0 * ratio)
+        for k, ratio in enumerate((0.5, 0.86, 0.8, 1.14, 1.3, 0.1, 0.84, 1.2))
+    ]
     assert beyond_requirements({"labels": [rows[1], rows[3]]}) == {}
     assert beyond_requirements({}) == {}
     rows[1] = rows[1]._replace(lost_components=lost, components=9, mesh_components=7)
     rows[3] = rows[3]._replace(lost_components=lost[:1], components=2, mesh_components=2)
-    rows[5] = rows[5]._replace(lost_components=lost[1:], components=1, mesh_components=1)  # its cell is elsewhere
+    # its cell is elsewhere
+    rows[5] = rows[5]._replace(lost_components=lost[1:], components=1, mesh_components=1)
     rows[7] = rows[7]._replace(mesh_components=3)
     rows[0] = rows[0]._replace(lost_components=lost, mesh_components=5)  # the space between tissues
     assert beyond_requirements({"labels": rows, "label_names": {5: "rib"}}) == {
-        "not all labels fit": "labels: of 7 and label 0, 6 with less than 0.85 or more than 1.15 times the volume of "
+        "not all labels fit": "labels: of 7 and label 0, 6 with less than 0.85 or more than 1.15 "
+        "times the volume of "
         "voxels: 5 (rib) (0.1), 0 (0.5), 4 (1.3), 2 (0.8), 7 (1.2) and 1 more; "
         "3 with components without a cell: "
         "1 (2 of 9, voxels: 43), 3 (1 of 2, voxels: 40), 5 (rib) (1 of 1, voxels: 3); "
@@ -156,7 +189,9 @@ def test_what_requirements_allow_is_counted_over_all_labels_the_worst_first():
 
 
 def test_pieces_that_merge_and_cavities_that_open_are_counted():
-    """Components that are lost do not merge; of a label partly beyond the mesh, and of label 0, nothing is known."""
+    """Components that are lost do not merge; of a label partly beyond the mesh, and of label 0,
+    nothing is known.
+    """
     lost = tuple(LostComponent(n, (1.0, 2.5, 3.0)) for n in (40, 3))
     counts = {
         0: (9, 1, ()),
@@ -168,7 +203,10 @@ def test_pieces_that_merge_and_cavities_that_open_are_counted():
         6: (1, 1, ()),
     }
     names = ("components", "mesh_components", "lost_components")
-    rows = [label_of(k, 9.0)._replace(**dict(zip(names, count, strict=True))) for k, count in counts.items()]
+    rows = [
+        label_of(k, 9.0)._replace(**dict(zip(names, count, strict=True)))
+        for k, count in counts.items()
+    ]
     rows[4] = rows[4]._replace(voxels=2 * rows[4].covered_voxels, mesh_volume=4.5)
     empty = dict.fromkeys(LabelInterface._fields, 0)
     cavities = {0: (5, 1), 2: (1, 1), 3: (1, 2), 4: (1, 0), 5: (1, 0), 6: (3, 1)}
@@ -178,7 +216,8 @@ def test_pieces_that_merge_and_cavities_that_open_are_counted():
     ]
     (line,) = beyond_requirements({"labels": rows, "interfaces": surfaces}).values()
     assert line == (
-        "labels: of 6 and label 0, 2 with components without a cell: 1 (2 of 3, voxels: 43), 3 (2 of 9, voxels: 43); "
+        "labels: of 6 and label 0, 2 with components without a cell: 1 (2 of 3, voxels: 43), 3 "
+        "(2 of 9, voxels: 43); "
         "2 with fewer pieces of cells than of voxels: 3 (3 of 7), 2 (2 of 3); "
         "1 with fewer cavities in cells than in voxels: 6 (1 of 3)"
     )
@@ -188,11 +227,21 @@ def test_pieces_that_merge_and_cavities_that_open_are_counted():
     ("change", "words"),
     [
         ({"mesh_volume": 8.6}, ""),
-        ({"mesh_volume": 8.5}, "with less than 0.95 or more than 1.05 times the volume of voxels (0.944)"),
-        ({"mesh_volume": 9.5}, "with less than 0.95 or more than 1.05 times the volume of voxels (1.06)"),
         (
-            {"components": 4, "lost_components": (LostComponent(7, (0.0, 0.0)), LostComponent(2, (1.0, 0.0)))},
-            "with components without a cell (2 of 4, voxels: 9); with fewer pieces of cells than of voxels (1 of 2)",
+            {"mesh_volume": 8.5},
+            "with less than 0.95 or more than 1.05 times the volume of voxels (0.944)",
+        ),
+        (
+            {"mesh_volume": 9.5},
+            "with less than 0.95 or more than 1.05 times the volume of voxels (1.06)",
+        ),
+        (
+            {
+                "components": 4,
+                "lost_components": (LostComponent(7, (0.0, 0.0)), LostComponent(2, (1.0, 0.0))),
+            },
+            "with components without a cell (2 of 4, voxels: 9); with fewer pieces of cells than "
+            "of voxels (1 of 2)",
         ),
     ],
 )
@@ -214,7 +263,9 @@ def test_more_nodes_do_not_help_voxels_without_a_label_in_a_foreground(said):
         text = said()
         assert text.count("\n") == n_lines
         assert text.count("allow more nodes") == n_remedies
-        assert text.count("0 (voxels without a label, enclosed or bright)") == (word == "foreground")
+        assert text.count("0 (voxels without a label, enclosed or bright)") == (
+            word == "foreground"
+        )
     told(*unmet({"labels": "..."}, {"labels": [air._replace(dice=0.0)]}, "foreground"))
     assert said().endswith("of 200 voxels or more, lies in a cell with that label\n")
 
@@ -237,8 +288,20 @@ def started_only():
         (ended(), "graded", 100, {}, ""),
         (ended(), "graded", 120, {}, "100 nodes instead of 120; use more iterations\n"),
         (ended()._replace(ended="converged"), "graded", 120, {}, "100 nodes instead of 120\n"),
-        (started_only(), "graded", 120, {}, "100 nodes instead of 120, as no iteration was made; allow some"),
-        (ended(), "graded", 80, {"nodes_of_sizes": 107}, "the target sizes need about 107; set `nodes` to that"),
+        (
+            started_only(),
+            "graded",
+            120,
+            {},
+            "100 nodes instead of 120, as no iteration was made; allow some",
+        ),
+        (
+            ended(),
+            "graded",
+            80,
+            {"nodes_of_sizes": 107},
+            "the target sizes need about 107; set `nodes` to that",
+        ),
         (ended(E_D=1.2), "start", None, {}, "E_D rose to 1.200 times its initial value"),
         (ended(E_D=1.2), "graded", None, {}, ""),
         (
@@ -248,7 +311,13 @@ def started_only():
             {"cells_without_voxel": 1},
             "nodes instead of 120: most cells contain no voxel centre",
         ),
-        (ended(), "graded", None, {"nodes_of_many_labels": 3}, "more than 4 labels meet at 3 nodes"),
+        (
+            ended(),
+            "graded",
+            None,
+            {"nodes_of_many_labels": 3},
+            "more than 4 labels meet at 3 nodes",
+        ),
     ],
 )
 def test_what_is_hardly_meant(said, result, mode, nodes, measured, words):
@@ -259,12 +328,16 @@ def test_what_is_hardly_meant(said, result, mode, nodes, measured, words):
 
 
 def test_thin_walls_are_the_reason_of_an_initial_mesh_that_is_far_too_large(said):
-    many = ended()._replace(initial=tetopt.Mesh(np.vstack([MESH.points, np.zeros((497, 2))]), MESH.cells))
+    many = ended()._replace(
+        initial=tetopt.Mesh(np.vstack([MESH.points, np.zeros((497, 2))]), MESH.cells)
+    )
     reason = "(the initial mesh has 500, to keep thin walls of the mask)"
     for n_nodes, nodes, measured, is_told in (
-        (200, 100, {"mask": NEAR}, True), (200, 100, {}, False), (400, 350, {"mask": NEAR}, False),
+        (200, 100, {"mask": NEAR}, True),
+        (200, 100, {}, False),
+        (400, 350, {"mask": NEAR}, False),
         (80, 100, {"mask": NEAR}, False),
-    ):  # fmt: skip
+    ):
         told(*of_result(many, "fast", "graded", n_nodes, nodes, measured))
         assert said().startswith(f"{n_nodes} nodes instead of {nodes}{f' {reason}' * is_told}; ")
 
@@ -291,7 +364,9 @@ def test_only_requested_sizes_are_a_remedy(tmp_path, capsys, words, has_sizes):
 
 
 def test_nodes_that_do_not_suffice_are_called_the_least(said):
-    """More nodes make all other cells smaller, so that sizes take more; not if other cells have a size."""
+    """More nodes make all other cells smaller, so that sizes take more; not if other cells have
+    a size.
+    """
     data = np.zeros((24, 24, 24))
     data[4:20, 4:20, 4:20], data[10:13, 4:20, 4:20] = 1.0, 2.0
     what = tetopt.content(tetopt.Image(data), tetopt.Image(data))
@@ -300,7 +375,10 @@ def test_nodes_that_do_not_suffice_are_called_the_least(said):
         again = sizes_by_label(Sizes(cells_across=1, edge_size=edge_size), what, made.nodes)
         assert (again.scale > 1.0) == is_least
         tell_label_sizes(made)
-        assert f"sizes by label require {'at least' if is_least else 'about'} {made.nodes} nodes" in said()
+        assert (
+            f"sizes by label require {'at least' if is_least else 'about'} {made.nodes} nodes"
+            in said()
+        )
 
 
 def test_cells_between_thick_slices_are_no_reason_for_fewer_nodes(said):
@@ -336,7 +414,17 @@ def test_every_cell_without_a_voxel_is_told(tmp_path, capsys):
     rng = np.random.default_rng(3)
     path = tmp_path / "noise.nii.gz"
     tetopt.save_image(path, tetopt.Image(rng.normal(size=(20, 20))))
-    command = ["mesh", path, "--uniform", "--nodes", "200", "-o", tmp_path / "a.vtu", "--json", tmp_path / "a.json"]
+    command = [
+        "mesh",
+        path,
+        "--uniform",
+        "--nodes",
+        "200",
+        "-o",
+        tmp_path / "a.vtu",
+        "--json",
+        tmp_path / "a.json",
+    ]
     assert exit_code(*command) == 0
     out, err = capsys.readouterr()
     numbers = numbers_in(tmp_path / "a.json")
@@ -352,7 +440,18 @@ def test_every_cell_without_a_voxel_is_told(tmp_path, capsys):
     err = capsys.readouterr().err
     assert "contain no voxel centre" in err
     assert "reduce" not in err  # interfaces make such cells, and labels need nodes
-    sizes = ["mesh", path, "--edge-size", "1.6", "--nodes", "200", "--iterations", "2", "-o", tmp_path / "b.vtu"]
+    sizes = [
+        "mesh",
+        path,
+        "--edge-size",
+        "1.6",
+        "--nodes",
+        "200",
+        "--iterations",
+        "2",
+        "-o",
+        tmp_path / "b.vtu",
+    ]
     assert exit_code(*sizes) == 0
     err = capsys.readouterr().err
     assert "sizes require about 3" in err

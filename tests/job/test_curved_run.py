@@ -1,4 +1,6 @@
-"""Runs of order 2 with labels: what they tell and write, and what `tetopt quality` says of folded cells."""
+"""Runs of order 2 with labels: what they tell and write, and what `tetopt quality` says of
+folded cells.
+"""
 
 import numpy as np
 import pytest
@@ -18,15 +20,24 @@ def test_a_run_counts_and_writes_curved_edges(tmp_path):
     tetopt.save_image(tmp_path / "l.nii.gz", labels)
     output, numbers = tmp_path / "ball.vtu", tmp_path / "run.json"
     job = tetopt.Job(
-        images=tmp_path / "l.nii.gz", labels=tmp_path / "l.nii.gz", output=output, nodes=600, order=2, iterations=6,
-        json_path=numbers, young="2", nu=0.3, loads=["hold:inferior", "pressure:superior:0.1"],
-    )  # fmt: skip
+        images=tmp_path / "l.nii.gz",
+        labels=tmp_path / "l.nii.gz",
+        output=output,
+        nodes=600,
+        order=2,
+        iterations=6,
+        json_path=numbers,
+        young="2",
+        nu=0.3,
+        loads=["hold:inferior", "pressure:superior:0.1"],
+    )
     told = []
     result = tetopt.run(job, on=told.append)
     curving = result.optimized.curving
     (words,) = [event.text for event in told if "edges on smooth surfaces" in event.text]
     assert words.startswith(
-        f"{curving.n_on_level} of {curving.n_edges} edges on smooth surfaces have their mid-edge node"
+        f"{curving.n_on_level} of {curving.n_edges} edges on smooth surfaces have their mid-edge "
+        "node"
     )
     written = numbers_in(numbers)
     schemas.assert_described(written)
@@ -38,31 +49,45 @@ def test_a_run_counts_and_writes_curved_edges(tmp_path):
     assert written["quality"]["smallest_volume"] == pytest.approx(result.mesh.cell_volumes.min())
     back = tetopt.load_mesh(output)
     np.testing.assert_array_equal(back.mesh.midpoints, result.mesh.midpoints)
-    solved, again = (tetopt.solve(tetopt.build_model(mesh)) for mesh in (back, back._replace(mesh=result.mesh)))
+    solved, again = (
+        tetopt.solve(tetopt.build_model(mesh)) for mesh in (back, back._replace(mesh=result.mesh))
+    )
     np.testing.assert_array_equal(solved.u, again.u)
     straight = tetopt.Mesh(result.mesh.points, result.mesh.cells)
-    assert np.abs(solved.u - tetopt.solve(tetopt.build_model(back._replace(mesh=straight))).u).max() > 1e-4
+    assert (
+        np.abs(solved.u - tetopt.solve(tetopt.build_model(back._replace(mesh=straight))).u).max()
+        > 1e-4
+    )
 
 
 def test_a_start_with_curved_edges_loses_them_without_labels(tmp_path):
     image = sample_image()
     tetopt.save_image(tmp_path / "a.nii.gz", image)
-    tetopt.save_mesh(tmp_path / "s.vtu", with_bent_edges(tetopt.lattice_mesh(image, nodes=60), 0.05), order=2)
+    tetopt.save_mesh(
+        tmp_path / "s.vtu", with_bent_edges(tetopt.lattice_mesh(image, nodes=60), 0.05), order=2
+    )
     for iterations in (1, 0):
         told = []
         job = tetopt.Job(
-            images=tmp_path / "a.nii.gz", start=tmp_path / "s.vtu", output=tmp_path / f"{iterations}.vtu", order=2,
+            images=tmp_path / "a.nii.gz",
+            start=tmp_path / "s.vtu",
+            output=tmp_path / f"{iterations}.vtu",
+            order=2,
             iterations=iterations,
-        )  # fmt: skip
+        )
         result = tetopt.run(job, on=told.append)
         is_lost = any("curved edges become straight" in event.text for event in told)
         assert is_lost == (result.mesh.midpoints is None) == (iterations == 1)
 
 
 def test_volumes_of_converted_cells_are_those_of_the_written_order(tmp_path):
-    """Straight cells have the volume that their surface encloses, and keep it with order 2 again."""
+    """Straight cells have the volume that their surface encloses, and keep it with order 2
+    again.
+    """
     mesh = with_bent_edges(sample_model().mesh, 0.05)
-    tetopt.save_mesh(tmp_path / "2.vtu", mesh, {"volume": mesh.cell_volumes, "rho": mesh.cell_volumes}, order=2)
+    tetopt.save_mesh(
+        tmp_path / "2.vtu", mesh, {"volume": mesh.cell_volumes, "rho": mesh.cell_volumes}, order=2
+    )
     surface = mesh.points[boundary_facets(mesh.cells)]
     for source, output, order in (("2", "1", 1), ("1", "again", 2)):
         paths = (tmp_path / f"{name}.vtu" for name in (source, output))

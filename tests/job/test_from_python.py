@@ -1,4 +1,6 @@
-"""What commands do with files, called from Python: the same numbers, files and refusals, and nothing printed."""
+"""What commands do with files, called from Python: the same numbers, files and refusals, and
+nothing printed.
+"""
 
 import subprocess
 import sys
@@ -26,7 +28,9 @@ def place(tmp_path):
     tetopt.save_image(tmp_path / "image.nii.gz", image)
     mesh = tetopt.lattice_mesh(image, nodes=200)
     tetopt.save_mesh(
-        tmp_path / "a.vtu", mesh, {"label": tetopt.cell_labels(labels, mesh), **tetopt.cell_fields(mesh, image)}
+        tmp_path / "a.vtu",
+        mesh,
+        {"label": tetopt.cell_labels(labels, mesh), **tetopt.cell_fields(mesh, image)},
     )
     return tmp_path
 
@@ -38,16 +42,20 @@ def test_python_has_the_numbers_of_the_commands(place, capfd):
         numbers = [
             judge(mesh, image).numbers,
             solve_file(mesh, model=ModelOptions(**load), part=LabelledPart()).numbers,
-            convert_file(mesh, place / "b.inp", solver=SolverOptions(**load), part=LabelledPart()).numbers,
+            convert_file(
+                mesh, place / "b.inp", solver=SolverOptions(**load), part=LabelledPart()
+            ).numbers,
             write_surface(mesh, place / "b.stl", SurfacePart(label="1")).numbers,
         ]
     assert capfd.readouterr() == ("", "")
     first = (place / "b.inp").read_bytes(), (place / "b.stl").read_bytes()
     model = ("--young", load["young"], "--load", "compress:5%")
     commands = [
-        ("quality", mesh, "--image", image), ("fem", mesh, *model),
-        ("convert", mesh, place / "b.inp", *model), ("surface", mesh, "-o", place / "b.stl", "--label", "1"),
-    ]  # fmt: skip
+        ("quality", mesh, "--image", image),
+        ("fem", mesh, *model),
+        ("convert", mesh, place / "b.inp", *model),
+        ("surface", mesh, "-o", place / "b.stl", "--label", "1"),
+    ]
     for words, ours in zip(commands, numbers, strict=True):
         assert exit_code(*words, "--force", "--json", place / "command.json") == 0
         save_json(place / "python.json", ours)
@@ -88,7 +96,8 @@ def test_a_pool_of_new_processes_works_after_a_run(tmp_path):
         "import tetopt\n\n\n"
         "def voxels(size):\n"
         "    image = tetopt.Image(np.ones((size,) * 3))\n"
-        "    return int(tetopt.cell_moments(image, tetopt.lattice_mesh(image, nodes=60)).n_voxels.sum())\n\n\n"
+        "    return int(tetopt.cell_moments(image, tetopt.lattice_mesh(image, "
+        "nodes=60)).n_voxels.sum())\n\n\n"
         "if __name__ == '__main__':\n"
         "    print(voxels(4))\n"
         "    with multiprocessing.get_context('spawn').Pool(1) as pool:\n"
@@ -105,12 +114,18 @@ def test_an_image_is_meshed_as_by_the_command(tmp_path, given):
     phantom = tetopt.load_phantom("sphere")
     image, labels = phantom.image(voxel_mm=6), phantom.label_image(voxel_mm=6)
     near = np.linalg.norm(np.indices(image.shape).T - (np.array(image.shape) - 1) / 2, axis=-1).T
-    files = {"image": image, "labels": labels, "mask": tetopt.Image(1.0 * (near < 5.2), image.affine)}
+    files = {
+        "image": image,
+        "labels": labels,
+        "mask": tetopt.Image(1.0 * (near < 5.2), image.affine),
+    }
     for name, each in files.items():
         tetopt.save_image(tmp_path / f"{name}.nii.gz", each)
     words = [word for name in given for word in (f"--{name}", tmp_path / f"{name}.nii.gz")]
     code = exit_code("mesh", tmp_path / "image.nii.gz", "-o", tmp_path / "a.vtu", *words)
-    result = tetopt.mesh_image(tetopt.load_image(tmp_path / "image.nii.gz"), **{name: files[name] for name in given})
+    result = tetopt.mesh_image(
+        tetopt.load_image(tmp_path / "image.nii.gz"), **{name: files[name] for name in given}
+    )
     assert (code == 1) == bool(result.violated)
     written = tetopt.load_mesh(tmp_path / "a.vtu")
     np.testing.assert_array_equal(result.mesh.points, written.mesh.points)
@@ -122,7 +137,9 @@ def test_an_image_is_meshed_as_by_the_command(tmp_path, given):
 
 
 def test_a_result_comes_with_its_mask_and_labels(place):
-    """To the model that its content and labels give; of a plain image, with curved cells of order 2."""
+    """To the model that its content and labels give; of a plain image, with curved cells of
+    order 2.
+    """
     phantom = tetopt.load_phantom("sphere")
     image, labels = phantom.image(voxel_mm=6), phantom.label_image(voxel_mm=6)
     mask = tetopt.Image(1.0 * (np.indices(image.shape)[0] < 8), image.affine)
@@ -135,7 +152,9 @@ def test_a_result_comes_with_its_mask_and_labels(place):
     for name in ("a.vtu", "b.vtu"):
         tetopt.save_model(place / name, model if name == "a.vtu" else other)
     assert (place / "a.vtu").read_bytes() == (place / "b.vtu").read_bytes()
-    assert not np.array_equal(model.cell_data["mean"], tetopt.cell_fields(result.mesh, image)["mean"])
+    assert not np.array_equal(
+        model.cell_data["mean"], tetopt.cell_fields(result.mesh, image)["mean"]
+    )
     straight = tetopt.mesh_image(image, 300, iterations=0, order=2)
     assert (straight.mesh.midpoints, tetopt.build_model(straight).order) == (None, 2)
     with pytest.raises(InputError, match="a result of `mesh_image` without an image"):

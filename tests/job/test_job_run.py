@@ -21,17 +21,31 @@ OF_PARTS = {"parts": 2, "nodes": 300, "workers": 1}
 
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory):
-    """An image of 3-D with a mask, labels and a second contrast, one of 2-D, one for parts, a mesh to start from."""
+    """An image of 3-D with a mask, labels and a second contrast, one of 2-D, one for parts, a
+    mesh to start from.
+    """
     folder = tmp_path_factory.mktemp("inputs")
     image = sample_image(3)
     values = {
-        "a": image.data, "b": image.data**2, "l": image.data > 30, "m": image.data > -np.inf, "p": sample_image(2).data,
-    }  # fmt: skip
+        "a": image.data,
+        "b": image.data**2,
+        "l": image.data > 30,
+        "m": image.data > -np.inf,
+        "p": sample_image(2).data,
+    }
     for name, data in values.items():
-        tetopt.save_image(folder / f"{name}.nii.gz", tetopt.Image(1.0 * data, image.affine if data.ndim == 3 else None))
+        tetopt.save_image(
+            folder / f"{name}.nii.gz",
+            tetopt.Image(1.0 * data, image.affine if data.ndim == 3 else None),
+        )
     ball = 400.0 * ((np.indices((24, 24, 24)) - 12.0) ** 2).sum(axis=0) < 400.0 * 60.0
     tetopt.save_image(folder / "c.nii", tetopt.Image(500.0 + 400.0 * ball))
-    assert exit_code("mesh", folder / "a.nii.gz", "-o", folder / "s.vtu", "--nodes", 60, "--iterations", 1) == 0
+    assert (
+        exit_code(
+            "mesh", folder / "a.nii.gz", "-o", folder / "s.vtu", "--nodes", 60, "--iterations", 1
+        )
+        == 0
+    )
     return folder
 
 
@@ -65,11 +79,15 @@ def words_of(options):
         if value is True:
             yield f"--{option}"
         elif value is not None:
-            yield from (f"--{option}={text}" for text in (value if isinstance(value, list) else [value]))
+            yield from (
+                f"--{option}={text}" for text in (value if isinstance(value, list) else [value])
+            )
 
 
 def both(inputs, folder, monkeypatch, images, options, name="x.vtu", is_drawn=False):
-    """The exit code of the command, and the result of the same run from Python, each in a folder of its own."""
+    """The exit code of the command, and the result of the same run from Python, each in a folder
+    of its own.
+    """
     paths = [inputs / each for each in ([images] if isinstance(images, str) else images)]
     options = {"nodes": 60, "iterations": 2} | {
         key: inputs / value if key in FILES else value for key, value in options.items()
@@ -81,12 +99,16 @@ def both(inputs, folder, monkeypatch, images, options, name="x.vtu", is_drawn=Fa
     code = exit_code("mesh", *paths, "-o", name, "--json", "r.json", *words_of(options))
     monkeypatch.chdir(folder / "python")
     events = []
-    result = tetopt.run(tetopt.Job(images=paths, output=name, json_path="r.json", **options), on=events.append)
+    result = tetopt.run(
+        tetopt.Job(images=paths, output=name, json_path="r.json", **options), on=events.append
+    )
     return code, result, events
 
 
 def files_in(folder):
-    return {str(path.relative_to(folder)): path for path in sorted(folder.rglob("*")) if path.is_file()}
+    return {
+        str(path.relative_to(folder)): path for path in sorted(folder.rglob("*")) if path.is_file()
+    }
 
 
 def alike(value):
@@ -126,7 +148,9 @@ def test_a_run_leaves_the_files_of_the_command(inputs, tmp_path, monkeypatch, ki
     assert stages[0] == "read"
     assert {"round" if kind == "parts" else "optimise", "write"} <= set(stages)
     sentences = {event.data: event.text for event in events if event.kind == "violated"}
-    assert sentences == {name: f"requirement violated: {name}: {words}" for name, words in result.violated.items()}
+    assert sentences == {
+        name: f"requirement violated: {name}: {words}" for name, words in result.violated.items()
+    }
     assert all(event.text for event in events)
 
 
@@ -137,8 +161,16 @@ def test_a_run_writes_every_format_as_the_command_does(inputs, tmp_path, monkeyp
     assert_equal_files(tmp_path)
 
 
-def test_without_a_listener_warnings_are_pythons_and_within_one_they_are_its_events(inputs, tmp_path):
-    job = tetopt.Job(images=inputs / "a.nii.gz", output=tmp_path / "w.vtu", nodes=60, iterations=1, min_dihedral=65)
+def test_without_a_listener_warnings_are_pythons_and_within_one_they_are_its_events(
+    inputs, tmp_path
+):
+    job = tetopt.Job(
+        images=inputs / "a.nii.gz",
+        output=tmp_path / "w.vtu",
+        nodes=60,
+        iterations=1,
+        min_dihedral=65,
+    )
     with pytest.warns(UserWarning, match="requirement violated: min_dihedral: "):
         assert "min_dihedral" in tetopt.run(job).violated
     events = []
@@ -155,11 +187,20 @@ def test_an_input_is_no_output_and_a_refused_run_leaves_no_folder(inputs, tmp_pa
     before = (tmp_path / "x.vtu").read_bytes()
     with pytest.raises(tetopt.InputError, match="is also an input"):
         tetopt.run(
-            tetopt.Job(images=inputs / "a.nii.gz", start=tmp_path / "x.vtu", output=tmp_path / "x.vtu", force=True)
+            tetopt.Job(
+                images=inputs / "a.nii.gz",
+                start=tmp_path / "x.vtu",
+                output=tmp_path / "x.vtu",
+                force=True,
+            )
         )
     assert (tmp_path / "x.vtu").read_bytes() == before
     with pytest.raises(tetopt.InputError, match="no such file"):
-        tetopt.run(tetopt.Job(images=tmp_path / "no.nii", output=tmp_path / "y.vtu", figures=tmp_path / "pictures"))
+        tetopt.run(
+            tetopt.Job(
+                images=tmp_path / "no.nii", output=tmp_path / "y.vtu", figures=tmp_path / "pictures"
+            )
+        )
     assert not (tmp_path / "pictures").exists()
 
 
@@ -173,7 +214,9 @@ def test_the_library_prints_nothing(inputs, tmp_path, capfd):
 
 @pytest.mark.parametrize("suffix", [".vtu", ".inp", ".feb"])
 def test_a_run_cut_short_writes_its_mesh_before_anything_else(tmp_path, monkeypatch, suffix):
-    """Before cells are lifted and measured, which takes minutes for many; FEBio takes no mesh without moduli."""
+    """Before cells are lifted and measured, which takes minutes for many; FEBio takes no mesh
+    without moduli.
+    """
     phantom = tetopt.load_phantom("sphere")
     tetopt.save_image(tmp_path / "a.nii", phantom.image(voxel_mm=4))
     tetopt.save_image(tmp_path / "l.nii", phantom.label_image(voxel_mm=4))

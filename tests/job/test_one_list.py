@@ -1,4 +1,6 @@
-"""What is wrong with a mesh is one list: the command's exit code, run.json, its last line, and a cohort's row agree."""
+"""What is wrong with a mesh is one list: the command's exit code, run.json, its last line, and a
+cohort's row agree.
+"""
 
 from itertools import pairwise
 
@@ -26,7 +28,9 @@ FINE = ["--spacing", "6", "--iterations", "0"]
 
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory):
-    """An image, and labels of which one has 512 voxels that are apart, which large cells cannot have."""
+    """An image, and labels of which one has 512 voxels that are apart, which large cells cannot
+    have.
+    """
     folder = tmp_path_factory.mktemp("inputs")
     x = np.indices((24, 24, 24))[0]
     labels = np.where(x < 12, 1, 3)
@@ -55,12 +59,17 @@ def test_exit_code_and_files_and_cohort_agree(inputs, tmp_path, monkeypatch, cap
         monkeypatch.setattr(tetopt.measure.measures, measure, failing)
     key = "sub-1"
     subject_folder(tmp_path, key).mkdir(parents=True)
-    mesh, numbers = subject_folder(tmp_path, key) / mesh_name(key, ".vtu"), numbers_path(tmp_path, key)
+    mesh, numbers = (
+        subject_folder(tmp_path, key) / mesh_name(key, ".vtu"),
+        numbers_path(tmp_path, key),
+    )
     assert exit_code("mesh", "a.nii.gz", "-o", mesh, "--json", numbers, *words) == 1
     violated = numbers_in(numbers)["violated"]
     assert name in violated
     said = capsys.readouterr()
-    assert said.out.splitlines()[-1].startswith(f"requirements not met: {', '.join(violated)}; {mesh}: ")
+    assert said.out.splitlines()[-1].startswith(
+        f"requirements not met: {', '.join(violated)}; {mesh}: "
+    )
     for key_of, sentence in violated.items():
         assert sentence.replace("`", "")[:40].split(";")[0] in said.err.replace("`", ""), key_of
     row = row_of(tmp_path, key)
@@ -73,7 +82,16 @@ def test_exit_code_and_files_and_cohort_agree(inputs, tmp_path, monkeypatch, cap
 
 def test_a_good_mesh_ends_with_a_verdict(inputs, tmp_path, capsys):
     out = tmp_path / "a.vtu"
-    command = ["mesh", inputs / "a.nii.gz", "-o", out, "--json", tmp_path / "a.json", "--spacing", "8"]
+    command = [
+        "mesh",
+        inputs / "a.nii.gz",
+        "-o",
+        out,
+        "--json",
+        tmp_path / "a.json",
+        "--spacing",
+        "8",
+    ]
     assert exit_code(*command, "--iterations", "0") == 0
     assert numbers_in(tmp_path / "a.json")["violated"] == {}
     said = capsys.readouterr()
@@ -86,7 +104,9 @@ def test_a_good_mesh_ends_with_a_verdict(inputs, tmp_path, capsys):
 
 
 def test_a_verdict_is_not_without_what_requirements_allow(tmp_path, capsys):
-    """A label of 180 voxels whose cells are too large for it, and a speck of another without a cell."""
+    """A label of 180 voxels whose cells are too large for it, and a speck of another without a
+    cell.
+    """
     labels = np.ones((24, 24, 24))
     labels[8:13, 8:14, 8:14], labels[3, 3, 3], labels[16:, 16:, 16:] = 2.0, 3.0, 3.0
     tetopt.save_image(tmp_path / "l.nii.gz", tetopt.Image(labels))
@@ -113,12 +133,18 @@ def test_commands_tell_that_the_run_of_a_mesh_violated_requirements(inputs, tmp_
     for source, out in pairwise(files):  # also of a copy
         capsys.readouterr()
         assert exit_code("convert", source, out, "--young", "1") == 0
-        assert "the run that built this mesh violated requirements: error" in capsys.readouterr().err
-    assert exit_code("quality", mesh, "--json", tmp_path / "q.json") == 0  # without --check, it only warns
+        assert (
+            "the run that built this mesh violated requirements: error" in capsys.readouterr().err
+        )
+    # without --check, it only warns
+    assert exit_code("quality", mesh, "--json", tmp_path / "q.json") == 0
     for path in (mesh, tmp_path / "b.msh"):
         assert exit_code("quality", path, "--check", "--json", tmp_path / "q.json", "--force") == 1
         said = capsys.readouterr()
-        assert "of the image's variance is unexplained" in numbers_in(tmp_path / "q.json")["violated"]["error"]
+        assert (
+            "of the image's variance is unexplained"
+            in numbers_in(tmp_path / "q.json")["violated"]["error"]
+        )
         assert f"requirement violated: error: {path}: when built, " in " ".join(said.err.split())
         assert said.out.splitlines()[-1].startswith(f"requirements not met: error; {path}: ")
     assert exit_code("mesh", inputs / "a.nii.gz", "-o", mesh, *COARSE, "--force") == 0
@@ -139,7 +165,10 @@ def test_a_run_whose_energy_rises_says_what_nodes_follow(inputs, options, words)
     tetopt.save_image(inputs / "m.nii.gz", tetopt.Image(np.indices((24, 24, 24))[0] > 4))
     files = {name: inputs / file if file.endswith("gz") else file for name, file in options.items()}
     source = read_source(SourceOptions(images=[inputs / "a.nii.gz"], **files))
-    assert ended_words("risen", "the mesh", source.surface_words) == f"ended, as E no longer falls{words}"
+    assert (
+        ended_words("risen", "the mesh", source.surface_words)
+        == f"ended, as E no longer falls{words}"
+    )
 
 
 def test_numbers_are_written_although_a_picture_fails(inputs, tmp_path, monkeypatch, capsys):
@@ -149,7 +178,15 @@ def test_numbers_are_written_although_a_picture_fails(inputs, tmp_path, monkeypa
         raise OSError(28, "No space left on device", "slice.png")
 
     monkeypatch.setattr(tetopt.job.run, "draw", full)
-    command = ["mesh", inputs / "a.nii.gz", "-o", tmp_path / "a.vtu", "--json", tmp_path / "a.json", *COARSE]
+    command = [
+        "mesh",
+        inputs / "a.nii.gz",
+        "-o",
+        tmp_path / "a.vtu",
+        "--json",
+        tmp_path / "a.json",
+        *COARSE,
+    ]
     assert exit_code(*command, "--figures", tmp_path) == 2
     numbers = numbers_in(tmp_path / "a.json")
     assert list(numbers["violated"]) == list(numbers["failed"]) == ["figures"]
@@ -158,19 +195,37 @@ def test_numbers_are_written_although_a_picture_fails(inputs, tmp_path, monkeypa
 
 def test_remedies_agree():
     """The worst decides: what it asks for is not contradicted by what follows."""
-    more, fewer = Problem("a", "allow more nodes", wants="smaller"), Problem("b", "reduce `nodes`", wants="larger")
+    more, fewer = (
+        Problem("a", "allow more nodes", wants="smaller"),
+        Problem("b", "reduce `nodes`", wants="larger"),
+    )
     lost = Problem("c", "allow more nodes", "labels", "smaller")
     assert [each.words for each in agreed([more, fewer])] == ["a; allow more nodes", "b"]
     assert [each.words for each in agreed([fewer, more])] == ["b; reduce `nodes`", "a"]
-    assert [each.words for each in agreed([fewer, Problem("d"), lost])] == ["c; allow more nodes", "b", "d"]
-    assert sentences([lost, more, lost._replace(text="e")]) == {"labels": "c; allow more nodes; e; allow more nodes"}
+    assert [each.words for each in agreed([fewer, Problem("d"), lost])] == [
+        "c; allow more nodes",
+        "b",
+        "d",
+    ]
+    assert sentences([lost, more, lost._replace(text="e")]) == {
+        "labels": "c; allow more nodes; e; allow more nodes"
+    }
 
 
 def test_cells_across_are_those_of_the_mesh():
-    row = LabelFidelity(3, 900, 900.0, 900.0, 90, 0, 0.9, 0.9, 0.1, 0.2, 1, 1, False, edge=3.6, cells_across=1.2)
-    rows = [row, row._replace(label=4, cells_across=1.9), row._replace(label=5, cells_across=0.8, edge=5.0)]
+    row = LabelFidelity(
+        3, 900, 900.0, 900.0, 90, 0, 0.9, 0.9, 0.1, 0.2, 1, 1, False, edge=3.6, cells_across=1.2
+    )
+    rows = [
+        row,
+        row._replace(label=4, cells_across=1.9),
+        row._replace(label=5, cells_across=0.8, edge=5.0),
+    ]
     (problem,) = of_layers([*rows, row._replace(label=0)], 2.0, {3: "fluid"})
-    assert problem.text == "fewer than 2 cells across: 5 0.8 (edges 5 mm), 3 (fluid) 1.2 (edges 3.6 mm)"
+    assert (
+        problem.text
+        == "fewer than 2 cells across: 5 0.8 (edges 5 mm), 3 (fluid) 1.2 (edges 3.6 mm)"
+    )
     assert list(of_layers(rows[1:2], 2.0, {})) == []
 
 
@@ -181,11 +236,28 @@ def test_flat_cells_are_judged_without_iterations(tmp_path, capsys):
     tetopt.save_image(tmp_path / "a.nii.gz", tetopt.Image(np.indices(mask.shape)[0] + 20.0))
     tetopt.save_image(tmp_path / "m.nii.gz", tetopt.Image(1.0 * mask))
     out, numbers = tmp_path / "a.vtu", tmp_path / "a.json"
-    words = ["mesh", tmp_path / "a.nii.gz", "--mask", tmp_path / "m.nii.gz", "-o", out, "--json", numbers]
+    words = [
+        "mesh",
+        tmp_path / "a.nii.gz",
+        "--mask",
+        tmp_path / "m.nii.gz",
+        "-o",
+        out,
+        "--json",
+        numbers,
+    ]
     assert exit_code(*words, "--nodes", "1200", "--iterations", "0") == 1
     assert numbers_in(numbers)["quality"]["min_dihedral"] < 12.0
     assert list(numbers_in(numbers)["violated"]) == ["min_dihedral"]
-    again = ["quality", out, "--image", tmp_path / "a.nii.gz", "--mask", tmp_path / "m.nii.gz", "--check"]
+    again = [
+        "quality",
+        out,
+        "--image",
+        tmp_path / "a.nii.gz",
+        "--mask",
+        tmp_path / "m.nii.gz",
+        "--check",
+    ]
     capsys.readouterr()
     assert exit_code(*again, "--json", tmp_path / "q.json") == 1
     assert numbers_in(tmp_path / "q.json")["violated"] == numbers_in(numbers)["violated"]

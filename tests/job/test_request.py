@@ -1,4 +1,6 @@
-"""What was asked of a run: options as words and back, and checksums that tell when a run has to be made again."""
+"""What was asked of a run: options as words and back, and checksums that tell when a run has to
+be made again.
+"""
 
 from dataclasses import fields
 from pathlib import Path
@@ -20,24 +22,71 @@ from tetopt.start.label_sizes import LabelSize
 
 # Of each field of the options of `tetopt mesh` a value that is not its default.
 VALUES = {
-    "images": [Path("/a/-b.nii"), Path("/c.nii")], "mask": Path("/m.nii"), "background": "-5", "labels": Path("/l.nii"),
-    "weights": "1,2", "smooth_interfaces": 0.25, "label_weight": 2.0, "volume": 1, "crop": "1:9,:,:", "slice_": "k=3",
-    "nodes": 77, "target_error": 0.1, "nodes_max": 99, "size_min": 1.0, "edge_size": 9.0, "edge_max": 8.0,
+    "images": [Path("/a/-b.nii"), Path("/c.nii")],
+    "mask": Path("/m.nii"),
+    "background": "-5",
+    "labels": Path("/l.nii"),
+    "weights": "1,2",
+    "smooth_interfaces": 0.25,
+    "label_weight": 2.0,
+    "volume": 1,
+    "crop": "1:9,:,:",
+    "slice_": "k=3",
+    "nodes": 77,
+    "target_error": 0.1,
+    "nodes_max": 99,
+    "size_min": 1.0,
+    "edge_size": 9.0,
+    "edge_max": 8.0,
     "gradation": 0.5,
-    "sizing": Path("/s.nii"), "lattice": "octree", "uniform": True, "spacing": 3.0, "start": Path("/m.vtu"), "k_D": 0.3,
-    "iterations": 3, "boundary": "fixed", "method": "paper", "shape_power": 2.0, "min_dihedral": 5.0, "n_t": 2,
-    "retessellate": "never", "threads": 1, "max_seconds": 5.0, "max_gb": 3.0, "young": "0.5 + 0.01*h", "nu": "0.3",
-    "density": "1000", "average": "hill", "bins": "5:log", "sets": ["A=below:1", "B=below:2"], "written_sets": "all",
-    "loads": ["compress:5%", "hold:xmin"], "label_names": Path("/t.csv"), "order": 2, "nonlinear": True, "units": "MPa",
-    "space": "lps", "fields": "mean", "keep_components": True, "free_volumes": True,
-    "keep_labels": "2,liver", "fill_holes": "3", "drop_labels": "0", "cells_across": 1.5, "label_size": "1=2",
+    "sizing": Path("/s.nii"),
+    "lattice": "octree",
+    "uniform": True,
+    "spacing": 3.0,
+    "start": Path("/m.vtu"),
+    "k_D": 0.3,
+    "iterations": 3,
+    "boundary": "fixed",
+    "method": "paper",
+    "shape_power": 2.0,
+    "min_dihedral": 5.0,
+    "n_t": 2,
+    "retessellate": "never",
+    "threads": 1,
+    "max_seconds": 5.0,
+    "max_gb": 3.0,
+    "young": "0.5 + 0.01*h",
+    "nu": "0.3",
+    "density": "1000",
+    "average": "hill",
+    "bins": "5:log",
+    "sets": ["A=below:1", "B=below:2"],
+    "written_sets": "all",
+    "loads": ["compress:5%", "hold:xmin"],
+    "label_names": Path("/t.csv"),
+    "order": 2,
+    "nonlinear": True,
+    "units": "MPa",
+    "space": "lps",
+    "fields": "mean",
+    "keep_components": True,
+    "free_volumes": True,
+    "keep_labels": "2,liver",
+    "fill_holes": "3",
+    "drop_labels": "0",
+    "cells_across": 1.5,
+    "label_size": "1=2",
     "merge": "white=2,41; rest=*",
-    "tissues": Path("/c1.nii,/c2.nii"), "mask_label": "5,liver", "spacing_mm": "0.5",
-}  # fmt: skip
+    "tissues": Path("/c1.nii,/c2.nii"),
+    "mask_label": "5,liver",
+    "spacing_mm": "0.5",
+}
 
 
 def test_words_give_the_options_back():
-    """Every option that runs of many subjects have, as words of a command line, comes to the same record."""
+    """Every option that runs of many subjects have, as words of a command line, comes to the
+    same record.
+    """
     before, after = RunOptions(**{each.name: VALUES[each.name] for each in fields(RunOptions)}), []
 
     def command(options: RunOptions) -> int:
@@ -56,7 +105,9 @@ def test_defaults_are_not_given():
 
 @pytest.fixture
 def request_of(tmp_path):
-    """A function from other values of options to what is then requested, of a mesh of an image with a mask."""
+    """A function from other values of options to what is then requested, of a mesh of an image
+    with a mask.
+    """
     for name in ("a.nii", "m.nii", "young.csv"):
         (tmp_path / name).write_text("intensity,young\n0,1\n100,5\n")
 
@@ -94,7 +145,13 @@ def test_a_table_of_labels_is_part_of_a_request_by_what_it_says(request_of, tmp_
         groups.write_text(group)
         sums.add(request_of(**asked)["sha256"])
     assert len(sums) == 3
-    assert sorted(request_of(**asked)["files"]) == ["images", "label-size", "labels", "mask", "merge"]
+    assert sorted(request_of(**asked)["files"]) == [
+        "images",
+        "label-size",
+        "labels",
+        "mask",
+        "merge",
+    ]
 
 
 def test_sizes_of_labels_in_a_file(tmp_path):
@@ -137,42 +194,74 @@ def test_a_request_does_not_know_folders(request_of, tmp_path):
 
 
 def test_run_json_states_the_request(tmp_path):
-    """It is the one that the options come to, so that whoever has them knows whether the mesh is that one."""
+    """It is the one that the options come to, so that whoever has them knows whether the mesh is
+    that one.
+    """
     assert exit_code("phantom", "sphere", "-o", tmp_path / "sphere.nii.gz", "--voxel-mm", "5") == 0
-    words = mesh_words(tmp_path / "sphere.nii.gz", tmp_path, "--nodes", "60", "--iterations", "1", "--threads", "1")
+    words = mesh_words(
+        tmp_path / "sphere.nii.gz", tmp_path, "--nodes", "60", "--iterations", "1", "--threads", "1"
+    )
     assert exit_code(*words) == 0
-    job = Job(images=[tmp_path / "sphere.nii.gz"], nodes=60, iterations=1, output=tmp_path / "b.vtu")
+    job = Job(
+        images=[tmp_path / "sphere.nii.gz"], nodes=60, iterations=1, output=tmp_path / "b.vtu"
+    )
     assert numbers_in(tmp_path / "a.json")["request"] == requested(job)
 
 
 def test_options_of_a_row_replace_those_of_all():
-    """Of values that may be repeated all are the row's; a switch can be off; what is not named stays."""
+    """Of values that may be repeated all are the row's; a switch can be off; what is not named
+    stays.
+    """
     options = RunOptions(sets=["C=below:3"], nonlinear=True, units="MPa", average="hill")
-    texts = {"set": "A=below:1; B=below:2;", "nonlinear": "No", "nodes": "70.0", "crop": "1:9,:,:", "average": "voigt"}
+    texts = {
+        "set": "A=below:1; B=below:2;",
+        "nonlinear": "No",
+        "nodes": "70.0",
+        "crop": "1:9,:,:",
+        "average": "voigt",
+    }
     own = with_options(options, texts)
     assert given_options(own) == {
-        "crop": "1:9,:,:", "nodes": 70, "average": "voigt", "set": ["A=below:1", "B=below:2"], "units": "MPa",
-    }  # fmt: skip
+        "crop": "1:9,:,:",
+        "nodes": 70,
+        "average": "voigt",
+        "set": ["A=below:1", "B=below:2"],
+        "units": "MPa",
+    }
 
 
-@pytest.mark.parametrize(("texts", "words"), [
-    ({"nods": "1"}, "did you mean nodes"), ({"nodes": "1e3"}, "`nodes`: expected a whole number, got .1e3."),
-    ({"nonlinear": "maybe"}, "expected True or False"), ({"iterations": "-1"}, "`iterations`: expected 0 or more"),
-    ({"method": "Fast"}, "expected fast or paper, got .Fast."),
-    ({"nodes": "9" * 20, "k-d": "x"}, "; `k_D`: expected a number"),
-    ({"json": "a.json"}, "not an option"), ({"help": "1"}, "not an option"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("texts", "words"),
+    [
+        ({"nods": "1"}, "did you mean nodes"),
+        ({"nodes": "1e3"}, "`nodes`: expected a whole number, got .1e3."),
+        ({"nonlinear": "maybe"}, "expected True or False"),
+        ({"iterations": "-1"}, "`iterations`: expected 0 or more"),
+        ({"method": "Fast"}, "expected fast or paper, got .Fast."),
+        ({"nodes": "9" * 20, "k-d": "x"}, "; `k_D`: expected a number"),
+        ({"json": "a.json"}, "not an option"),
+        ({"help": "1"}, "not an option"),
+    ],
+)
 def test_options_of_a_row_that_cannot_be(texts, words):
     with pytest.raises(InputError, match=words):
         with_options(RunOptions(), texts)
 
 
-def test_a_folder_is_read_once_for_its_checksum_and_files_beside_a_header_count(tmp_path, monkeypatch):
+def test_a_folder_is_read_once_for_its_checksum_and_files_beside_a_header_count(
+    tmp_path, monkeypatch
+):
     reads = []
-    monkeypatch.setattr("tetopt.job.request.sha256", lambda path: reads.append(path) or sha256(path))
+    monkeypatch.setattr(
+        "tetopt.job.request.sha256", lambda path: reads.append(path) or sha256(path)
+    )
     (tmp_path / "a.zarr").mkdir()
     (tmp_path / "a.zarr" / "0").write_bytes(b"voxels")
-    assert checksum(tmp_path / "a.zarr") == checksum(tmp_path / "a.zarr") == sha256(tmp_path / "a.zarr")
+    assert (
+        checksum(tmp_path / "a.zarr")
+        == checksum(tmp_path / "a.zarr")
+        == sha256(tmp_path / "a.zarr")
+    )
     assert reads == [tmp_path / "a.zarr"]
     header = "NDims = 3\nDimSize = 1 1 1\nElementType = MET_UCHAR\nElementDataFile = b.raw\n"
     (tmp_path / "b.mhd").write_text(header)

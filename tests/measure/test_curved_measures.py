@@ -1,4 +1,6 @@
-"""Measures of curved cells: of a ball whose cells are straight or curved, beside the ball itself."""
+"""Measures of curved cells: of a ball whose cells are straight or curved, beside the ball
+itself.
+"""
 
 import numpy as np
 import pytest
@@ -14,7 +16,9 @@ VOLUME, AREA = 4.0 / 3.0 * np.pi * RADIUS**3, 4.0 * np.pi * RADIUS**2
 
 @pytest.fixture(scope="module")
 def ball():
-    """A ball of 20 mm as label 1 of 1 mm voxels in a box, in cells of order 2; the labels and the result."""
+    """A ball of 20 mm as label 1 of 1 mm voxels in a box, in cells of order 2; the labels and
+    the result.
+    """
     labels = tetopt.load_phantom("sphere").label_image(voxel_mm=1)
     return labels, tetopt.mesh_image(tetopt.content(labels, labels), 2000, order=2, iterations=8)
 
@@ -28,14 +32,20 @@ def measured(ball):
 
 
 def test_volumes_are_exact(ball, measured):
-    """Straight cells lose 5 % of the ball or more, curved ones less than 0.5 %; together they fill the box."""
+    """Straight cells lose 5 % of the ball or more, curved ones less than 0.5 %; together they
+    fill the box.
+    """
     labels, result = ball
     curved, straight = (each["labels"][1].mesh_volume for each in measured)
     assert abs(curved / VOLUME - 1.0) < 0.005
     assert straight / VOLUME < 0.95
     assert curved == pytest.approx(result.mesh.cell_volumes[result.labels == 1].sum())
-    assert sum(row.mesh_volume for row in measured[0]["labels"]) == pytest.approx(labels.volume, rel=1e-12)
-    np.testing.assert_array_equal(tetopt.cell_fields(result.mesh)["volume"], result.mesh.cell_volumes)
+    assert sum(row.mesh_volume for row in measured[0]["labels"]) == pytest.approx(
+        labels.volume, rel=1e-12
+    )
+    np.testing.assert_array_equal(
+        tetopt.cell_fields(result.mesh)["volume"], result.mesh.cell_volumes
+    )
 
 
 def test_overlaps_distances_and_areas_are_of_the_pieces(ball, measured):
@@ -45,7 +55,14 @@ def test_overlaps_distances_and_areas_are_of_the_pieces(ball, measured):
     of_pieces = fidelity(labels, None, pieces, np.repeat(result.labels, n_pieces))
     curved, straight = (each["labels"][1] for each in measured)
     own = of_pieces["labels"][1]
-    for name in ("dice", "volume_dice", "distance_mean", "distance_p95", "distance_max", "thickness_mesh"):
+    for name in (
+        "dice",
+        "volume_dice",
+        "distance_mean",
+        "distance_p95",
+        "distance_max",
+        "thickness_mesh",
+    ):
         assert getattr(curved, name) == getattr(own, name), name
     assert curved.n_cells == straight.n_cells == own.n_cells // 8
     assert 1.0 - curved.dice < 0.4 * (1.0 - straight.dice)
@@ -59,11 +76,15 @@ def test_overlaps_distances_and_areas_are_of_the_pieces(ball, measured):
 
 
 def test_folds_are_counted_at_the_edges_of_cells():
-    """A square's corners are turned as much with straight midpoints; its sides have no new edges."""
+    """A square's corners are turned as much with straight midpoints; its sides have no new
+    edges.
+    """
     labels = tetopt.Image(np.pad(np.ones((6, 6), dtype=np.uint8), 3))
     mesh = tetopt.lattice_mesh(labels, blocks=(4, 4))
     of_cell = tetopt.cell_labels(labels, mesh)
-    quadratic = tetopt.Mesh(mesh.points, mesh.cells, mesh.points[numbered_edges(mesh.cells)[0]].mean(axis=1))
+    quadratic = tetopt.Mesh(
+        mesh.points, mesh.cells, mesh.points[numbered_edges(mesh.cells)[0]].mean(axis=1)
+    )
     rows = [tetopt.label_interfaces(labels, each, of_cell)[1] for each in (mesh, quadratic)]
     assert rows[0].folded > 0.2
     assert rows[0]._replace(area=0.0, area_ratio=0.0) == rows[1]._replace(area=0.0, area_ratio=0.0)
@@ -74,7 +95,9 @@ def test_a_mask_is_filled_by_curved_cells():
     labels = tetopt.load_phantom("sphere").label_image(voxel_mm=2)
     mask = tetopt.Image(labels.data == 1, labels.affine)
     mesh = tetopt.mesh_image(tetopt.content(mask, mask=mask), 900, order=2, iterations=6).mesh
-    curved, straight = (tetopt.mask_fidelity(mask, each) for each in (mesh, tetopt.Mesh(mesh.points, mesh.cells)))
+    curved, straight = (
+        tetopt.mask_fidelity(mask, each) for each in (mesh, tetopt.Mesh(mesh.points, mesh.cells))
+    )
     assert curved.mesh_volume == pytest.approx(mesh.cell_volumes.sum())
     assert abs(curved.mesh_volume / VOLUME - 1.0) < 0.3 * abs(straight.mesh_volume / VOLUME - 1.0)
     assert curved.dice > straight.dice + 0.01
@@ -83,7 +106,9 @@ def test_a_mask_is_filled_by_curved_cells():
 
 
 def test_requirements_are_on_curved_cells(ball, monkeypatch):
-    """The ball of straight cells is too small, that of curved ones is not; what else is violated stays."""
+    """The ball of straight cells is too small, that of curved ones is not; what else is violated
+    stays.
+    """
     labels, result = ball
     content = tetopt.content(labels, labels)
     monkeypatch.setattr("tetopt.engine.requirements.LEAST_VOLUME", 0.97)
@@ -96,7 +121,8 @@ def test_requirements_are_on_curved_cells(ball, monkeypatch):
     assert sorted(checked_curved(curved, content).violated) == ["min_dihedral"]
     monkeypatch.setattr("tetopt.engine.requirements.LEAST_VOLUME", 1.01)
     assert (
-        "times that of voxels: 0.999 for label 1, 1 for label 0;" in checked_curved(curved, content).violated["labels"]
+        "times that of voxels: 0.999 for label 1, 1 for label 0;"
+        in checked_curved(curved, content).violated["labels"]
     )
 
 
@@ -110,5 +136,6 @@ def test_a_run_is_judged_by_its_curved_cells(monkeypatch):
     assert "labels" in checked(result._replace(mesh=straight), content, 0.0, straight).violated
     assert result.violated == {}
     assert (
-        tetopt.label_fidelity(labels, result.mesh, result.labels)[1].mesh_volume > 0.95 * (labels.data == 1).sum() * 64
+        tetopt.label_fidelity(labels, result.mesh, result.labels)[1].mesh_volume
+        > 0.95 * (labels.data == 1).sum() * 64
     )

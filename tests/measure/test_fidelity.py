@@ -27,11 +27,15 @@ from tetopt.measure.fidelity import (
 
 def blocky(image, blocks):
     """A lattice whose blocks' faces are planes of facets."""
-    return tetopt.lattice_mesh(image, "criss-cross" if image.ndim == 2 else "five-tet", blocks=blocks)
+    return tetopt.lattice_mesh(
+        image, "criss-cross" if image.ndim == 2 else "five-tet", blocks=blocks
+    )
 
 
 def slabs(n, affine=None):
-    """An image of 8^n voxels, label 0 in its half of x < 3.5, else 1; a lattice, a plane of facets at each 1/2 of x."""
+    """An image of 8^n voxels, label 0 in its half of x < 3.5, else 1; a lattice, a plane of
+    facets at each 1/2 of x.
+    """
     labels = np.zeros((8,) * n)
     labels[4:] = 1
     image = tetopt.Image(labels, affine)
@@ -72,7 +76,9 @@ def ball_field(n, size, radius, centre):
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_cell_labels_against_twin(n):
-    """Counted voxel by voxel, on a mesh that leaves voxels out and has cells without voxels, and with many ties."""
+    """Counted voxel by voxel, on a mesh that leaves voxels out and has cells without voxels, and
+    with many ties.
+    """
     rng = np.random.default_rng(n)
     labels = tetopt.Image(rng.choice([0, 2, 7], (9, 8, 7)[:n]), random_affine(rng, n))
     whole = tetopt.lattice_mesh(labels, blocks=((5, 4, 4) if n == 3 else (6, 5))[:n])
@@ -89,7 +95,9 @@ def test_cell_labels_against_twin(n):
         else:
             n_empty += 1
             expected = labels.data[
-                tuple(np.rint(labels.to_index(mesh.points[mesh.cells[cell]].mean(axis=0))).astype(int))
+                tuple(
+                    np.rint(labels.to_index(mesh.points[mesh.cells[cell]].mean(axis=0))).astype(int)
+                )
             ]
         assert of_cell[cell] == expected
     assert of_cell.dtype == np.int64
@@ -106,7 +114,9 @@ def test_cell_labels_against_twin(n):
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_half_level_of_a_plane(n):
-    """It runs from face to face of the box, has no part on them, and lies where the field is 1/2."""
+    """It runs from face to face of the box, has no part on them, and lies where the field is
+    1/2.
+    """
     image, _, _ = slabs(n, random_affine(np.random.default_rng(n), n))
     flat = np.eye(n + 1)
     for level, place in (
@@ -120,7 +130,9 @@ def test_half_level_of_a_plane(n):
         np.testing.assert_array_equal(points[:, 1:].min(axis=0), -0.5)
         np.testing.assert_array_equal(points[:, 1:].max(axis=0), 7.5)
         edges = points[facets[:, 1:]] - points[facets[:, :1]]
-        area = np.linalg.norm(edges[:, 0] if n == 2 else np.cross(edges[:, 0], edges[:, 1]) / 2, axis=-1).sum()
+        area = np.linalg.norm(
+            edges[:, 0] if n == 2 else np.cross(edges[:, 0], edges[:, 1]) / 2, axis=-1
+        ).sum()
         assert area == pytest.approx(8.0 ** (n - 1), rel=1e-6)
         in_world = half_level_surface(level, image.affine)
         np.testing.assert_allclose(image.to_index(in_world.points), points, atol=1e-9)
@@ -155,7 +167,9 @@ def test_distances_against_twin(n):
     corners[1, -1] = 0.25 * corners[1, 0] + 0.75 * corners[1, -2]
     corners[2, 1:] = corners[2, 0]
     facets = np.arange(25 * n).reshape(25, n)
-    points = np.vstack([rng.normal(0.0, 20.0, (60, n)), corners[:, 0] + rng.normal(0.0, 0.1, (25, n))])
+    points = np.vstack(
+        [rng.normal(0.0, 20.0, (60, n)), corners[:, 0] + rng.normal(0.0, 0.1, (25, n))]
+    )
     distances = surface_distances(points, FacetSurface(corners.reshape(-1, n), facets))
     expected = [min(naive.facet_distance(p, c) for c in corners) for p in points]
     np.testing.assert_allclose(distances, expected, rtol=1e-9, atol=1e-9)
@@ -163,12 +177,17 @@ def test_distances_against_twin(n):
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_points_are_spread_evenly(n):
-    """Each facet has its fraction of the points to within two, uniformly dense by their mean and covariance."""
+    """Each facet has its fraction of the points to within two, uniformly dense by their mean and
+    covariance.
+    """
     corners = np.random.default_rng(n).normal(size=(3, n, n)) + 10.0 * np.arange(3)[:, None, None]
     surface = FacetSurface(corners.reshape(-1, n), np.arange(3 * n).reshape(3, n))
     points = evenly_spread(surface, 3000)
     apart = np.array(
-        [surface_distances(points, FacetSurface(surface.points, surface.facets[k : k + 1])) for k in range(3)]
+        [
+            surface_distances(points, FacetSurface(surface.points, surface.facets[k : k + 1]))
+            for k in range(3)
+        ]
     )
     assert apart.min(axis=0).max() < 1e-9
     edges = corners[:, 1:] - corners[:, :1]
@@ -178,7 +197,8 @@ def test_points_are_spread_evenly(n):
     for k in range(3):
         inside = points[apart.argmin(axis=0) == k]
         np.testing.assert_allclose(inside.mean(axis=0), corners[k].mean(axis=0), atol=0.02)
-        spread = np.cov((inside - inside.mean(axis=0)).T, bias=True)  # of a uniform density on a simplex
+        # of a uniform density on a simplex
+        spread = np.cov((inside - inside.mean(axis=0)).T, bias=True)
         offset = corners[k] - corners[k].mean(axis=0)
         np.testing.assert_allclose(spread, offset.T @ offset / (n * (n + 1)), atol=0.03)
     np.testing.assert_array_equal(points, evenly_spread(surface, 3000))
@@ -196,7 +216,9 @@ def test_no_side_of_a_plate_is_left_out():
 def test_no_more_points_than_allowed():
     image = slabs(3)[0]
     plane = half_level_surface(image.data == 1, image.affine)
-    there, back = _distances(plane, FacetSurface(plane.points, plane.facets[: len(plane.facets) // 2]), 1e-9)
+    there, back = _distances(
+        plane, FacetSurface(plane.points, plane.facets[: len(plane.facets) // 2]), 1e-9
+    )
     assert len(there) == MOST_POINTS
     assert MOST_POINTS / 2 - 1 <= len(back) <= MOST_POINTS / 2 + 1
     assert sum(len(d) for d in _distances(plane, plane, 1e9)) == 2000
@@ -229,7 +251,9 @@ def test_shifted_plane(n, shift):
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_distances_are_pooled_by_area(n):
-    """A stripe with two sides of which the mesh has one: of three equal areas one is 4 voxels away."""
+    """A stripe with two sides of which the mesh has one: of three equal areas one is 4 voxels
+    away.
+    """
     image, mesh, x = slabs(n)
     stripe = np.zeros(image.shape)
     stripe[2:6] = 3
@@ -245,7 +269,13 @@ def test_lost_label():
     image = tetopt.Image(labels)
     background, speck = label_fidelity(image, blocky(image, (1, 1, 1)))
     assert speck.is_lost
-    assert (speck.n_cells, speck.mesh_volume, speck.dice, speck.voxels, speck.components) == (0, 0.0, 0.0, 1, 1)
+    assert (speck.n_cells, speck.mesh_volume, speck.dice, speck.voxels, speck.components) == (
+        0,
+        0.0,
+        0.0,
+        1,
+        1,
+    )
     assert speck.mesh_components == 0
     assert np.isnan(speck.distance_mean)
     assert np.isnan(speck.distance_p95)
@@ -254,7 +284,9 @@ def test_lost_label():
 
 
 def test_cells_without_a_voxel():
-    """Five cells to a block of half a voxel along x: of two blocks one may hold the centre, on their common side."""
+    """Five cells to a block of half a voxel along x: of two blocks one may hold the centre, on
+    their common side.
+    """
     labels = np.zeros((4, 4, 4))
     labels[2:] = 3
     image = tetopt.Image(labels)
@@ -262,12 +294,16 @@ def test_cells_without_a_voxel():
     rows = label_fidelity(image, mesh)
     is_empty = tetopt.cell_moments(image, mesh).n_voxels == 0
     of_cell = cell_labels(image, mesh)
-    assert [row.n_empty_cells for row in rows] == [is_empty[of_cell == row.label].sum() for row in rows]
+    assert [row.n_empty_cells for row in rows] == [
+        is_empty[of_cell == row.label].sum() for row in rows
+    ]
     assert 0 < is_empty.sum() < len(mesh.cells)
 
 
 def test_label_that_fills_the_box_has_no_distance():
-    (row,) = label_fidelity(tetopt.Image(np.ones((4, 4))), tetopt.lattice_mesh(tetopt.Image(np.ones((4, 4))), nodes=20))
+    (row,) = label_fidelity(
+        tetopt.Image(np.ones((4, 4))), tetopt.lattice_mesh(tetopt.Image(np.ones((4, 4))), nodes=20)
+    )
     assert np.isnan(row.distance_mean)
     assert (row.label, row.dice, row.is_lost) == (1, 1.0, False)
 
@@ -326,7 +362,9 @@ def test_bad_labels():
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_mask_of_a_shifted_plane(n):
-    """2 voxels of 1.5 mm; faces of the box count on neither side; the plane ends at the box, as a disc does."""
+    """2 voxels of 1.5 mm; faces of the box count on neither side; the plane ends at the box, as
+    a disc does.
+    """
     image, mesh, x = slabs(n, shift_affine(np.random.default_rng(n), n, [1.5, 0.5, -3.0]))
     fidelity = mask_fidelity(image, tetopt.Mesh(mesh.points, mesh.cells[x > 1.5]))
     layer = 8 ** (n - 1)
@@ -341,7 +379,9 @@ def test_mask_of_a_shifted_plane(n):
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_mask_of_a_ball(n):
-    """Its half level is a sphere of radius 10 voxels; the mesh's of 11.5; in voxels of unequal size, sheared."""
+    """Its half level is a sphere of radius 10 voxels; the mesh's of 11.5; in voxels of unequal
+    size, sheared.
+    """
     rng = np.random.default_rng(n)
     image = tetopt.Image(ball_field(n, 32, 10.0, 15.2), random_affine(rng, n))
     points, cells = ball(n, 11.5, np.full(n, 15.2))
@@ -368,7 +408,10 @@ def test_mask_reverse_is_another_distance():
     assert fidelity.distance_p95 == pytest.approx(0.0, abs=1e-9)
     assert fidelity.reverse_mean == pytest.approx((0 + 0 + 7 + 10) / 4, rel=6e-3)
     assert fidelity.reverse_p95 == pytest.approx(10.0)
-    assert (fidelity.distance_p95_mm, fidelity.reverse_p95_mm) == (pytest.approx(0.0, abs=1e-9), pytest.approx(20.0))
+    assert (fidelity.distance_p95_mm, fidelity.reverse_p95_mm) == (
+        pytest.approx(0.0, abs=1e-9),
+        pytest.approx(20.0),
+    )
     assert (fidelity.components, fidelity.mesh_components) == (2, 1)
     assert (fidelity.euler, fidelity.mesh_euler) == (4, 2)
 
@@ -406,7 +449,12 @@ def test_volume_dice_does_not_depend_on_the_unit():
     dice = []
     for voxel in (1.0, 0.01):
         image = tetopt.Image(labels, np.diag([voxel] * 3 + [1.0]))
-        dice.append([row.volume_dice for row in label_fidelity(image, tetopt.lattice_mesh(image, blocks=(6, 6, 6)))])
+        dice.append(
+            [
+                row.volume_dice
+                for row in label_fidelity(image, tetopt.lattice_mesh(image, blocks=(6, 6, 6)))
+            ]
+        )
     np.testing.assert_allclose(dice[0], dice[1], rtol=1e-6)
     assert 0.5 < dice[0][1] < 1.0
 
@@ -414,14 +462,19 @@ def test_volume_dice_does_not_depend_on_the_unit():
 @pytest.mark.parametrize("n", [2, 3])
 @pytest.mark.parametrize("is_masked", [False, True])
 def test_dice_by_majority(n, is_masked):
-    """Dice of the labels that most of the voxels in each cell have, whatever labels the cells have."""
+    """Dice of the labels that most of the voxels in each cell have, whatever labels the cells
+    have.
+    """
     rng = np.random.default_rng(3)
     coarse = rng.integers(0, 4, (5,) * n)
     image = tetopt.Image(np.kron(coarse, np.ones((3, 4, 2)[:n])), random_affine(rng, n))
     mask = tetopt.Image(rng.random(image.shape) < 0.7, image.affine) if is_masked else None
     mesh = tetopt.lattice_mesh(image, nodes=100)
     mesh = tetopt.Mesh(mesh.points, mesh.cells[: len(mesh.cells) // 2])  # the rest is outside
-    owner, inside = tetopt.cell_of_voxel(image, mesh), np.ones(image.shape, bool) if mask is None else mask.data > 0
+    owner, inside = (
+        tetopt.cell_of_voxel(image, mesh),
+        np.ones(image.shape, bool) if mask is None else mask.data > 0,
+    )
     painted = np.full(image.shape, -1 if is_masked else 0)
     for cell in range(len(mesh.cells)):
         own = image.data[inside & (owner == cell)].astype(int)

@@ -1,4 +1,6 @@
-"""Surfaces of labels: cubes, rings and shells whose numbers are known, an independent program's numbers, slow twins."""
+"""Surfaces of labels: cubes, rings and shells whose numbers are known, an independent program's
+numbers, slow twins.
+"""
 
 from collections import Counter
 from itertools import combinations
@@ -12,7 +14,13 @@ from shapes import OBLIQUE, shaped
 
 import tetopt
 from tetopt.geometry.simplex import centroids, oriented
-from tetopt.measure.fidelity import FacetSurface, LabelFidelity, cell_labels, label_fidelity, surface_areas
+from tetopt.measure.fidelity import (
+    FacetSurface,
+    LabelFidelity,
+    cell_labels,
+    label_fidelity,
+    surface_areas,
+)
 from tetopt.measure.interfaces import (
     LabelInterface,
     area_at_volume,
@@ -26,9 +34,13 @@ from tetopt.start.carve import part_of
 
 
 def blocky(labels, affine=None):
-    """An image of labels, a mesh with a block of cells in each voxel, and the label of each cell."""
+    """An image of labels, a mesh with a block of cells in each voxel, and the label of each
+    cell.
+    """
     image = tetopt.Image(labels, affine)
-    mesh = tetopt.lattice_mesh(image, "criss-cross" if image.ndim == 2 else "five-tet", blocks=image.shape)
+    mesh = tetopt.lattice_mesh(
+        image, "criss-cross" if image.ndim == 2 else "five-tet", blocks=image.shape
+    )
     return image, mesh, cell_labels(image, mesh)
 
 
@@ -57,10 +69,18 @@ def test_two_cubes_that_share_an_edge_or_a_corner():
     labels = np.zeros((5, 5, 5))
     labels[1, 1, 1] = labels[2, 2, 1] = 1
     labels[1, 2, 1] = 2
-    assert [broken(row) for row in label_interfaces(*blocky(labels))] == [(0,) * 4, (1, 0, 0, 0), (0,) * 4]
+    assert [broken(row) for row in label_interfaces(*blocky(labels))] == [
+        (0,) * 4,
+        (1, 0, 0, 0),
+        (0,) * 4,
+    ]
     labels[1, 2, 1], labels[2, 2, 1], labels[2, 2, 2] = 0, 0, 1
     labels[1, 1, 2] = 2
-    assert [broken(row) for row in label_interfaces(*blocky(labels))] == [(1, 0, 0, 0), (0, 0, 1, 0), (0,) * 4]
+    assert [broken(row) for row in label_interfaces(*blocky(labels))] == [
+        (1, 0, 0, 0),
+        (0, 0, 1, 0),
+        (0,) * 4,
+    ]
 
 
 def test_the_outside_is_no_label_but_is_around():
@@ -89,7 +109,9 @@ def test_areas_are_those_of_closed_surfaces():
 
 
 def test_a_void_that_the_mesh_leaves_out_is_a_cavity():
-    """A shell around a void of the mask, with an island in it; beside it a block with a cavity of label 0."""
+    """A shell around a void of the mask, with an island in it; beside it a block with a cavity
+    of label 0.
+    """
     labels = np.ones((7, 7, 12))
     labels[3, 3, 9] = 0.0
     inside = np.ones(labels.shape, dtype=bool)
@@ -126,12 +148,18 @@ def test_euler_numbers(kind, euler, cavities):
         cavities,
     )
     around = {"hole": (6, 1), "handle": (2, 1)}[kind]
-    assert (background.euler, background.cavities) == (background.mesh_euler, background.mesh_cavities) == around
+    assert (
+        (background.euler, background.cavities)
+        == (background.mesh_euler, background.mesh_cavities)
+        == around
+    )
     assert broken(inside) == broken(background) == (0, 0, 0, 0)
 
 
 def test_a_cavity_is_open_where_corners_meet():
-    """A hollow cube with a voxel taken out of a corner: what is within touches what is around, in a point."""
+    """A hollow cube with a voxel taken out of a corner: what is within touches what is around,
+    in a point.
+    """
     labels = np.zeros((5, 5, 5))
     labels[1:4, 1:4, 1:4] = 1
     labels[2, 2, 2] = 0
@@ -177,7 +205,12 @@ def naive_counts(cells, of_cell, label):
         links = [[len(a & b) >= n - 1 for b in own] for a in own]
         if connected_components(np.array(links))[0] > 1:
             pinched.append((node,))
-    return len(crowded), sum(around(e) == 2 for e in crowded), len(pinched), sum(around(p) == 2 for p in pinched)
+    return (
+        len(crowded),
+        sum(around(e) == 2 for e in crowded),
+        len(pinched),
+        sum(around(p) == 2 for p in pinched),
+    )
 
 
 @pytest.mark.parametrize("n", [2, 3])
@@ -186,7 +219,9 @@ def test_edges_and_nodes_against_a_slow_twin(n):
     image, mesh, of_cell = blocky(rng.integers(0, 3, (5, 4, 3)[:n]))
     of_cell[rng.random(len(of_cell)) < 0.1] = 1  # some that cells of a voxel do not share
     rows = label_interfaces(image, mesh, of_cell)
-    assert [broken(row) for row in rows] == [naive_counts(mesh.cells, of_cell, row.label) for row in rows]
+    assert [broken(row) for row in rows] == [
+        naive_counts(mesh.cells, of_cell, row.label) for row in rows
+    ]
     assert max(row.nonmanifold_edges for row in rows) >= 3
 
 
@@ -219,7 +254,11 @@ def test_small_labels_have_no_ratio():
     assert voxel.smooth_area < 0.1
     labels = np.zeros((9, 9))
     labels[1:7, 1:7], labels[8, 8] = 1, 2
-    assert [np.isnan(row.area_ratio) for row in label_interfaces(*blocky(labels))] == [False, False, True]
+    assert [np.isnan(row.area_ratio) for row in label_interfaces(*blocky(labels))] == [
+        False,
+        False,
+        True,
+    ]
 
 
 @pytest.mark.parametrize("radius", [4.0, 6.0, 9.0])
@@ -235,7 +274,9 @@ def test_area_of_smooth_shapes(radius):
         assert area_at_volume(nets, inside.sum() / 8.0) == pytest.approx(area, rel=0.02)
         assert surface_areas(nets).sum() < 0.98 * area
     plane = smooth_surface(np.pad(along < 0.0, 1), affine)
-    far = np.linalg.norm(plane.points[plane.facets].mean(axis=1) - 0.5 * np.array([32.3, 32.7, 32.45]), axis=-1)
+    far = np.linalg.norm(
+        plane.points[plane.facets].mean(axis=1) - 0.5 * np.array([32.3, 32.7, 32.45]), axis=-1
+    )
     assert surface_areas(plane)[far < 12.0].sum() == pytest.approx(np.pi * 12.0**2, rel=0.02)
 
 
@@ -249,18 +290,23 @@ def test_a_circle_of_pixels():
 
 
 def test_the_numbers_of_an_independent_program():
-    """Areas, folds and edges as a few lines of numpy and pyvista have them, of random patches of three labels."""
+    """Areas, folds and edges as a few lines of numpy and pyvista have them, of random patches of
+    three labels.
+    """
     rng = np.random.default_rng(7)
     affine = random_affine(rng, 3)
     coarse = rng.integers(0, 3, (4, 4, 4))
     image = tetopt.Image(np.kron(coarse, np.ones((5, 4, 6))), affine)
     mesh = tetopt.lattice_mesh(image, nodes=900)
-    mesh = tetopt.Mesh(mesh.points + rng.normal(0.0, 0.01, mesh.points.shape), mesh.cells)  # no angle of just 60
+    # no angle of just 60
+    mesh = tetopt.Mesh(mesh.points + rng.normal(0.0, 0.01, mesh.points.shape), mesh.cells)
     of_cell = cell_labels(image, mesh)
     for row in label_interfaces(image, mesh, of_cell):
         cells, points = mesh.cells[of_cell == row.label], mesh.points
         triangles = cells[:, [[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]]].reshape(-1, 3)
-        _, which, count = np.unique(np.sort(triangles, axis=1), axis=0, return_inverse=True, return_counts=True)
+        _, which, count = np.unique(
+            np.sort(triangles, axis=1), axis=0, return_inverse=True, return_counts=True
+        )
         triangles = triangles[count[which.ravel()] == 1]
         normals = np.cross(*(points[triangles[:, k]] - points[triangles[:, 0]] for k in (1, 2)))
         area = np.linalg.norm(normals, axis=1)
@@ -273,7 +319,9 @@ def test_the_numbers_of_an_independent_program():
         grid = pyvista.ImageData(dimensions=padded.shape)
         grid.point_data["v"] = padded.ravel(order="F")
         ours = smooth_surface(padded == 1, affine)
-        nets = grid.contour_labels(scalars="v", smoothing=True, output_mesh_type="triangles", boundary_style="external")
+        nets = grid.contour_labels(
+            scalars="v", smoothing=True, output_mesh_type="triangles", boundary_style="external"
+        )
         at = np.asarray(nets.points, dtype=np.float64) @ affine[:3, :3].T
         smooth = surface_areas(FacetSurface(at, nets.faces.reshape(-1, 4)[:, 1:])).sum()
         assert row.area == pytest.approx(area.sum() / 2)

@@ -18,7 +18,10 @@ def test_measures_keep_to_the_number_of_threads():
     before = numba.get_num_threads()
     try:
         numba.set_num_threads(1)
-        assert measured_each({"a": numba.get_num_threads, "b": numba.get_num_threads}, None) == {"a": 1, "b": 1}
+        assert measured_each({"a": numba.get_num_threads, "b": numba.get_num_threads}, None) == {
+            "a": 1,
+            "b": 1,
+        }
     finally:
         numba.set_num_threads(before)
 
@@ -44,7 +47,9 @@ def close(one, other):
 
 @pytest.mark.parametrize("shape", [(30, 40, 36), (50, 44)])
 def test_what_lies_far_from_a_mask_counts_for_no_measure(shape):
-    """A mask that reaches one side of the image, a mesh that reaches beyond it, two labels with a loose voxel."""
+    """A mask that reaches one side of the image, a mesh that reaches beyond it, two labels with
+    a loose voxel.
+    """
     place = np.indices(shape)
     middle = np.array([0, 14, 16][: len(shape)]).reshape(-1, *[1] * len(shape))
     far = np.sqrt(((place - middle) ** 2).sum(axis=0))

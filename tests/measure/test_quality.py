@@ -1,4 +1,6 @@
-"""The paper's four errors to the digits of Table 1, histograms, kinds of bad cells, and the summary."""
+"""The paper's four errors to the digits of Table 1, histograms, kinds of bad cells, and the
+summary.
+"""
 
 from math import acos, atan, degrees, sqrt
 
@@ -32,7 +34,9 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def test_third_row_of_table_1():
-    """Fig. 2(a): 7 x 7 squares cut into four, 113 nodes and 196 triangles; every digit of the row."""
+    """Fig. 2(a): 7 x 7 squares cut into four, 113 nodes and 196 triangles; every digit of the
+    row.
+    """
     mesh = lattice_mesh(Image(np.zeros((70, 70))), blocks=(7, 7))
     assert (len(mesh.points), len(mesh.cells)) == (113, 196)
     errors = quality_errors(mesh.points, mesh.cells)
@@ -81,7 +85,13 @@ def test_histogram_is_fractions_over_0_to_1_over_n():
     assert fraction[29] == pytest.approx(0.2)
     assert fraction[int(0.2440 * 90)] == pytest.approx(0.8)
     fraction, edges = rho_histogram(*EQUILATERAL)
-    assert (fraction[-1], fraction.sum(), edges[-1], len(fraction), len(edges)) == (1, 1, 0.5, 40, 41)
+    assert (fraction[-1], fraction.sum(), edges[-1], len(fraction), len(edges)) == (
+        1,
+        1,
+        0.5,
+        40,
+        41,
+    )
 
 
 # Kinds
@@ -93,7 +103,9 @@ def test_kind_of_each_archetype(kind, t):
     assert bad_kinds(*single(BAD_TETS[kind](t))).tolist() == [kind]
 
 
-@pytest.mark.parametrize("mesh", [*SINGLE[2], *SINGLE[3][:2], TWO_TETS, FIVE_TET_CUBE, TWO_TRIANGLES])
+@pytest.mark.parametrize(
+    "mesh", [*SINGLE[2], *SINGLE[3][:2], TWO_TETS, FIVE_TET_CUBE, TWO_TRIANGLES]
+)
 def test_good_cells_are_good(mesh):
     assert set(bad_kinds(*mesh)) == {"good"}
 
@@ -111,15 +123,17 @@ def test_kind_does_not_change_with_rotation_scale_reflection_or_order(seed, kind
     shape = shape + rng.normal(scale=1e-6, size=(4, 3))
     points, cells = single(shape)
     assert bad_kinds(points, cells).tolist() == [kind]
-    moved = np.exp(rng.uniform(-5, 5)) * (rng.choice([-1, 1]) * points @ random_rotation(rng, 3).T) + rng.normal(size=3)
+    moved = np.exp(rng.uniform(-5, 5)) * (
+        rng.choice([-1, 1]) * points @ random_rotation(rng, 3).T
+    ) + rng.normal(size=3)
     assert bad_kinds(moved, rng.permuted(cells, axis=1)).tolist() == [kind]
 
 
 def test_flat_cells_have_a_kind():
     flat = np.array([[0, 1, 2, 3]])
-    assert {kind: bad_kinds(BAD_TETS[kind](0.0), flat)[0] for kind in ("sliver", "cap", "spade")} == {
-        kind: kind for kind in ("sliver", "cap", "spade")
-    }
+    assert {
+        kind: bad_kinds(BAD_TETS[kind](0.0), flat)[0] for kind in ("sliver", "cap", "spade")
+    } == {kind: kind for kind in ("sliver", "cap", "spade")}
     assert bad_kinds(np.array([[0.0, 0, 0], [1, 1, 1], [2, 2, 2], [3, 3, 3]]), flat)[0] == "needle"
 
 
@@ -165,7 +179,11 @@ def test_quality_of_good_and_bad_cells():
 @pytest.mark.parametrize("mesh", ALL_SMALL)
 def test_kinds_are_named_by_dimension(mesh):
     measured = quality(*mesh)
-    names = {"needle", "cap"} if mesh[0].shape[1] == 2 else {"needle", "wedge", "cap", "spade", "sliver"}
+    names = (
+        {"needle", "cap"}
+        if mesh[0].shape[1] == 2
+        else {"needle", "wedge", "cap", "spade", "sliver"}
+    )
     assert set(measured.kinds) == names
     assert sum(measured.kinds.values()) == (bad_kinds(*mesh) != "good").sum()
 

@@ -28,7 +28,10 @@ def test_thresholds_leave_the_least_variance(classes):
         values = np.sort(rng.choice(256, 9, replace=False)).astype(float)
         values[0], values[-1] = 0.0, 255.0
         weights = rng.uniform(0.1, 5.0, 9)
-        best = min(within(values, weights, values[list(cut)]) for cut in combinations(range(1, 9), classes - 1))
+        best = min(
+            within(values, weights, values[list(cut)])
+            for cut in combinations(range(1, 9), classes - 1)
+        )
         thresholds = class_thresholds(values, classes, weights)
         assert np.all(np.diff(thresholds) > 0.0)
         assert within(values, weights, thresholds) == pytest.approx(
@@ -43,14 +46,20 @@ def test_clear_clusters_are_found():
 
 
 def test_a_bright_voxel_leaves_the_classes_as_they_are(monkeypatch):
-    """One that is a million times brighter than the rest; values of ordinary spread have the bins of all of them."""
+    """One that is a million times brighter than the rest; values of ordinary spread have the
+    bins of all of them.
+    """
     rng = np.random.default_rng(0)
-    values = np.concatenate([rng.normal(10.0, 1.0, 4000), rng.normal(20.0, 1.0, 3000), rng.normal(40.0, 2.0, 3000)])
+    values = np.concatenate(
+        [rng.normal(10.0, 1.0, 4000), rng.normal(20.0, 1.0, 3000), rng.normal(40.0, 2.0, 3000)]
+    )
     thresholds = class_thresholds(values, 3)
     assert 12.0 < thresholds[0] < 18.0
     assert 23.0 < thresholds[1] < 35.0
     for outliers in ([4e7], [-3e5, 2e6], [1e3, 1e6]):
-        np.testing.assert_allclose(class_thresholds(np.append(values, outliers), 3), thresholds, atol=1.5)
+        np.testing.assert_allclose(
+            class_thresholds(np.append(values, outliers), 3), thresholds, atol=1.5
+        )
     monkeypatch.setattr(otsu, "FEWEST_BINS", 1)
     np.testing.assert_array_equal(class_thresholds(values, 3), thresholds)
     with pytest.raises(tetopt.InputError, match="fill only 2 of 256 bins"):  # without narrower ones
@@ -78,7 +87,9 @@ def test_bad_classes(values, classes, words):
 
 
 def test_optimising_the_mesh_improves_the_segmentation():
-    """On the sphere phantom the painted classes come nearer to the true labels, in both label and background."""
+    """On the sphere phantom the painted classes come nearer to the true labels, in both label
+    and background.
+    """
     phantom = tetopt.load_phantom("sphere")
     image, truth = phantom.image(voxel_mm=2.0), phantom.label_image(voxel_mm=2.0)
     mesh = tetopt.lattice_mesh(image, nodes=800)

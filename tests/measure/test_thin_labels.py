@@ -1,4 +1,6 @@
-"""Thickness, layers and contact of labels: shells and slabs of known size, sums taken one by one."""
+"""Thickness, layers and contact of labels: shells and slabs of known size, sums taken one by
+one.
+"""
 
 from collections import defaultdict
 from itertools import combinations
@@ -13,14 +15,24 @@ import tetopt
 from tetopt.contents.thickness import thickness_between
 from tetopt.geometry.simplex import volumes
 from tetopt.measure.fidelity import LabelFidelity, Thickness, label_fidelity
-from tetopt.measure.thin import LabelContact, contact_totals, label_contacts, label_layers, label_thickness
+from tetopt.measure.thin import (
+    LabelContact,
+    contact_totals,
+    label_contacts,
+    label_layers,
+    label_thickness,
+)
 from tetopt.report.tables import contact_table, contacts_in_words, thin_table
 
 
 def blocky(labels, affine=None):
-    """An image of labels, a mesh with a block of cells in each voxel, and the label of each cell."""
+    """An image of labels, a mesh with a block of cells in each voxel, and the label of each
+    cell.
+    """
     image = tetopt.Image(np.asarray(labels, dtype=float), affine)
-    mesh = tetopt.lattice_mesh(image, "criss-cross" if image.ndim == 2 else "five-tet", blocks=image.shape)
+    mesh = tetopt.lattice_mesh(
+        image, "criss-cross" if image.ndim == 2 else "five-tet", blocks=image.shape
+    )
     return image, mesh, tetopt.cell_labels(image, mesh)
 
 
@@ -31,24 +43,32 @@ def slabs(size, n=3):
     return labels
 
 
-@pytest.mark.parametrize(("affine", "shape", "stairs"), [(OBLIQUE, (5, 4, 6), 2 / 3), (None, (7, 6), np.pi / 4)])
+@pytest.mark.parametrize(
+    ("affine", "shape", "stairs"), [(OBLIQUE, (5, 4, 6), 2 / 3), (None, (7, 6), np.pi / 4)]
+)
 def test_facets_between_blocks_are_the_faces_between_voxels(affine, shape, stairs):
     """Which smooth surfaces have less of, by a factor that is known in the mean over directions."""
     image, mesh, of_cell = blocky(np.random.default_rng(3).integers(0, 4, shape), affine)
     contacts = label_contacts(image, mesh, of_cell)
     assert [each.labels for each in contacts] == list(combinations(range(4), 2))
-    if affine is None or np.allclose(affine[:-1, :-1].T @ affine[:-1, :-1], np.diag(image.spacing**2)):
+    if affine is None or np.allclose(
+        affine[:-1, :-1].T @ affine[:-1, :-1], np.diag(image.spacing**2)
+    ):
         np.testing.assert_allclose([each.ratio for each in contacts], 1.0 / stairs)
     area = defaultdict(float)
     for axis in range(image.ndim):
         along = np.moveaxis(image.data, axis, 0)
         for pair in zip(along[:-1].ravel(), along[1:].ravel(), strict=True):
             area[tuple(sorted(pair))] += stairs * np.prod(image.spacing) / image.spacing[axis]
-    np.testing.assert_allclose([each.voxels_mm2 for each in contacts], [area[each.labels] for each in contacts])
+    np.testing.assert_allclose(
+        [each.voxels_mm2 for each in contacts], [area[each.labels] for each in contacts]
+    )
 
 
 def test_contact_that_the_voxels_do_not_have():
-    """A layer that a mesh tears is between two labels in the voxels, and a hole in the layer's contact with each."""
+    """A layer that a mesh tears is between two labels in the voxels, and a hole in the layer's
+    contact with each.
+    """
     image, mesh, of_cell = blocky(slabs(1))
     x = mesh.points[mesh.cells].mean(axis=1)
     hole = (of_cell == 2) & (np.abs(x[:, 1:] - 7.0) < 2.0).all(axis=1)
@@ -60,7 +80,10 @@ def test_contact_that_the_voxels_do_not_have():
     assert contacts[1, 3].mesh_mm2 == pytest.approx(16.0)
     assert contacts[2, 3].mesh_mm2 == pytest.approx(14.0**2 - 16.0)
     assert contact_totals(list(contacts.values())) == pytest.approx(
-        {"false_mm2": 16.0, "excess_mm2": 16.0 + contacts[1, 2].mesh_mm2 + 180.0 - 1.2 * 14.0**2 * 4.0 / 3.0}
+        {
+            "false_mm2": 16.0,
+            "excess_mm2": 16.0 + contacts[1, 2].mesh_mm2 + 180.0 - 1.2 * 14.0**2 * 4.0 / 3.0,
+        }
     )
 
 
@@ -68,7 +91,9 @@ def test_only_voxels_in_the_mask_touch():
     labels = slabs(3)
     mask = tetopt.Image(np.indices(labels.shape)[0] < 11)
     image, mesh, of_cell = blocky(labels)
-    assert [each.labels for each in label_contacts(image, mesh, of_cell, mask) if each.voxels_mm2] == [(1, 2)]
+    assert [
+        each.labels for each in label_contacts(image, mesh, of_cell, mask) if each.voxels_mm2
+    ] == [(1, 2)]
     with pytest.raises(tetopt.InputError, match=r"mask: expected the labels' shape"):
         label_contacts(image, mesh, of_cell, tetopt.Image(np.ones((3, 3, 3))))
 
@@ -76,7 +101,8 @@ def test_only_voxels_in_the_mask_touch():
 @pytest.mark.parametrize("n", [2, 3])
 def test_layers_are_cells_without_an_inner_node(n):
     image, mesh, of_cell = blocky(slabs(1, n))
-    assert label_fidelity(image, mesh, of_cell)[1].one_layer_fraction == (1.0 if n == 3 else 0.0)  # 2-D: centres
+    # 2-D: centres
+    assert label_fidelity(image, mesh, of_cell)[1].one_layer_fraction == (1.0 if n == 3 else 0.0)
     image, mesh, of_cell = blocky(slabs(4, n)[5:15, :5])
     rows = {row.label: row for row in label_fidelity(image, mesh, of_cell)}
     beside = defaultdict(list)
@@ -88,7 +114,9 @@ def test_layers_are_cells_without_an_inner_node(n):
         on = {i for facet, labels in beside.items() if labels.count(label) == 1 for i in facet}
         own = [cell for cell in range(len(mesh.cells)) if of_cell[cell] == label]
         part = sum(size[cell] for cell in own if set(mesh.cells[cell]) <= on)
-        assert rows[label].one_layer_fraction == pytest.approx(part / sum(size[cell] for cell in own))
+        assert rows[label].one_layer_fraction == pytest.approx(
+            part / sum(size[cell] for cell in own)
+        )
         assert (part > 0.0) == (n == 3)
 
 
@@ -100,7 +128,10 @@ def test_a_shell_between_facets_is_as_thick_as_it_is(size, spacing, monkeypatch)
     centre, shape = np.full(3, 21.3), np.ceil(44.0 / spacing).astype(int)
     place = np.moveaxis(np.indices(shape), 0, -1) * spacing - centre
     r = np.linalg.norm(place, axis=-1)
-    balls = [pyvista.Sphere(radius=radius, theta_resolution=90, phi_resolution=90) for radius in (14.0, 14.0 + size)]
+    balls = [
+        pyvista.Sphere(radius=radius, theta_resolution=90, phi_resolution=90)
+        for radius in (14.0, 14.0 + size)
+    ]
     corners = np.concatenate([b.points[b.regular_faces].astype(float) for b in balls]) + centre
     rows = np.where(r > 14.0 + size, 0, np.where(r > 14.0, 1, 2))
     thickness = thickness_between(corners, rows, spacing, 10.0)
@@ -122,14 +153,17 @@ def test_voxels_and_cells_of_the_same_surfaces_are_as_thick(n, size):
 def test_edges_are_those_of_the_labels_own_cells():
     image, mesh, of_cell = blocky(slabs(3, 3))
     row = label_layers(tetopt.content(image, image), mesh, of_cell)[2]
-    assert row.edge == pytest.approx(np.sqrt(2.0))  # each voxel's centre is in the middle one of its five cells
+    # each voxel's centre is in the middle one of its five cells
+    assert row.edge == pytest.approx(np.sqrt(2.0))
     assert row.across == pytest.approx(row.voxels.p50 / row.edge, rel=1e-6)
 
 
 def test_only_voxels_of_the_cells_label_count_as_its_layers():
     """Cells of label 2 also hold five layers of voxels of label 1, which is 8 mm thick."""
     image, mesh, of_cell = blocky(slabs(3, 3))
-    wide = np.where(mesh.points[mesh.cells].mean(axis=1)[:, 0] > 2.5, np.maximum(of_cell, 2), of_cell)
+    wide = np.where(
+        mesh.points[mesh.cells].mean(axis=1)[:, 0] > 2.5, np.maximum(of_cell, 2), of_cell
+    )
     row = label_layers(tetopt.content(image, image), mesh, wide)[2]
     assert row.across == pytest.approx(3.0 / np.sqrt(2.0), rel=0.03)
 
@@ -162,7 +196,9 @@ def test_a_mesh_of_nested_shells_is_as_thick_as_its_voxels():
         voxels, cells = found[label]
         assert (voxels.p50, cells.p50) == pytest.approx((size,) * 2, rel=0.04)
         assert cells == pytest.approx(voxels, rel=0.06)
-    (shell,) = [each for each in label_contacts(labels, result.mesh, result.labels) if each.labels == (1, 2)]
+    (shell,) = [
+        each for each in label_contacts(labels, result.mesh, result.labels) if each.labels == (1, 2)
+    ]
     assert shell.mesh_mm2 == pytest.approx(4.0 * np.pi * 10.0**2, rel=0.02)
     assert shell.ratio == pytest.approx(1.0, abs=0.05)
 
@@ -174,26 +210,47 @@ def texts(table):
 
 def test_tables_have_the_worst_five_alone():
     rows = [
-        LabelFidelity(*(9,) * 12, False, 1.0, fraction, 0.9, 9, (), Thickness(1.0, 2.0, 3.0, 3.0), None)._replace(
-            label=label
+        LabelFidelity(
+            *(9,) * 12, False, 1.0, fraction, 0.9, 9, (), Thickness(1.0, 2.0, 3.0, 3.0), None
+        )._replace(label=label)
+        for label, fraction in zip(
+            range(1, 42), np.random.default_rng(2).permutation(41) / 41.0, strict=True
         )
-        for label, fraction in zip(range(1, 42), np.random.default_rng(2).permutation(41) / 41.0, strict=True)
     ]
     shown = texts(thin_table(rows, {rows[0].label: "bone [l]"}))
     worst = sorted(rows, key=lambda row: -row.one_layer_fraction)[:5]
     assert [int(row[0].split()[0]) for row in shown] == [row.label for row in worst]
     assert (
-        texts(thin_table([rows[0]._replace(label=0, one_layer_fraction=1.0), *rows], {rows[0].label: "bone [l]"}))
+        texts(
+            thin_table(
+                [rows[0]._replace(label=0, one_layer_fraction=1.0), *rows],
+                {rows[0].label: "bone [l]"},
+            )
+        )
         == shown
     )
-    assert shown[0][1:] == (f"{100 * worst[0].one_layer_fraction:.1f}", "2.00 (1.00 to >= 3.00)", "-", "-", "-")
-    alike = [row._replace(one_layer_fraction=1.0, thickness_voxels=Thickness(0.0, row.label % 7, 9.0)) for row in rows]
+    assert shown[0][1:] == (
+        f"{100 * worst[0].one_layer_fraction:.1f}",
+        "2.00 (1.00 to >= 3.00)",
+        "-",
+        "-",
+        "-",
+    )
+    alike = [
+        row._replace(one_layer_fraction=1.0, thickness_voxels=Thickness(0.0, row.label % 7, 9.0))
+        for row in rows
+    ]
     assert [int(row[0]) for row in texts(thin_table(alike, {}))] == [7, 14, 21, 28, 35]
     thick = rows[0]._replace(one_layer_fraction=1.0)
-    for row in (thick._replace(cells_across=2.0), thick._replace(thickness_voxels=Thickness(1.0, 3.0, 3.0, 3.0))):
+    for row in (
+        thick._replace(cells_across=2.0),
+        thick._replace(thickness_voxels=Thickness(1.0, 3.0, 3.0, 3.0)),
+    ):
         assert texts(thin_table([row, *rows], {rows[0].label: "bone [l]"})) == shown
         assert thin_table([row], {}) is None
-    contacts = [LabelContact((1, k), 100.0 + k, 50.0 + k, 0.0)._replace(ratio=2.0) for k in range(2, 42)]
+    contacts = [
+        LabelContact((1, k), 100.0 + k, 50.0 + k, 0.0)._replace(ratio=2.0) for k in range(2, 42)
+    ]
     contacts += [LabelContact((2, 3), 90.0, 0.0, np.nan), LabelContact((2, 4), 149.0, 100.0, 1.49)]
     shown = texts(contact_table(contacts, {3: "fluid"}, 2))
     assert shown[0] == ("2, 3 fluid", "90.0", "0.0", "false")
@@ -205,6 +262,7 @@ def test_tables_have_the_worst_five_alone():
     assert texts(contact_table([small, large], {}, 2))[0][0] == "7, 9"
     words = contacts_in_words(contact_totals(contacts[-2:]), 2)
     assert words == (
-        "contact beyond 1.2 times that of the voxels: 119.0 mm, including 90.0 mm between labels that do not touch in "
+        "contact beyond 1.2 times that of the voxels: 119.0 mm, including 90.0 mm between labels "
+        "that do not touch in "
         "the voxels"
     )

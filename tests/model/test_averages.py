@@ -8,7 +8,14 @@ import pytest
 from tetopt import Image, InputError, cell_moments, cell_of_voxel, lattice_mesh
 from tetopt.fem.solution import gauss_moduli, solve
 from tetopt.geometry.quadratic import gauss_rule
-from tetopt.model.averages import cell_values, cell_young, element_young, gauss_young, node_young, parse_average
+from tetopt.model.averages import (
+    cell_values,
+    cell_young,
+    element_young,
+    gauss_young,
+    node_young,
+    parse_average,
+)
 from tetopt.model.build import build_model
 from tetopt.model.model import in_units
 from tetopt.start.carve import part_of
@@ -20,7 +27,9 @@ def noise(shape, seed=0, affine=None):
 
 @pytest.mark.parametrize("shape", [(24, 20), (14, 12, 10)])
 def test_the_cell_s_modulus_is_the_mean_of_the_mapping_over_its_voxels(shape):
-    """Eq. (2). For a linear mapping that is the value of the mean; for a convex one it is more, where h varies."""
+    """Eq. (2). For a linear mapping that is the value of the mean; for a convex one it is more,
+    where h varies.
+    """
     image = noise(shape)
     mesh = lattice_mesh(image, blocks=(2,) * len(shape))
     moments = cell_moments(image, mesh)
@@ -42,7 +51,8 @@ AVERAGES = {
     "harmonic": lambda values: 1.0 / (1.0 / values).mean(),
     "power:2": lambda values: np.sqrt((values**2).mean()),
     "power:-0.5": lambda values: (values**-0.5).mean() ** -2.0,
-    "power:1e-9": lambda values: np.exp(np.log(values).mean()),  # of which it is 1e-9 times a variance away
+    # of which it is 1e-9 times a variance away
+    "power:1e-9": lambda values: np.exp(np.log(values).mean()),
     "hill": lambda values: 0.5 * (values.mean() + 1.0 / (1.0 / values).mean()),
 }
 
@@ -50,7 +60,9 @@ AVERAGES = {
 @pytest.mark.parametrize("average", AVERAGES)
 @pytest.mark.parametrize("shape", [(12, 13), (14, 12, 13)])
 def test_averages_over_ten_orders_of_magnitude(average, shape):
-    """Against each cell's voxels one cell after the other; a cell without any has the modulus at its centroid."""
+    """Against each cell's voxels one cell after the other; a cell without any has the modulus at
+    its centroid.
+    """
     image = Image(np.random.default_rng(0).uniform(-11.5, 11.5, shape))
     mesh = lattice_mesh(image, nodes=60 if len(shape) == 2 else 700)
     young = cell_young(image, mesh, np.exp, average)
@@ -60,25 +72,44 @@ def test_averages_over_ten_orders_of_magnitude(average, shape):
         values = np.exp(image.data[owner == cell])
         if len(values) == 0:
             n_empty += 1
-            at = tuple(np.rint(image.to_index(mesh.points[mesh.cells[cell]].mean(axis=0)[None])[0]).astype(int))
+            at = tuple(
+                np.rint(image.to_index(mesh.points[mesh.cells[cell]].mean(axis=0)[None])[0]).astype(
+                    int
+                )
+            )
             assert young[cell] == np.exp(image.data[at])
             continue
         assert values.min() <= young[cell] <= values.max()
-        assert young[cell] == pytest.approx(AVERAGES[average](values), rel=1e-7 if "e-9" in average else 1e-12)
+        assert young[cell] == pytest.approx(
+            AVERAGES[average](values), rel=1e-7 if "e-9" in average else 1e-12
+        )
     assert n_empty > 0 or len(shape) == 2
 
 
 def test_averages_are_in_the_order_of_their_powers():
-    """The inequality of means of powers; Hill's is between its bounds; all are one where the mapping is constant."""
+    """The inequality of means of powers; Hill's is between its bounds; all are one where the
+    mapping is constant.
+    """
     image = noise((14, 12, 13))
     mesh = lattice_mesh(image, nodes=80)
-    words = ["power:-10", "harmonic", "power:-0.5", "geometric", "power:0.5", "mean", "power:3", "power:10"]
+    words = [
+        "power:-10",
+        "harmonic",
+        "power:-0.5",
+        "geometric",
+        "power:0.5",
+        "mean",
+        "power:3",
+        "power:10",
+    ]
     moduli = [cell_young(image, mesh, lambda h: 1.0 + h, each) for each in words]
     for less, more in pairwise(moduli):
         assert (less < more).all()
     hill = cell_young(image, mesh, lambda h: 1.0 + h, "hill")
     assert ((moduli[1] < hill) & (hill < moduli[5])).all()
-    np.testing.assert_allclose(cell_young(image, mesh, lambda h: 1.0 + h, "power:-1"), moduli[1], rtol=1e-14)
+    np.testing.assert_allclose(
+        cell_young(image, mesh, lambda h: 1.0 + h, "power:-1"), moduli[1], rtol=1e-14
+    )
     for each in [*words, "hill", "nodes", "gauss"]:
         assert (cell_young(image, mesh, lambda h: 0.7 + 0.0 * h, each) == 0.7).all()
         for order in (1, 2):
@@ -86,7 +117,9 @@ def test_averages_are_in_the_order_of_their_powers():
 
 
 def test_empty_space_in_a_cell():
-    """A modulus of 0 counts in means of powers above 0; of others it would be all that counts, and is refused."""
+    """A modulus of 0 counts in means of powers above 0; of others it would be all that counts,
+    and is refused.
+    """
     image = noise((10, 10, 10))
     mesh = lattice_mesh(image, nodes=40)
     owner = cell_of_voxel(image, mesh)
@@ -98,44 +131,65 @@ def test_empty_space_in_a_cell():
     assert (cell_young(image, mesh, lambda h: 0.0 * h, "power:0.5") == 0.0).all()
     for each in ("geometric", "harmonic", "hill", "nodes", "gauss", "power:-2", "power:-0.5"):
         with pytest.raises(
-            InputError, match=rf"above 0 kPa for {each}, got 0 in \d+ voxels of the mesh.*`average` mean"
+            InputError,
+            match=rf"above 0 kPa for {each}, got 0 in \d+ voxels of the mesh.*`average` mean",
         ):
             cell_young(image, mesh, mapping, each)
 
 
 @pytest.mark.parametrize("average", ["mean", "geometric", "gauss", "nodes"])
 def test_a_mapping_need_not_be_one_for_voxels_beside_the_mesh(average):
-    """As of the air around an organ; within it everything is as with a mapping that holds everywhere."""
+    """As of the air around an organ; within it everything is as with a mapping that holds
+    everywhere.
+    """
     image = noise((12, 12, 12))
     mesh = lattice_mesh(image, nodes=200)
     part = part_of(mesh, mesh.points[mesh.cells].max(axis=1)[:, 0] < 7.0)
-    air = Image(np.where((cell_of_voxel(image, part) < 0) & (np.indices(image.shape)[0] > 8), -1000.0, image.data))
+    air = Image(
+        np.where(
+            (cell_of_voxel(image, part) < 0) & (np.indices(image.shape)[0] > 8), -1000.0, image.data
+        )
+    )
     moduli = element_young(air, part, lambda h: 1.0 + h, average, 2)
-    np.testing.assert_array_equal(moduli, element_young(image, part, lambda h: 1.0 + np.abs(h), average, 2))
-    np.testing.assert_array_equal(cell_values(air, part, np.sqrt), cell_values(image, part, np.sqrt))
+    np.testing.assert_array_equal(
+        moduli, element_young(image, part, lambda h: 1.0 + np.abs(h), average, 2)
+    )
+    np.testing.assert_array_equal(
+        cell_values(air, part, np.sqrt), cell_values(image, part, np.sqrt)
+    )
     with pytest.raises(InputError, match="expected 0 kPa or more"):
         element_young(air, mesh, lambda h: 1.0 + h, average, 2)
 
 
-@pytest.mark.parametrize("text", ["", "voigt", "power", "power:", "power:x", "power:nan", "power:11", "mean:1", "Mean"])
+@pytest.mark.parametrize(
+    "text", ["", "voigt", "power", "power:", "power:x", "power:nan", "power:11", "mean:1", "Mean"]
+)
 def test_words_that_are_no_average(text):
-    with pytest.raises(InputError, match=r'average: expected mean, .*power:P with P from -10 to 10.*got "'):
+    with pytest.raises(
+        InputError, match=r'average: expected mean, .*power:P with P from -10 to 10.*got "'
+    ):
         parse_average(text)
     with pytest.raises(InputError, match="average: expected"):
         build_model(lattice_mesh(noise((4, 4, 4)), blocks=(1, 1, 1)), average=text)
 
 
 def test_words_of_averages():
-    assert [parse_average(each).power for each in ("mean", "geometric", "harmonic", "power:0.5", "hill")] == [
-        1.0, 0.0, -1.0, 0.5, None
-    ]  # fmt: skip
+    assert [
+        parse_average(each).power for each in ("mean", "geometric", "harmonic", "power:0.5", "hill")
+    ] == [1.0, 0.0, -1.0, 0.5, None]
     assert parse_average(" power:+5e-1 ") == parse_average("power:0.5")
-    assert [parse_average(each).place for each in ("nodes", "gauss", "hill")] == ["nodes", "gauss", "cells"]
+    assert [parse_average(each).place for each in ("nodes", "gauss", "hill")] == [
+        "nodes",
+        "gauss",
+        "cells",
+    ]
 
 
 @pytest.mark.parametrize("shape", [(24, 20), (14, 12, 10)])
 def test_moduli_of_nodes(shape):
-    """The weighted geometric mean, hat function by hat function; within the range of the voxels around."""
+    """The weighted geometric mean, hat function by hat function; within the range of the voxels
+    around.
+    """
     image = noise(shape)
     mesh = lattice_mesh(image, blocks=(2,) * len(shape))
     young = node_young(image, mesh, lambda h: 1.0 + h)
@@ -150,7 +204,9 @@ def test_moduli_of_nodes(shape):
         total[corners] += hats * np.log(1.0 + image.data[tuple(place)])
     np.testing.assert_allclose(young, np.exp(total / weight), rtol=1e-9)
     np.testing.assert_allclose(
-        cell_young(image, mesh, lambda h: 1.0 + h, "nodes"), young[mesh.cells].mean(axis=1), rtol=1e-15
+        cell_young(image, mesh, lambda h: 1.0 + h, "nodes"),
+        young[mesh.cells].mean(axis=1),
+        rtol=1e-15,
     )
 
 
@@ -168,7 +224,9 @@ def test_a_node_without_voxels_has_the_nearest_one_s_modulus():
 @pytest.mark.parametrize("n", [2, 3])
 @pytest.mark.parametrize("order", [1, 2])
 def test_moduli_at_gauss_points_are_linear_in_the_cell(n, order):
-    """Exact for a linear field; their weighted sum is the mean over the cell; equal corners give that very number."""
+    """Exact for a linear field; their weighted sum is the mean over the cell; equal corners give
+    that very number.
+    """
     image = noise((8,) * n)
     mesh = lattice_mesh(image, blocks=(2,) * n)
     places, weights = gauss_rule(n, order)
@@ -196,15 +254,23 @@ def test_a_model_has_moduli_of_nodes():
     )
     assert build_model(mesh, image, young=mapping).node_young is None
     assert build_model(mesh, image, young="3", average="nodes").node_young is None  # nothing varies
-    with pytest.raises(InputError, match=r"bins: moduli that vary within cells cannot.*an average other than nodes"):
+    with pytest.raises(
+        InputError, match=r"bins: moduli that vary within cells cannot.*an average other than nodes"
+    ):
         build_model(mesh, image, young=mapping, average="nodes", bins=3)
-    with pytest.raises(InputError, match=r"average: nodes needs the image's voxels; give the image \(`image`\)"):
-        build_model(mesh, young=mapping, average="nodes", cell_data={"mean": np.ones(len(mesh.cells))})
+    with pytest.raises(
+        InputError, match=r"average: nodes needs the image's voxels; give the image \(`image`\)"
+    ):
+        build_model(
+            mesh, young=mapping, average="nodes", cell_data={"mean": np.ones(len(mesh.cells))}
+        )
 
 
 @pytest.mark.parametrize("shape", [(24, 20), (14, 12, 10)])
 def test_moduli_around_gauss_points(shape):
-    """Each has the geometric mean of the cell's voxels nearest to its corner; empty ones that of the cell."""
+    """Each has the geometric mean of the cell's voxels nearest to its corner; empty ones that of
+    the cell.
+    """
     n = len(shape)
     image = noise(shape)
     mesh = lattice_mesh(image, blocks=(12 - 2 * n,) * n)
@@ -232,17 +298,22 @@ def test_moduli_around_gauss_points(shape):
     assert n_full > 20
     assert n_empty > 0
     np.testing.assert_array_equal(
-        element_young(image, mesh, lambda h: 1.0 + h, "gauss"), cell_young(image, mesh, lambda h: 1.0 + h, "geometric")
+        element_young(image, mesh, lambda h: 1.0 + h, "gauss"),
+        cell_young(image, mesh, lambda h: 1.0 + h, "geometric"),
     )
 
 
 def test_a_model_has_moduli_at_gauss_points():
-    """Solved as they are; its materials, for files, have the geometric means; linear cells have no others."""
+    """Solved as they are; its materials, for files, have the geometric means; linear cells have
+    no others.
+    """
     image = noise((8, 9, 10))
     mesh = lattice_mesh(image, blocks=(2, 2, 2))
     mapping = [(0.0, 1.0), (200.0, 10.0)]
     model = build_model(mesh, image, young=mapping, average="gauss", order=2, loads=["compress:1%"])
-    np.testing.assert_array_equal(gauss_moduli(model), element_young(image, mesh, mapping, "gauss", 2))
+    np.testing.assert_array_equal(
+        gauss_moduli(model), element_young(image, mesh, mapping, "gauss", 2)
+    )
     np.testing.assert_array_equal(gauss_moduli(in_units(model, "MPa")), gauss_moduli(model) * 1e-3)
     of_cells = model.materials.young[model.materials.of_cell]
     np.testing.assert_array_equal(of_cells, cell_young(image, mesh, mapping, "geometric"))

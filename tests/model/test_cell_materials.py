@@ -59,7 +59,8 @@ def test_bins_by_number_and_by_logarithm():
     assert by_log.of_cell.tolist() == [0, 0, 0, 0, 1, 1]
     assert by_log.young.tolist() == [3.75, 768.0]
     wide = materials([1.0, 9.0, 30.0, 100.0], 0.3, 4)
-    assert binned(wide, np.ones(4), 2, "log").of_cell.tolist() == [0, 0, 1, 1]  # at 10; at 30.25 of square roots
+    # at 10; at 30.25 of square roots
+    assert binned(wide, np.ones(4), 2, "log").of_cell.tolist() == [0, 0, 1, 1]
     equal = binned(exact, np.ones(6), 4)  # the third quarter is empty
     assert equal.young.tolist() == [3.75, 512.0, 1024.0]
 
@@ -93,7 +94,9 @@ def test_bins_that_are_none(count, spacing, match):
 def test_values_by_label():
     assert by_label(ByLabel({1: 2.5, 0: 1.0}), np.array([0, 1, 1])).tolist() == [1.0, 2.5, 2.5]
     assert by_label(ByLabel({1: 2.5}, 7.0), np.array([0, 1, 9])).tolist() == [7.0, 2.5, 7.0]
-    with pytest.raises(InputError, match=r"got 1, but the mesh also has 0, 3 \(2 more\); give values for these"):
+    with pytest.raises(
+        InputError, match=r"got 1, but the mesh also has 0, 3 \(2 more\); give values for these"
+    ):
         by_label(ByLabel({1: 2.5}), np.array([0, 1, 3]))
     with pytest.raises(InputError, match="has no labels"):
         by_label(ByLabel({1: 2.5}), None)
@@ -103,10 +106,17 @@ def test_values_by_name():
     names, labels = {0: "air", 3: "left lung", 5: "liver", 8: "liver"}, np.array([0, 3, 5, 8])
     mapping = ByLabel({"Left_Lung": 2.5, "liver": 4.0}, 1.0)
     assert by_label(mapping, labels, names).tolist() == [1.0, 2.5, 4.0, 4.0]
-    assert by_label(ByLabel({3: 2.5, "liver_8": 4.0}, 1.0), labels, names).tolist() == [1.0, 2.5, 1.0, 4.0]
+    assert by_label(ByLabel({3: 2.5, "liver_8": 4.0}, 1.0), labels, names).tolist() == [
+        1.0,
+        2.5,
+        1.0,
+        4.0,
+    ]
     with pytest.raises(InputError, match=r"label 3 \(left lung\) has two values"):
         by_label(ByLabel({3: 2.5, "left lung": 4.0}), labels, names)
-    with pytest.raises(InputError, match=r"got liver, but the mesh also has 0 \(air\), 3 \(left lung\)"):
+    with pytest.raises(
+        InputError, match=r"got liver, but the mesh also has 0 \(air\), 3 \(left lung\)"
+    ):
         by_label(ByLabel({"liver": 4.0}), labels, names)
     with pytest.raises(InputError, match="did you mean left lung"):
         by_label(ByLabel({"left lnug": 4.0}, 1.0), labels, names)
@@ -116,16 +126,28 @@ def test_values_by_name():
 
 def test_a_model_s_table_names_mappings_and_sets():
     model = sample_model(3)
-    about = {"label_table": {"1": {"name": "bright/ball"}, "0": {"name": "rest"}, "9": {"name": "far"}}}
+    about = {
+        "label_table": {"1": {"name": "bright/ball"}, "0": {"name": "rest"}, "9": {"name": "far"}}
+    }
     named = build_model(
-        model.mesh, young="bright/ball=5,*=2", nu="rest=0.3,far=0.1,*=0.4", cell_data=model.cell_data, about=about
+        model.mesh,
+        young="bright/ball=5,*=2",
+        nu="rest=0.3,far=0.1,*=0.4",
+        cell_data=model.cell_data,
+        about=about,
     )
     is_bright = model.cell_data["label"] == 1
-    np.testing.assert_array_equal(named.materials.young[named.materials.of_cell], np.where(is_bright, 5.0, 2.0))
-    np.testing.assert_array_equal(named.materials.nu[named.materials.of_cell], np.where(is_bright, 0.4, 0.3))
+    np.testing.assert_array_equal(
+        named.materials.young[named.materials.of_cell], np.where(is_bright, 5.0, 2.0)
+    )
+    np.testing.assert_array_equal(
+        named.materials.nu[named.materials.of_cell], np.where(is_bright, 0.4, 0.3)
+    )
     assert set(named.sets.cells) == {"rest", "bright_ball"}
     assert "interface_rest_bright_ball" in named.sets.facets
-    np.testing.assert_array_equal(named.sets.facets["interface_rest_bright_ball"], model.sets.facets["interface_0_1"])
+    np.testing.assert_array_equal(
+        named.sets.facets["interface_rest_bright_ball"], model.sets.facets["interface_0_1"]
+    )
 
 
 def test_the_mean_of_the_mapping_and_the_mapping_of_the_mean():
@@ -142,9 +164,16 @@ def test_the_mean_of_the_mapping_and_the_mapping_of_the_mean():
 
 
 def test_constants_are_one_material():
-    """Whatever the means over many voxels would round to; also where a mapping is constant in a cell."""
+    """Whatever the means over many voxels would round to; also where a mapping is constant in a
+    cell.
+    """
     image, mesh = sample_image(3), sample_model(3).mesh
-    for young, nu in (("0.7", "0.49"), (0.7, 0.49), ("0.7 + 0*h", "0.49 + 0*h"), ([(0, 0.7), (1, 0.7)], 0.49)):
+    for young, nu in (
+        ("0.7", "0.49"),
+        (0.7, 0.49),
+        ("0.7 + 0*h", "0.49 + 0*h"),
+        ([(0, 0.7), (1, 0.7)], 0.49),
+    ):
         table = build_model(mesh, image, young=young, nu=nu).materials
         assert (table.young.tolist(), table.nu.tolist()) == ([0.7], [0.49])
     assert build_model(mesh, young="3").materials.young.tolist() == [3.0]  # needs no image
@@ -168,7 +197,9 @@ def test_ratios_may_be_negative_and_mappings():
 def test_one_mapping_for_each_label_and_one_number_a_cell():
     model = sample_model(3)
     labels = model.cell_data["label"]
-    table = build_model(model.mesh, young="0=1.5,1=4", nu="0=0.45,1=0.3", cell_data=model.cell_data).materials
+    table = build_model(
+        model.mesh, young="0=1.5,1=4", nu="0=0.45,1=0.3", cell_data=model.cell_data
+    ).materials
     np.testing.assert_array_equal(table.young[table.of_cell], np.where(labels == 1, 4.0, 1.5))
     np.testing.assert_array_equal(table.nu[table.of_cell], np.where(labels == 1, 0.3, 0.45))
     moduli = np.linspace(1.0, 2.0, len(labels))
@@ -195,7 +226,9 @@ def test_cells_of_another_density_are_of_another_material():
 
 @pytest.mark.parametrize("wrong", [0.0, -1.0, np.nan, np.inf])
 def test_densities_that_are_none(wrong):
-    with pytest.raises(InputError, match="density: expected kg/m3 above 0, got other values in 1 cells"):
+    with pytest.raises(
+        InputError, match="density: expected kg/m3 above 0, got other values in 1 cells"
+    ):
         materials(1.0, 0.3, 2, [1000.0, wrong])
     with pytest.raises(InputError, match="gravity: the cells have no density; give `density`"):
         density_of(materials(1.0, 0.3, 2))

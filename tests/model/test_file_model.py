@@ -20,9 +20,16 @@ def named(model):
     """The model with a table of its labels and sets by their names."""
     about = {"label_table": TABLE, "image": "T1.nii.gz"}
     again = tetopt.build_model(
-        model.mesh, young=3.0 + np.arange(len(model.mesh.cells)) % 2, nu=0.3, density=1100.0, order=model.order,
-        cell_data=model.cell_data, about=about, sets=["tip=below:20"], loads=["hold:inferior", "pressure:superior:2"],
-    )  # fmt: skip
+        model.mesh,
+        young=3.0 + np.arange(len(model.mesh.cells)) % 2,
+        nu=0.3,
+        density=1100.0,
+        order=model.order,
+        cell_data=model.cell_data,
+        about=about,
+        sets=["tip=below:20"],
+        loads=["hold:inferior", "pressure:superior:2"],
+    )
     return again._replace(point_data=model.point_data)
 
 
@@ -32,7 +39,9 @@ def test_what_the_file_has_goes_on(tmp_path, model):
     again = tetopt.build_model(saved(tmp_path, first))
     assert again.order == first.order
     assert again.loads[0]._replace(numbers=None) == first.loads[0]._replace(numbers=None)
-    assert [load.numbers.tolist() for load in again.loads] == [load.numbers.tolist() for load in first.loads]
+    assert [load.numbers.tolist() for load in again.loads] == [
+        load.numbers.tolist() for load in first.loads
+    ]
     for one, other in zip(again.sets, first.sets, strict=True):
         assert list(one) == list(other)
         assert all(one[name].tolist() == other[name].tolist() for name in one)
@@ -58,7 +67,9 @@ def test_what_is_stated_takes_the_place_of_the_file_s(tmp_path):
     assert by_name.order == 1
     assert tetopt.build_model(loaded, nu=0.4).materials.young.tolist() == [3.0, 4.0]
     solved = tetopt.solution_fields(loaded.mesh, tetopt.solve(tetopt.build_model(loaded)))
-    painted = loaded._replace(cell_data=loaded.cell_data | solved.cell_data, point_data=solved.point_data)
+    painted = loaded._replace(
+        cell_data=loaded.cell_data | solved.cell_data, point_data=solved.point_data
+    )
     assert "von_mises" in tetopt.build_model(painted).cell_data
     assert "displacement" not in tetopt.build_model(painted, young=2.0).point_data
     assert "von_mises" not in tetopt.build_model(painted, young=2.0).cell_data
@@ -67,8 +78,13 @@ def test_what_is_stated_takes_the_place_of_the_file_s(tmp_path):
 def test_loads_whose_sets_are_gone_are_said_to_be_left_out(tmp_path):
     loaded = saved(tmp_path, named(sample_model(3)))
     facets = {name: rows for name, rows in loaded.sets.facets.items() if name != "inferior"}
-    with pytest.warns(UserWarning, match="dropped the file's loads: it no longer has the sets inferior"):
-        assert tetopt.build_model(loaded._replace(sets=loaded.sets._replace(facets=facets))).loads == ()
+    with pytest.warns(
+        UserWarning, match="dropped the file's loads: it no longer has the sets inferior"
+    ):
+        assert (
+            tetopt.build_model(loaded._replace(sets=loaded.sets._replace(facets=facets))).loads
+            == ()
+        )
 
 
 @pytest.mark.full
@@ -77,5 +93,7 @@ def test_as_convert_writes_it(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     loaded = saved(tmp_path, named(sample_model(3)), "first.vtu")
     assert main(["convert", "first.vtu", "b.inp", "--nu", "0.35"]) == 0
-    tetopt.save_model("ours.inp", tetopt.build_model(loaded, nu=0.35, about={"tetopt": tetopt.__version__}))
+    tetopt.save_model(
+        "ours.inp", tetopt.build_model(loaded, nu=0.35, about={"tetopt": tetopt.__version__})
+    )
     assert (tmp_path / "ours.inp").read_text("utf-8") == (tmp_path / "b.inp").read_text("utf-8")

@@ -38,12 +38,47 @@ def test_values(text, expected):
 @pytest.mark.parametrize(
     "text",
     [
-        "", "h +", "x", "__import__('os')", "h.size", "h[0]", "lambda: 1", "[h]", "'h'", "True", "1j", "h if h else 1",
-        "h < 2", "h @ h", "h // 2", "h & 1", "~h", "not h", "sum(h)", "max(h)", "abs(h, 2)", "max(h, 1, 2)", "abs(x=h)",
-        "min(*h)", "h; h", "h = 1", "(h := 2)", "f'{h}'", "abs", "...", "None", "(" * 300 + "h" + ")" * 300, "\0",
-        "h" + "+h" * 20000, "h" + "+h" * 983, "-" * 983 + "h", "1" + "0" * 400, "1if h else 2", "h +\n x",
+        "",
+        "h +",
+        "x",
+        "__import__('os')",
+        "h.size",
+        "h[0]",
+        "lambda: 1",
+        "[h]",
+        "'h'",
+        "True",
+        "1j",
+        "h if h else 1",
+        "h < 2",
+        "h @ h",
+        "h // 2",
+        "h & 1",
+        "~h",
+        "not h",
+        "sum(h)",
+        "max(h)",
+        "abs(h, 2)",
+        "max(h, 1, 2)",
+        "abs(x=h)",
+        "min(*h)",
+        "h; h",
+        "h = 1",
+        "(h := 2)",
+        "f'{h}'",
+        "abs",
+        "...",
+        "None",
+        "(" * 300 + "h" + ")" * 300,
+        "\0",
+        "h" + "+h" * 20000,
+        "h" + "+h" * 983,
+        "-" * 983 + "h",
+        "1" + "0" * 400,
+        "1if h else 2",
+        "h +\n x",
     ],
-)  # fmt: skip
+)
 def test_refuses(text):
     with pytest.raises(tetopt.InputError, match="formula") as caught:
         parse_formula(text)
@@ -73,7 +108,8 @@ def test_no_value_is_refused_with_the_intensity():
 def test_one_over_strain_is_the_papers_mapping():
     strain = np.array([0.02, -0.01, 0.0, 0.3])
     np.testing.assert_array_equal(
-        young_from(parse_mapping("1/max(abs(h), 0.001)"), strain), 1.0 / np.maximum(np.abs(strain), 0.001)
+        young_from(parse_mapping("1/max(abs(h), 0.001)"), strain),
+        1.0 / np.maximum(np.abs(strain), 0.001),
     )
 
 
@@ -82,7 +118,9 @@ def test_mapping_is_a_table_or_a_formula():
     np.testing.assert_array_equal(young_from(parse_mapping("max(h, 60)"), [50.0]), [60.0])
 
 
-@pytest.mark.parametrize("text", ["h" * 10**6, "+".join("h" * 10**5), "(" * 5000 + "h" + ")" * 5000, "9" * 10_001])
+@pytest.mark.parametrize(
+    "text", ["h" * 10**6, "+".join("h" * 10**5), "(" * 5000 + "h" + ")" * 5000, "9" * 10_001]
+)
 def test_formulas_without_end(text):
     with pytest.raises(tetopt.InputError, match="expected at most 10000 characters"):
         parse_formula(text)

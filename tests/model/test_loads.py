@@ -23,7 +23,14 @@ from tetopt.model.loads import (
     parse_loads,
     spring_constants,
 )
-from tetopt.model.sets import FACE_NAMES, area_vectors, box_of, nodes_of, standard_sets, with_requested
+from tetopt.model.sets import (
+    FACE_NAMES,
+    area_vectors,
+    box_of,
+    nodes_of,
+    standard_sets,
+    with_requested,
+)
 
 
 @pytest.mark.parametrize("n", [2, 3])
@@ -95,14 +102,19 @@ def test_step_1_may_have_the_loads_of_all_steps_alone():
 
 
 def test_components_and_steps_keep_displacements_apart():
-    """The same nodes may be held along one axis by one load and along another by the next, or in other steps."""
+    """The same nodes may be held along one axis by one load and along another by the next, or in
+    other steps.
+    """
     model = sample_model(3)
     sliding = ["move:left:0,free,free", "move:superior:free,free,0", "move:inferior:free,0,1"]
     assert len(parse_loads(sliding, model.mesh, model.sets)) == 3
     steps = ["hold:superior", "1/move:inferior:0,0,1", "2/move:inferior:0,1,0"]
     loads = parse_loads(steps, model.mesh, model.sets)
     assert count_of_steps(loads) == 2
-    assert [[load.numbers.tolist() for load in in_step(loads, step)][1] for step in (1, 2)] == [[0, 0, 1], [0, 1, 0]]
+    assert [[load.numbers.tolist() for load in in_step(loads, step)][1] for step in (1, 2)] == [
+        [0, 0, 1],
+        [0, 1, 0],
+    ]
     assert count_of_steps(()) == 1
 
 
@@ -129,8 +141,14 @@ def test_components_and_steps_keep_displacements_apart():
         (["9" * 5000 + "/hold:left"], "a step of 1 or more"),
         (["1/hold:left", "9999/hold:left"], "in step 9999, but none in step 2"),
         (["hold:left", "3/pressure:right:1"], "in step 3, but none in step 2"),
-        (["hold:left", "2/move:left:0,0,1", "1/pressure:right:1"], "already have a prescribed displacement"),
-        (["move:left:free,0,free", "move:posterior:1,2,free"], "already have a prescribed displacement"),
+        (
+            ["hold:left", "2/move:left:0,0,1", "1/pressure:right:1"],
+            "already have a prescribed displacement",
+        ),
+        (
+            ["move:left:free,0,free", "move:posterior:1,2,free"],
+            "already have a prescribed displacement",
+        ),
         (["compress:5%", "hold:superior"], "already have a prescribed displacement"),
     ],
 )
@@ -143,7 +161,9 @@ def test_loads_that_are_none(texts, match):
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_an_organ_is_pressed_along_the_world_axis(n):
-    """Between its own outermost nodes, though the areas of neither side sum up to exactly that direction."""
+    """Between its own outermost nodes, though the areas of neither side sum up to exactly that
+    direction.
+    """
     mesh = ball_mesh(n)
     turn = np.eye(n)
     turn[-2:, -2:] = [[0.8, 0.6], [-0.6, 0.8]]
@@ -151,12 +171,15 @@ def test_an_organ_is_pressed_along_the_world_axis(n):
     top, bottom = parse_loads(["compress:5%"], mesh, standard_sets(mesh))
     assert [top.set_name, bottom.set_name] == list(FACE_NAMES[n][-1])[::-1]
     assert not top.numbers.any()
-    np.testing.assert_allclose(bottom.numbers, 0.05 * np.ptp(mesh.points, axis=0) * np.eye(n)[-1], rtol=1e-12)
+    np.testing.assert_allclose(
+        bottom.numbers, 0.05 * np.ptp(mesh.points, axis=0) * np.eye(n)[-1], rtol=1e-12
+    )
 
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_a_side_where_the_box_cuts_a_stem_is_told(n):
-    """The body's upper side is the face of the box, its lower one that of a stem, of one of many blocks: too small.
+    """The body's upper side is the face of the box, its lower one that of a stem, of one of many
+    blocks: too small.
 
     Sets of the user's may be as small as they are.
     """
@@ -172,21 +195,30 @@ def test_a_side_where_the_box_cuts_a_stem_is_told(n):
         parse_loads(["compress:5%"], mesh, known)
     assert len(told) == 1
     percent = float(re.search(", (.*) % of the area that", str(told[0].message))[1])
-    assert percent == pytest.approx(100.0 * k ** (1.0 - n), rel=0.05)  # cut cells at the stem's root show a little more
+    # cut cells at the stem's root show a little more
+    assert percent == pytest.approx(100.0 * k ** (1.0 - n), rel=0.05)
     request = str(told[0].message).split('"')[-2]
     wider = with_requested(mesh, known, [request], None)
     assert len(wider.facets["base"]) > len(known.facets[low])
-    small = with_requested(mesh, known, [f"tip=point:{','.join(['8.5'] * (n - 1) + ['-0.5'])}:1.5"], None)
+    small = with_requested(
+        mesh, known, [f"tip=point:{','.join(['8.5'] * (n - 1) + ['-0.5'])}:1.5"], None
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        parse_loads(["move:base:" + ",".join("1" * n), f"hold:{high}", "gravity:" + ",".join("1" * n)], mesh, wider)
+        parse_loads(
+            ["move:base:" + ",".join("1" * n), f"hold:{high}", "gravity:" + ",".join("1" * n)],
+            mesh,
+            wider,
+        )
         parse_loads(["hold:tip"], mesh, small)
 
 
 def test_no_side_to_press():
     """A tetrahedron has a tip and no top; the sets that it has are named."""
     mesh = tetopt.Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2, 3]])
-    with pytest.raises(InputError, match=r"the mesh has no facets superior; .* boundary, left, posterior, inferior"):
+    with pytest.raises(
+        InputError, match=r"the mesh has no facets superior; .* boundary, left, posterior, inferior"
+    ):
         parse_loads(["compress:5%"], mesh, standard_sets(mesh))
 
 
@@ -208,7 +240,8 @@ def test_weights_integrate_what_cells_of_the_order_can_be(n, order):
     areas = area_vectors(mesh, rows)
     normals = areas / np.linalg.norm(areas, axis=1)[:, None]
     volume = volumes(mesh.points, mesh.cells).sum()
-    flux = np.einsum("kw,ki,kwj->ij", weights, normals, points[nodes])  # of each coordinate's unit vector
+    # of each coordinate's unit vector
+    flux = np.einsum("kw,ki,kwj->ij", weights, normals, points[nodes])
     np.testing.assert_allclose(flux, volume * np.eye(n), atol=1e-10 * volume)
     if order == 2:
         centre = volumes(mesh.points, mesh.cells) @ mesh.points[mesh.cells].mean(axis=1) / volume

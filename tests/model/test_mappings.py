@@ -6,7 +6,14 @@ from models import sample_model
 
 from tetopt import InputError
 from tetopt.model.build import build_model
-from tetopt.model.mappings import ByLabel, has_column, load_mapping, parse_any_mapping, parse_mapping, young_from
+from tetopt.model.mappings import (
+    ByLabel,
+    has_column,
+    load_mapping,
+    parse_any_mapping,
+    parse_mapping,
+    young_from,
+)
 
 TABLE = [(-50.0, 2.0), (0.0, 1.0), (100.0, 5.0)]
 
@@ -42,7 +49,9 @@ def test_a_function_sees_float64_and_may_return_whole_numbers():
 def test_a_function_equal_to_a_table_gives_the_same():
     h = np.linspace(-50.0, 100.0, 31)
     np.testing.assert_allclose(
-        young_from(TABLE, h), young_from(lambda x: np.where(x < 0, 1.0 - x / 50.0, 1.0 + x / 25.0), h), rtol=1e-14
+        young_from(TABLE, h),
+        young_from(lambda x: np.where(x < 0, 1.0 - x / 50.0, 1.0 + x / 25.0), h),
+        rtol=1e-14,
     )
 
 
@@ -54,36 +63,46 @@ def test_a_function_equal_to_a_table_gives_the_same():
     [
         (
             [(0, 1), (0, 2)],
-            "mapping: intensities must increase, got 0 and then 0; sort the pairs and give each intensity once",
+            "mapping: intensities must increase, got 0 and then 0; sort the pairs and give each "
+            "intensity once",
         ),
         (
             [(0, 1), (9, 2), (5, 3)],
-            "mapping: intensities must increase, got 9 and then 5; sort the pairs and give each intensity once",
+            "mapping: intensities must increase, got 9 and then 5; sort the pairs and give each "
+            "intensity once",
         ),
         ([], "mapping: expected pairs (intensity, kPa), got an array of shape (0,)"),
         ([1.0, 2.0], "mapping: expected pairs (intensity, kPa), got an array of shape (2,)"),
         ([(1, 2, 3)], "mapping: expected pairs (intensity, kPa), got an array of shape (1, 3)"),
         ("soft", "mapping: expected pairs (intensity, kPa), got 'soft'"),
         ([(0, 1), (1,)], "mapping: expected pairs (intensity, kPa), got [(0, 1), (1,)]"),
-        ([(0, 1), (5, np.nan)], "mapping: expected finite intensities and moduli, got [[0.0, 1.0], [5.0, nan]]"),
+        (
+            [(0, 1), (5, np.nan)],
+            "mapping: expected finite intensities and moduli, got [[0.0, 1.0], [5.0, nan]]",
+        ),
         (
             [(0, -1), (10, 9)],
             "modulus: expected 0 kPa or more, got 1 invalid values, such as -1 at intensity 0; "
-            "give a modulus mapping (`young`) that is positive from 0 to 10, or leave out other tissue (`mask`)",
+            "give a modulus mapping (`young`) that is positive from 0 to 10, or leave out other "
+            "tissue (`mask`)",
         ),
         (
             lambda h: 4.0 - h,
-            "modulus: expected 0 kPa or more, got 2 invalid values, such as -1 at intensity 5, -6 at intensity 10; "
-            "give a modulus mapping (`young`) that is positive from 0 to 10, or leave out other tissue (`mask`)",
+            "modulus: expected 0 kPa or more, got 2 invalid values, such as -1 at intensity 5, "
+            "-6 at intensity 10; "
+            "give a modulus mapping (`young`) that is positive from 0 to 10, or leave out other "
+            "tissue (`mask`)",
         ),
         (
             lambda h: np.where(h > 5, np.inf, 1.0),
             "modulus: expected 0 kPa or more, got 1 invalid values, such as inf at intensity 10; "
-            "give a modulus mapping (`young`) that is positive from 0 to 10, or leave out other tissue (`mask`)",
+            "give a modulus mapping (`young`) that is positive from 0 to 10, or leave out other "
+            "tissue (`mask`)",
         ),
         (
             lambda h: h.sum(),
-            "mapping: expected a function that returns one value for each intensity, got shape () for shape (3,)",
+            "mapping: expected a function that returns one value for each intensity, got shape "
+            "() for shape (3,)",
         ),
     ],
 )
@@ -96,7 +115,9 @@ def test_messages_of_mappings(mapping, message):
 # From text and files
 
 
-@pytest.mark.parametrize("text", ["1=", "=2", "1=2,1=3", "1=2;2=3", "a=1,a=2", "1.5=2", "1=x", "*=1,*=2"])
+@pytest.mark.parametrize(
+    "text", ["1=", "=2", "1=2,1=3", "1=2;2=3", "a=1,a=2", "1.5=2", "1=x", "*=1,*=2"]
+)
 def test_labels_that_are_none(text):
     with pytest.raises(InputError, match="by label"):
         parse_any_mapping(text)
@@ -111,7 +132,9 @@ TOML = "intensity = [0, 50, 200]\nyoung = [0.5, 1, 6.0]\nnu = [0.45, 0.4, 0.49]\
 CSV = "intensity, young, nu\n0,0.5,0.45\n50,1,0.4\n200,6.0,0.49\n"
 
 
-@pytest.mark.parametrize(("name", "text"), [("a.toml", TOML), ("a.csv", CSV), ("A.CSV", "\ufeff" + CSV + "\n")])
+@pytest.mark.parametrize(
+    ("name", "text"), [("a.toml", TOML), ("a.csv", CSV), ("A.CSV", "\ufeff" + CSV + "\n")]
+)
 def test_tables_from_files(tmp_path, name, text):
     path = tmp_path / name
     path.write_text(text, encoding="utf-8")

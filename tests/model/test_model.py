@@ -18,7 +18,10 @@ from tetopt.model.sets import Sets, facet_triples
 def test_lps_turns_points_and_loads_about_z():
     model = sample_model(3)
     turned = in_space(
-        model._replace(loads=parse_loads(["hold:left", "move:right:1,2,3"], model.mesh, model.sets)), "lps"
+        model._replace(
+            loads=parse_loads(["hold:left", "move:right:1,2,3"], model.mesh, model.sets)
+        ),
+        "lps",
     )
     np.testing.assert_array_equal(turned.mesh.points, model.mesh.points * [-1, -1, 1])
     np.testing.assert_array_equal(turned.mesh.cells, model.mesh.cells)
@@ -38,14 +41,22 @@ def test_units():
     np.testing.assert_array_equal(other.materials.nu, model.materials.nu)
     assert described(model)[2] == "units: mm, kPa, mN, uJ, kg, s"
     assert described(other)[2] == "units: mm, MPa, N, mJ, t, s"
-    np.testing.assert_allclose(in_units(other, "kPa").materials.young, model.materials.young, rtol=1e-15)
+    np.testing.assert_allclose(
+        in_units(other, "kPa").materials.young, model.materials.young, rtol=1e-15
+    )
     with pytest.raises(InputError, match="expected one of kPa, MPa, Pa, got psi"):
         in_units(model, "psi")
 
 
 def test_with_pascals_lengths_are_in_metres():
     """Each quantity by the powers of its unit; and back."""
-    kinds = ["hold:inferior", "move:superior:free,0,-2", "pressure:left:3", "spring:right:5", "gravity:0,0,-9810"]
+    kinds = [
+        "hold:inferior",
+        "move:superior:free,0,-2",
+        "pressure:left:3",
+        "spring:right:5",
+        "gravity:0,0,-9810",
+    ]
     model = build_model(sample_model(3).mesh, young=4.0, density=1000.0, loads=kinds)
     n_cells, n_nodes = len(model.mesh.cells), len(model.mesh.points)
     model = model._replace(
@@ -65,7 +76,10 @@ def test_with_pascals_lengths_are_in_metres():
     expected = [[0.0, 0.0, 0.0], [np.nan, 0.0, -0.002], [3000.0], [5e6], [0.0, 0.0, -9.81]]
     for found, right in zip(numbers, expected, strict=True):
         np.testing.assert_allclose(found, right, rtol=1e-15)
-    found = {name: float(values.ravel()[0]) for name, values in (other.cell_data | other.point_data).items()}
+    found = {
+        name: float(values.ravel()[0])
+        for name, values in (other.cell_data | other.point_data).items()
+    }
     assert found == pytest.approx(
         {"volume": 7e-9, "rho": 0.3, "stress_step2": 2000.0, "displacement": 0.005}, rel=1e-15
     )
@@ -79,13 +93,16 @@ def test_with_pascals_lengths_are_in_metres():
 
 
 def test_the_head_is_of_single_lines():
-    model = sample_model(3)._replace(about={"tetopt": "1", "image": "a\nb.nii", "image_sha256": "00"})
+    model = sample_model(3)._replace(
+        about={"tetopt": "1", "image": "a\nb.nii", "image_sha256": "00"}
+    )
     assert described(model) == [
         "tetopt 1",
         "coordinates: RAS+, mm",
         "units: mm, kPa, mN, uJ, kg, s",
         "image: a b.nii, sha256 00",
-        f"materials: bins, error of the modulus {model.materials.binning.mean:.3%} (mean by volume), "
+        f"materials: bins, error of the modulus {model.materials.binning.mean:.3%} (mean by "
+        "volume), "
         f"{model.materials.binning.largest:.3%} (largest)",
     ]
     assert "of the slice's plane" in described(sample_model(2))[1]
@@ -102,7 +119,11 @@ def test_quadratic_cells_have_their_nodes_in_the_middle_of_edges():
     np.testing.assert_allclose(
         points[cells[:, 4:]], mesh.points[mesh.cells[:, QUADRATIC_EDGES]].mean(axis=2), rtol=1e-15
     )
-    edges = {tuple(sorted(edge)) for cell in mesh.cells.tolist() for edge in np.array(cell)[QUADRATIC_EDGES].tolist()}
+    edges = {
+        tuple(sorted(edge))
+        for cell in mesh.cells.tolist()
+        for edge in np.array(cell)[QUADRATIC_EDGES].tolist()
+    }
     assert len(points) == len(mesh.points) + len(edges)  # each once
     rows = sample_model(3).sets.facets["boundary"]
     facets = quadratic_facet_nodes(cells, rows)

@@ -56,7 +56,9 @@ def test_fields_of_nodes_are_exact_up_to_their_order(n):
         places = centres(grid).reshape(*grid.shape, n)
         linear = tetopt.field_on_image(mesh, mesh.points, grid)
         inside = np.isfinite(linear[..., 0])
-        np.testing.assert_allclose(linear[inside], places[inside], rtol=0.0, atol=1e-12 * np.abs(places).max())
+        np.testing.assert_allclose(
+            linear[inside], places[inside], rtol=0.0, atol=1e-12 * np.abs(places).max()
+        )
         nodes = quadratic(mesh.points, mesh.cells)[0]
         curved = tetopt.field_on_image(mesh, (nodes**2).sum(axis=1), grid)
         expected = (places**2).sum(axis=-1)
@@ -65,7 +67,9 @@ def test_fields_of_nodes_are_exact_up_to_their_order(n):
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_curved_cells_are_isoparametric(n):
-    """Their nodes' coordinates, as a field, give back the voxels' centres; a straight map would miss them."""
+    """Their nodes' coordinates, as a field, give back the voxels' centres; a straight map would
+    miss them.
+    """
     image = oblique(n)
     straight = moved_mesh(image)
     nodes, n_corners = quadratic(straight.points, straight.cells)[0], len(straight.points)
@@ -81,13 +85,17 @@ def test_curved_cells_are_isoparametric(n):
 
 
 def test_an_image_moves_with_its_displacement():
-    """By whole voxels exactly, by nothing not at all, and the inverse way back; labels stay labels."""
+    """By whole voxels exactly, by nothing not at all, and the inverse way back; labels stay
+    labels.
+    """
     image = sample_image(3)
     mesh = tetopt.lattice_mesh(image, nodes=100)
     still = tetopt.warped_image(mesh, np.zeros_like(mesh.points), image)
     np.testing.assert_allclose(still.data, image.data, atol=1e-9)
     along = image.affine[:3, 0]
-    moved = tetopt.warped_image(mesh, np.tile(2.0 * along, (len(mesh.points), 1)), image, outside=-5.0)
+    moved = tetopt.warped_image(
+        mesh, np.tile(2.0 * along, (len(mesh.points), 1)), image, outside=-5.0
+    )
     np.testing.assert_allclose(moved.data[2:], image.data[:-2], atol=1e-9)
     assert (moved.data[:2] == -5.0).all()
     middle = mesh.points.mean(axis=0)
@@ -96,11 +104,15 @@ def test_an_image_moves_with_its_displacement():
     labels = tetopt.Image(1.0 + (image.data > np.median(image.data)), image.affine)
     of_labels = tetopt.warped_image(mesh, 0.25 * (mesh.points - middle), labels, is_nearest=True)
     assert set(np.unique(of_labels.data)) <= {1.0, 2.0}
-    nearest = labels.data[tuple(np.clip(np.rint(index).astype(int), 0, np.array(image.shape) - 1).T)]
+    nearest = labels.data[
+        tuple(np.clip(np.rint(index).astype(int), 0, np.array(image.shape) - 1).T)
+    ]
     assert (of_labels.data.ravel() == nearest).mean() > 0.97  # but for ties
     from scipy.ndimage import map_coordinates
 
-    np.testing.assert_allclose(grown.data.ravel(), map_coordinates(image.data, index.T, order=1), atol=1e-6)
+    np.testing.assert_allclose(
+        grown.data.ravel(), map_coordinates(image.data, index.T, order=1), atol=1e-6
+    )
     nodes = quadratic(mesh.points, mesh.cells)[0]
     bent = tetopt.warped_image(mesh, 0.25 * (nodes - middle), image)  # the same, of order 2
     np.testing.assert_allclose(bent.data, grown.data, atol=1e-6)
@@ -110,7 +122,9 @@ def test_other_rows_and_displacements_are_rejected():
     image = oblique(3)
     mesh = moved_mesh(image)
     for rows in (5, len(mesh.points) + 1):
-        with pytest.raises(tetopt.InputError, match=f"values: expected a row for each of .* got {rows}"):
+        with pytest.raises(
+            tetopt.InputError, match=f"values: expected a row for each of .* got {rows}"
+        ):
             tetopt.field_on_image(mesh, np.zeros(rows), image)
     with pytest.raises(tetopt.InputError, match="expected ArrayLike, got list of str"):
         tetopt.field_on_image(mesh, ["a"] * len(mesh.cells), image)
@@ -121,22 +135,35 @@ def test_other_rows_and_displacements_are_rejected():
     far = tetopt.Image(np.zeros((3, 3, 3)), np.diag([1.0, 1.0, 1.0, 1.0]) + 1e4 * np.eye(4, k=3))
     with pytest.raises(tetopt.InputError, match="image: no voxel of it is inside the mesh"):
         tetopt.warped_image(mesh, np.zeros_like(mesh.points), far, image)
-    part = tetopt.Image(1.0 + image.data[3:], image.affine @ np.array([[1, 0, 0, 3], *np.eye(4)[1:].tolist()]))
+    part = tetopt.Image(
+        1.0 + image.data[3:], image.affine @ np.array([[1, 0, 0, 3], *np.eye(4)[1:].tolist()])
+    )
     moved = tetopt.warped_image(mesh, np.zeros_like(mesh.points), part, image, outside=-1.0)
     assert (moved.data[:2] == -1.0).all()  # not the edge of what there is
     assert (moved.data[3:] > 0.0).any()
-    with pytest.raises(tetopt.InputError, match="expected a 3-D image like the mesh, got a 2-D one"):
+    with pytest.raises(
+        tetopt.InputError, match="expected a 3-D image like the mesh, got a 2-D one"
+    ):
         tetopt.warped_image(mesh, np.zeros_like(mesh.points), oblique(2), image)
-    # Two triangles and two between them and a third: as many cells as nodes only where a ring closes.
-    ring = 2.0 * np.column_stack([np.cos(np.arange(8) * np.pi / 4.0), np.sin(np.arange(8) * np.pi / 4.0)])
-    cells = [[k, 8 + k, 8 + (k + 1) % 8] for k in range(8)] + [[k, 8 + (k + 1) % 8, (k + 1) % 8] for k in range(8)]
+    # Two triangles and two between them and a third: as many cells as nodes only where a ring
+    # closes.
+    ring = 2.0 * np.column_stack(
+        [np.cos(np.arange(8) * np.pi / 4.0), np.sin(np.arange(8) * np.pi / 4.0)]
+    )
+    cells = [[k, 8 + k, 8 + (k + 1) % 8] for k in range(8)] + [
+        [k, 8 + (k + 1) % 8, (k + 1) % 8] for k in range(8)
+    ]
     annulus = tetopt.Mesh(np.concatenate([ring, 2.0 * ring]), cells)
     grid = tetopt.Image(np.zeros((9, 9)), [[1, 0, -4], [0, 1, -4], [0, 0, 1]])
     assert len(annulus.cells) == len(annulus.points) == 16
     numbers = np.arange(16.0)
-    with pytest.raises(tetopt.InputError, match='16 cells and as many nodes; pass at="cells" or at="nodes"'):
+    with pytest.raises(
+        tetopt.InputError, match='16 cells and as many nodes; pass at="cells" or at="nodes"'
+    ):
         tetopt.field_on_image(annulus, numbers, grid)
-    of_cells, of_nodes = (tetopt.field_on_image(annulus, numbers, grid, at=at) for at in ("cells", "nodes"))
+    of_cells, of_nodes = (
+        tetopt.field_on_image(annulus, numbers, grid, at=at) for at in ("cells", "nodes")
+    )
     inside = np.isfinite(of_cells)
     assert (of_cells[inside] % 1.0 == 0.0).all()
     assert (of_nodes[inside] % 1.0 != 0.0).any()

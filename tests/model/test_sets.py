@@ -46,7 +46,9 @@ def test_facets_face_out_of_their_cell():
         every = np.argwhere(np.ones(mesh.cells.shape, dtype=bool))
         nodes = facet_triples(mesh.cells, every)
         opposite = mesh.cells[every[:, 0], every[:, 1]]
-        assert (np.sort(np.column_stack([nodes, opposite])) == np.sort(mesh.cells[every[:, 0]])).all()
+        assert (
+            np.sort(np.column_stack([nodes, opposite])) == np.sort(mesh.cells[every[:, 0]])
+        ).all()
         if n == 3:
             inward = mesh.points[opposite] - mesh.points[nodes[:, 0]]
             assert ((inward * outward_areas(mesh, every)).sum(axis=1) < 0.0).all()
@@ -71,7 +73,9 @@ def test_faces_are_named_by_the_world(order, signs):
     assert world_axes(affine) == order
     for axis, (low, high) in enumerate(NAMES):
         assert (mesh.points[nodes_of(mesh, sets[low])][:, axis] == mesh.points[:, axis].min()).all()
-        assert (mesh.points[nodes_of(mesh, sets[high])][:, axis] == mesh.points[:, axis].max()).all()
+        assert (
+            mesh.points[nodes_of(mesh, sets[high])][:, axis] == mesh.points[:, axis].max()
+        ).all()
         size = np.ptp(mesh.points, axis=0)
         for name, sign in ((low, -1.0), (high, 1.0)):
             area = np.zeros(3)
@@ -79,17 +83,22 @@ def test_faces_are_named_by_the_world(order, signs):
             np.testing.assert_allclose(outward_areas(mesh, sets[name]).sum(axis=0), area, atol=1e-9)
     assert len(sets["boundary"]) == sum(len(sets[name]) for pair in NAMES for name in pair)
     assert "mask_surface" not in sets
-    assert [name for name in standard_sets(mesh).facets] == ["boundary", *(name for pair in NAMES for name in pair)]
+    assert [name for name in standard_sets(mesh).facets] == [
+        "boundary",
+        *(name for pair in NAMES for name in pair),
+    ]
 
 
 def test_an_oblique_box_is_known_by_its_affine_alone():
     image, mesh = sample_image(3), sample_model(3).mesh
     with_box = standard_sets(mesh, box_of(image)).facets
     assert sum(len(with_box[name]) for pair in NAMES for name in pair) == len(with_box["boundary"])
-    without = standard_sets(mesh).facets  # turned about z, so that only those two faces lie in planes of the world
+    # turned about z, so that only those two faces lie in planes of the world
+    without = standard_sets(mesh).facets
     for name in ("inferior", "superior"):
         np.testing.assert_array_equal(without[name], with_box[name])
-    for name in ("left", "right", "posterior", "anterior"):  # what is outermost along the world's axes
+    # what is outermost along the world's axes
+    for name in ("left", "right", "posterior", "anterior"):
         assert 0 < len(without[name]) < len(with_box[name])
 
 
@@ -99,13 +108,19 @@ def test_the_surface_of_a_mask_is_the_boundary_off_the_box():
     lower = part_of(mesh, mesh.points[mesh.cells].mean(axis=1)[:, 2] < 1.5)
     sets = standard_sets(lower, box_of(image)).facets
     assert (lower.points[nodes_of(lower, sets["mask_surface"])][:, 2] > -0.5).all()
-    np.testing.assert_allclose(outward_areas(lower, sets["inferior"]).sum(axis=0), [0.0, 0.0, -16.0])
-    assert len(sets["boundary"]) == sum(len(rows) for name, rows in sets.items() if name != "boundary")
+    np.testing.assert_allclose(
+        outward_areas(lower, sets["inferior"]).sum(axis=0), [0.0, 0.0, -16.0]
+    )
+    assert len(sets["boundary"]) == sum(
+        len(rows) for name, rows in sets.items() if name != "boundary"
+    )
 
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_a_ball_within_the_box_has_sides_by_its_own_extent(n):
-    """Caps a tenth of it deep, each a tenth of a ball's surface, which face their side; no facet is on two."""
+    """Caps a tenth of it deep, each a tenth of a ball's surface, which face their side; no facet
+    is on two.
+    """
     mesh = ball_mesh(n)
     box = Box((60,) * n, np.eye(n + 1))
     sets = standard_sets(mesh, box).facets
@@ -120,8 +135,11 @@ def test_a_ball_within_the_box_has_sides_by_its_own_extent(n):
             areas = area_vectors(mesh, sets[name])
             assert (sign * areas[:, axis] >= np.abs(areas).max(axis=1)).all()
             fraction = np.sqrt((areas**2).sum(axis=1)).sum() / size
-            assert fraction == pytest.approx(0.1 if n == 3 else np.arccos(0.8) / np.pi, rel=0.35)  # by whole facets
-            assert (sign * (mesh.points[nodes_of(mesh, sets[name])][:, axis] - centre) > 0.6 * 20.0).all()
+            # by whole facets
+            assert fraction == pytest.approx(0.1 if n == 3 else np.arccos(0.8) / np.pi, rel=0.35)
+            assert (
+                sign * (mesh.points[nodes_of(mesh, sets[name])][:, axis] - centre) > 0.6 * 20.0
+            ).all()
     rows = np.concatenate(list(sets.values()))
     assert len(np.unique(rows, axis=0)) == len(rows)
 
@@ -153,14 +171,19 @@ def test_interfaces_are_held_by_the_smaller_label():
         assert {tuple(row) for row in nodes} == zero & one
         assert len(nodes) == len(zero & one)
         for label in (0, 1):
-            np.testing.assert_array_equal(model.sets.cells[f"label_{label}"], np.flatnonzero(labels == label))
+            np.testing.assert_array_equal(
+                model.sets.cells[f"label_{label}"], np.flatnonzero(labels == label)
+            )
 
 
 def test_three_labels_have_an_interface_for_each_pair_that_touches():
     mesh = tetopt.lattice_mesh(tetopt.Image(np.zeros((6, 4))), blocks=(3, 1))
     labels = np.floor((mesh.points[mesh.cells].mean(axis=1)[:, 0] + 0.5) / 2.0).astype(int) * 5
     sets = standard_sets(mesh, labels=labels)
-    assert [name for name in sets.facets if "interface" in name] == ["interface_0_5", "interface_5_10"]
+    assert [name for name in sets.facets if "interface" in name] == [
+        "interface_0_5",
+        "interface_5_10",
+    ]
     assert list(sets.cells) == ["label_0", "label_5", "label_10"]
 
 
@@ -176,7 +199,9 @@ def test_labels_that_are_none(labels):
 def requested(text, n=3, mean=None):
     model = sample_model(n)
     base = standard_sets(model.mesh)
-    return model.mesh, with_requested(model.mesh, base, [text], model.cell_data["mean"] if mean is None else mean)
+    return model.mesh, with_requested(
+        model.mesh, base, [text], model.cell_data["mean"] if mean is None else mean
+    )
 
 
 def test_below_is_the_largest_connected_part_and_its_surface():
@@ -266,12 +291,18 @@ def test_sets_on_the_boundary_are_carried_to_an_improved_mesh():
     image = sample_image(3)
     after = tetopt.optimize(image, model.mesh, boundary="fixed", iterations=3).mesh
     assert (after.points != model.mesh.points).any()
-    sets = Sets({"skin": boundary_rows(model.mesh), "inner": model.sets.facets["interface_0_1"]}, {"all": np.arange(9)})
+    sets = Sets(
+        {"skin": boundary_rows(model.mesh), "inner": model.sets.facets["interface_0_1"]},
+        {"all": np.arange(9)},
+    )
     survivors = surviving_sets(model.mesh, sets, after).facets
     assert "inner" not in survivors
     assert surviving_sets(model.mesh, sets, after).cells == {}
     places = [
-        {frozenset(map(tuple, corners)) for corners in mesh.points[facet_triples(mesh.cells, rows)].tolist()}
+        {
+            frozenset(map(tuple, corners))
+            for corners in mesh.points[facet_triples(mesh.cells, rows)].tolist()
+        }
         for mesh, rows in ((model.mesh, sets.facets["skin"]), (after, survivors["skin"]))
     ]
     assert places[0] == places[1]
@@ -281,7 +312,9 @@ def test_sets_of_a_mesh_join_the_standard_ones():
     mesh = sample_model(3).mesh
     standard = standard_sets(mesh, box_of(sample_image(3)))
     some = standard.facets["left"][:3]
-    own = Sets({"left": some, "right": standard.facets["right"], "skin": some}, {"Boundary": np.arange(4)})
+    own = Sets(
+        {"left": some, "right": standard.facets["right"], "skin": some}, {"Boundary": np.arange(4)}
+    )
     merged, renamed = merged_sets(standard, own)
     assert renamed == {"left": "left_2", "Boundary": "Boundary_2"}
     assert set(merged.facets) == {*standard.facets, "left_2", "skin"}

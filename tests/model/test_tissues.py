@@ -15,7 +15,9 @@ def owner(merge):
     """The group's name of each label."""
     groups = groups_of(merge)
     names = {group.label: group.name for group in groups}
-    return {label: names[number] for label, number in _members(groups, {}, np.arange(3000))[0].items()}
+    return {
+        label: names[number] for label, number in _members(groups, {}, np.arange(3000))[0].items()
+    }
 
 
 def test_ranges_rest_and_zero():
@@ -32,7 +34,9 @@ def test_members_by_name():
     names = {2: "Left White", 41: "Right White", 3: "cortex", 42: "cortex"}
     merged = merge_labels(ROW, "white=Left White, right white; grey=cortex; 0:air=511", names)
     assert merged.labels.data.tolist() == [[0.0, 1.0, 1.0, 2.0, 2.0, 0.0]]
-    with pytest.raises(InputError, match='`merge`: label "cortx": no label has this name; did you mean cortex'):
+    with pytest.raises(
+        InputError, match='`merge`: label "cortx": no label has this name; did you mean cortex'
+    ):
         merge_labels(ROW, "grey=cortx", names)
 
 
@@ -102,7 +106,10 @@ def test_rows_of_groups(tmp_path, text):
         ("white,2\ngrey,", 'groups.csv: expected rows .* got "grey,"'),
         ("white,2,41\ngrey,41", "`merge`: label 41 is in two groups, white and grey"),
         ("name,labels\n", "groups.csv: `merge`: expected NAME=LABELS"),
-        ("5:white,2\n5:grey,41", "groups.csv: `merge`: expected a different label for each group, got 5 twice"),
+        (
+            "5:white,2\n5:grey,41",
+            "groups.csv: `merge`: expected a different label for each group, got 5 twice",
+        ),
     ],
 )
 def test_other_rows_are_refused(tmp_path, text, match):
@@ -124,7 +131,8 @@ def test_presets_number_tissues_as_simnibs_does():
 
 def test_presets_agree_on_what_both_have():
     aseg, synthseg = owner("aseg"), owner("synthseg")
-    both = (aseg.keys() & synthseg.keys()) - set(range(130, 200))  # training maps have other structures there
+    # training maps have other structures there
+    both = (aseg.keys() & synthseg.keys()) - set(range(130, 200))
     assert len(both) > 80
     assert {label: aseg[label] for label in both} == {label: synthseg[label] for label in both}
     bones = {label: synthseg[label] for label in (502, 507, 508, 509, 511, 514, 515, 516, 530)}
@@ -132,4 +140,7 @@ def test_presets_agree_on_what_both_have():
 
 
 def test_labels_that_share_a_name_are_the_smallest():
-    assert numbers_by_name({41: "white", 2: "white", 3: "grey", 77: "white", 5: "White"}) == {41: 2, 77: 2}
+    assert numbers_by_name({41: "white", 2: "white", 3: "grey", 77: "white", 5: "White"}) == {
+        41: 2,
+        77: 2,
+    }

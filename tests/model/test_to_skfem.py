@@ -30,7 +30,11 @@ def outward(model, rows):
     """Unit normals of the facets (K, 2) out of their cells, (K, n)."""
     corners = model.mesh.points[facet_triples(model.mesh.cells, rows)]
     edges = corners[:, 1:] - corners[:, :1]
-    normals = np.cross(edges[:, 0], edges[:, 1]) if model.mesh.ndim == 3 else edges[:, 0, ::-1] * [1.0, -1.0]
+    normals = (
+        np.cross(edges[:, 0], edges[:, 1])
+        if model.mesh.ndim == 3
+        else edges[:, 0, ::-1] * [1.0, -1.0]
+    )
     return normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
@@ -47,7 +51,9 @@ def test_sets_are_boundaries_and_subdomains_of_their_names(model):
     assert list(mesh.boundaries) == list(model.sets.facets)
     for name, rows in model.sets.facets.items():
         nodes = mesh.facets[:, mesh.boundaries[name]].T
-        assert np.array_equal(np.sort(nodes, axis=1), np.sort(facet_triples(model.mesh.cells, rows), axis=1)), name
+        assert np.array_equal(
+            np.sort(nodes, axis=1), np.sort(facet_triples(model.mesh.cells, rows), axis=1)
+        ), name
     assert list(mesh.subdomains) == list(model.sets.cells)
     for name, cells in model.sets.cells.items():
         assert np.array_equal(mesh.subdomains[name], cells), name
@@ -78,7 +84,8 @@ def test_a_model_without_sets_has_none():
 
 def test_what_cannot_be_had_is_said(monkeypatch):
     with pytest.raises(
-        InputError, match=r"^to_skfem: expected linear cells, got order 2; .*P2 elements in scikit-fem$"
+        InputError,
+        match=r"^to_skfem: expected linear cells, got order 2; .*P2 elements in scikit-fem$",
     ):
         sample_model()._replace(order=2).to_skfem()
     monkeypatch.setitem(sys.modules, "skfem", None)

@@ -1,8 +1,9 @@
-"""Runs in parts that are killed, interrupted or out of disk on dask's workers: the same bytes (`make test-parts`).
+"""Runs in parts that are killed, interrupted or out of disk on dask's workers: the same bytes
+(`make test-parts`).
 
-python tests/parts/campaign.py [NODES [PARTS]]: the MNI152 T1 by `tetopt mesh`, 8000 nodes in 4 parts or more. Prints a
-table, and ends with 1 where a row of it is not as it should be.
-What goes wrong is done from outside: tetopt knows nothing of it.
+python tests/parts/campaign.py [NODES [PARTS]]: the MNI152 T1 by `tetopt mesh`, 8000 nodes in 4
+parts or more. Prints a table, and ends with 1 where a row of it is not as it should be. What goes
+wrong is done from outside: tetopt knows nothing of it.
 """
 
 import contextlib
@@ -39,24 +40,46 @@ class Run:
 
     def __init__(self, out, size, *options, texts=None):
         """`texts` is the folder of what it says, if not the mesh's."""
-        self.out, self.mark, self.text = out, secrets.token_hex(8), (texts or out.parent) / f"{out.stem}.txt"
-        words = ["mesh", mni_path("t1"), "-o", out, "--nodes", size[0], "--parts", size[1], *options]
+        self.out, self.mark, self.text = (
+            out,
+            secrets.token_hex(8),
+            (texts or out.parent) / f"{out.stem}.txt",
+        )
+        words = [
+            "mesh",
+            mni_path("t1"),
+            "-o",
+            out,
+            "--nodes",
+            size[0],
+            "--parts",
+            size[1],
+            *options,
+        ]
         with self.text.open("ab") as stream:
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "tetopt", *map(str, words)],
-                stdout=stream, stderr=stream, env=os.environ | {MARK: self.mark},
-            )  # fmt: skip
+                stdout=stream,
+                stderr=stream,
+                env=os.environ | {MARK: self.mark},
+            )
 
     @property
     def work(self):
         return self.out.with_name(self.out.name + ".work")
 
     def round(self):
-        """The number of the round whose parts are under way, and how many of it are done; None before and after."""
+        """The number of the round whose parts are under way, and how many of it are done; None
+        before and after.
+        """
         numbers = [int(path.name.partition("-")[2]) for path in self.work.glob("round-*")]
         if not numbers or not (folder := self.work / f"round-{max(numbers)}").is_dir():
             return None
-        return max(numbers), len(list(folder.glob("done-*.npz"))), len(list(folder.glob("part-*.npz")))
+        return (
+            max(numbers),
+            len(list(folder.glob("done-*.npz"))),
+            len(list(folder.glob("part-*.npz"))),
+        )
 
     def wait_for(self, number, n_done=1):
         """Until in a round so many parts are done and others are not; whether that was seen."""
@@ -144,7 +167,10 @@ def client_killed(folder, size, n_rounds, expected):
     first.end()
     seconds, before = gone_after(first), first.round()
     second = Run(folder / "client.vtu", size, "--workers", "2")
-    words = f"with {before[1]} of {before[2]} parts of round {before[0]} done, all gone in {seconds:.1f} s"
+    words = (
+        f"with {before[1]} of {before[2]} parts of round {before[0]} done, all gone in "
+        f"{seconds:.1f} s"
+    )
     wrong += checked(second, expected)
     rounds = re.findall(r"^(?:round (\d+)|measuring)", second.text.read_text(), re.M)
     if rounds.count(str(middle)) != 2 or rounds.count("1") != 1:
@@ -153,7 +179,9 @@ def client_killed(folder, size, n_rounds, expected):
 
 
 def disk_full(folder, size, n_rounds, expected):
-    """The disk of the folder of work filled in a round, emptied, and a run that goes on; only where one may mount."""
+    """The disk of the folder of work filled in a round, emptied, and a run that goes on; only
+    where one may mount.
+    """
     disk = folder / "disk"
     disk.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", f"size={FREE_BYTES:.0f}", "tmpfs", disk]
@@ -171,7 +199,9 @@ def disk_full(folder, size, n_rounds, expected):
             wrong.append(f"said: {first.last_line()}")
         gone_after(first)
         filler.unlink()
-        wrong += [] if first.work.exists() and not first.out.exists() else ["something half-written"]
+        wrong += (
+            [] if first.work.exists() and not first.out.exists() else ["something half-written"]
+        )
         wrong += checked(Run(disk / "full.vtu", size, "--workers", "2", texts=folder), expected)
         return "in round 2: one line, nothing lost", wrong
     finally:
@@ -197,7 +227,11 @@ def campaign(folder, size):
     run = Run(folder / "one.vtu", size, "--workers", "1")
     wrong, expected = checked(run, None), bytes_of(run.out)
     n_rounds = int(re.findall(r"round \d+ of (\d+)", run.text.read_text())[-1])
-    yield "1 worker", f"{time.monotonic() - begin:.0f} s, {n_rounds} rounds, sha256 {str(expected)[:12]}", wrong
+    yield (
+        "1 worker",
+        f"{time.monotonic() - begin:.0f} s, {n_rounds} rounds, sha256 {str(expected)[:12]}",
+        wrong,
+    )
     begin = time.monotonic()
     wrong = checked(Run(folder / "two.vtu", size, "--workers", "2"), expected)
     yield "2 workers", f"{time.monotonic() - begin:.0f} s, the same bytes", wrong
@@ -227,6 +261,7 @@ def main(size):
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where a shell runs this in the background
+    # ignored where a shell runs this in the background
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     numbers = [int(word) for word in sys.argv[1:]]
     sys.exit(main((*numbers, *(8000, 4)[len(numbers) :])))

@@ -11,6 +11,8 @@ def image():
 
 @pytest.fixture(scope="session")
 def run(image, tmp_path_factory):
-    """A run of 1500 nodes in 4 parts, or 9, of four rounds: what came of it, and its parts by round."""
+    """A run of 1500 nodes in 4 parts, or 9, of four rounds: what came of it, and its parts by
+    round.
+    """
     with one_thread():
         return recorded_run(tmp_path_factory.mktemp("run"), image, request(1500, 4, iterations=12))

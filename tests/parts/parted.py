@@ -14,13 +14,17 @@ from tetopt.parts.rounds import PartsRequest, mesh_in_parts
 from tetopt.parts.work import done_path, load_arrays, save_volume
 
 # Oblique, sheared, anisotropic and mirrored.
-SKEW = np.array([[-0.9, 0.3, 0.2, -7.0], [-0.25, 1.1, 0.1, 3.0], [0.0, 0.4, 1.6, 11.0], [0.0, 0.0, 0.0, 1.0]])
+SKEW = np.array(
+    [[-0.9, 0.3, 0.2, -7.0], [-0.25, 1.1, 0.1, 3.0], [0.0, 0.4, 1.6, 11.0], [0.0, 0.0, 0.0, 1.0]]
+)
 
 
 def balls(shape, affine=None, seed=3):
     """Two balls of whole numbers, and a little noise."""
     index = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, s) for s in shape], indexing="ij"), -1)
-    large, small = (np.linalg.norm(index - place, axis=-1) for place in ([0.0, 0.0, 0.0], [0.2, 0.1, -0.1]))
+    large, small = (
+        np.linalg.norm(index - place, axis=-1) for place in ([0.0, 0.0, 0.0], [0.2, 0.1, -0.1])
+    )
     data = 100 * (large < 0.75) + 60 * (small < 0.35)
     return tetopt.Image(data + np.random.default_rng(seed).integers(0, 9, shape), affine)
 
@@ -45,7 +49,9 @@ class Recorded(NamedTuple):
 
 
 def request(nodes, n_parts, **changes):
-    asked_for = PartsRequest(nodes, n_parts, GRADED_K_D, GRADED_ITERATIONS, 3.0, 12.0, 5e-4, None, "of this test")
+    asked_for = PartsRequest(
+        nodes, n_parts, GRADED_K_D, GRADED_ITERATIONS, 3.0, 12.0, 5e-4, None, "of this test"
+    )
     return asked_for._replace(**changes)
 
 
@@ -56,7 +62,9 @@ def recording(rounds):
         rounds.append([])
         for name in names:
             yield work_on(name)
-            rounds[-1].append(Recorded(*load_arrays(Path(name)), *load_arrays(done_path(Path(name)))))
+            rounds[-1].append(
+                Recorded(*load_arrays(Path(name)), *load_arrays(done_path(Path(name))))
+            )
 
     return runner
 

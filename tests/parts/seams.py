@@ -1,10 +1,12 @@
-"""Whether the seams of a run in parts are seen in its mesh, beside one in one piece: `python tests/parts/seams.py`.
+"""Whether the seams of a run in parts are seen in its mesh, beside one in one piece: `python
+tests/parts/seams.py`.
 
-A seam layer is where cells had a node that parts shared in a round, which stayed where it was then. The error of each
-voxel there, its squared deviation from its cell's mean, is summed up in both runs' meshes, and rho is averaged over the
-cells of its voxels. A layer of whole cells of one mesh is where that mesh has large ones, as a voxel is sooner in a
-large cell: E_D over the other mesh's is more than elsewhere by that alone. So what it is beside seams stands beside
-what it is in layers of the same kind, along planes where no seam ever was.
+A seam layer is where cells had a node that parts shared in a round, which stayed where it was then.
+The error of each voxel there, its squared deviation from its cell's mean, is summed up in both
+runs' meshes, and rho is averaged over the cells of its voxels. A layer of whole cells of one mesh
+is where that mesh has large ones, as a voxel is sooner in a large cell: E_D over the other mesh's
+is more than elsewhere by that alone. So what it is beside seams stands beside what it is in layers
+of the same kind, along planes where no seam ever was.
 """
 
 import sys
@@ -36,11 +38,15 @@ class Layer(NamedTuple):
 
 
 def seam_layers(image, rounds):
-    """Voxels of cells with a node that parts shared in a round and left where it was, (R,) and the image's shape."""
+    """Voxels of cells with a node that parts shared in a round and left where it was, (R,) and
+    the image's shape.
+    """
     result = []
     for parts in rounds:
         if parts[0].text["kind"] == "improve":
-            mesh = joined([part.after["ticks"] for part in parts], [part.after["cells"] for part in parts])
+            mesh = joined(
+                [part.after["ticks"] for part in parts], [part.after["cells"] for part in parts]
+            )
             beside = shared_nodes(Shared(*mesh))[mesh.cells].any(axis=1)
             points = image.to_world(mesh.ticks * 2.0 ** -parts[0].text["settings"]["bits"])
             result.append(beside[cell_of_voxel(image, tetopt.Mesh(points, mesh.cells))])
@@ -68,7 +74,10 @@ def layer_of(image, mesh, is_there):
     count = np.maximum(np.bincount(owner, minlength=len(mesh.cells)), 1)
     mean = np.bincount(owner, values, len(mesh.cells)) / count
     owner, values = owner[is_there.ravel()], values[is_there.ravel()]
-    return Layer(float(((values - mean[owner]) ** 2).sum()), float(rho(mesh.points, mesh.cells)[owner].mean()))
+    return Layer(
+        float(((values - mean[owner]) ** 2).sum()),
+        float(rho(mesh.points, mesh.cells)[owner].mean()),
+    )
 
 
 def beside_one_piece(image, mesh, one, is_there):
@@ -89,7 +98,9 @@ def compared(image, nodes, n_parts):
     seams = seam_layers(image, rounds)
     others = other_layers(image, mesh, rounds)
     layers = {f"seams of round {number}": layer for number, layer in enumerate(seams, 1)}
-    layers |= {f"other planes, {shift}": layer for shift, layer in zip(OTHER_SHIFTS, others, strict=True)}
+    layers |= {
+        f"other planes, {shift}": layer for shift, layer in zip(OTHER_SHIFTS, others, strict=True)
+    }
     rhos = [rho(each.points, each.cells) for each in (mesh, one.mesh)]
     return {
         "nodes": len(mesh.points),

@@ -1,4 +1,6 @@
-"""Runs in parts that end on the way, by whatever, and go on: the same bits as in one go, or one clear line."""
+"""Runs in parts that end on the way, by whatever, and go on: the same bits as in one go, or one
+clear line.
+"""
 
 import errno
 import shutil
@@ -56,8 +58,18 @@ def run(folder, runner=in_turn, asked_for=REQUEST, **options):
 def content(parted):
     """All of a result but the times."""
     result = parted.result
-    arrays = [result.mesh.points, result.mesh.cells, result.initial.points, parted.part, *parted.fields.values()]
-    return [array.tobytes() for array in arrays], [row._replace(seconds=0.0) for row in result.history], result.ended
+    arrays = [
+        result.mesh.points,
+        result.mesh.cells,
+        result.initial.points,
+        parted.part,
+        *parted.fields.values(),
+    ]
+    return (
+        [array.tobytes() for array in arrays],
+        [row._replace(seconds=0.0) for row in result.history],
+        result.ended,
+    )
 
 
 def test_it_does_not_matter_in_which_order_parts_are_run(folder, in_one_go):
@@ -69,7 +81,9 @@ def test_it_does_not_matter_in_which_order_parts_are_run(folder, in_one_go):
 def test_a_run_that_ends_after_each_part_goes_on(folder, in_one_go, monkeypatch):
     made, ends, result = [], 0, None
     improved = part._improved
-    monkeypatch.setattr(part, "_improved", lambda *arguments: made.append(1) or improved(*arguments))
+    monkeypatch.setattr(
+        part, "_improved", lambda *arguments: made.append(1) or improved(*arguments)
+    )
     while result is None:
         try:
             result = run(folder, ending_at_new)
@@ -91,13 +105,16 @@ def ending_at_new(names):
 
 @pytest.mark.deep
 def test_a_disk_that_is_full_at_each_file_once_loses_nothing(folder, in_one_go, monkeypatch):
-    """Each file of the run fails to be written the first time; so does each step between two of them."""
+    """Each file of the run fails to be written the first time; so does each step between two of
+    them.
+    """
     full, result = set(), None
     write = work.written_whole
 
     def written_whole(path, size):
         is_state = path.name == work.STATE_NAME and path.exists()
-        key = (path, path.stat().st_mtime_ns if is_state else 0)  # a state is written again in each round
+        # a state is written again in each round
+        key = (path, path.stat().st_mtime_ns if is_state else 0)
         if key not in full:
             full.add(key)
             raise OSError(errno.ENOSPC, "No space left on device", str(path))
@@ -117,7 +134,9 @@ def test_a_disk_that_is_full_at_each_file_once_loses_nothing(folder, in_one_go, 
 
 def test_a_run_that_is_stopped_gives_the_last_round_and_goes_on(folder, in_one_go):
     parts = []
-    first = run(folder, is_over=lambda: len(parts) >= 6, watch=lambda now, history: parts.append(now))
+    first = run(
+        folder, is_over=lambda: len(parts) >= 6, watch=lambda now, history: parts.append(now)
+    )
     assert (first.result.ended, first.result.history[-1].iteration) == ("stopped", 0)
     # Again at once, where what the end of the first left is not taken for parts of the round.
     second = run(folder, is_over=lambda: True)
@@ -125,7 +144,9 @@ def test_a_run_that_is_stopped_gives_the_last_round_and_goes_on(folder, in_one_g
     assert content(run(folder)) == in_one_go
 
 
-def test_a_run_that_ends_when_it_has_converged_does_not_go_on_with_rounds(folder, voxels, tmp_path_factory):
+def test_a_run_that_ends_when_it_has_converged_does_not_go_on_with_rounds(
+    folder, voxels, tmp_path_factory
+):
     lenient = REQUEST._replace(k_D=0.0, tolerance=0.5)
     other = tmp_path_factory.mktemp("other")
     save_volume(other, voxels)
@@ -192,14 +213,19 @@ def test_what_came_of_a_part_is_made_again_if_it_is_damaged(copy, in_one_go):
 def test_a_damaged_state_is_said_in_a_line(copy, name, way):
     damaged(copy / name, way)
     with pytest.raises(
-        InputError, match=rf"^[^\n]*{name}: the file is damaged [^\n]*; remove {copy} and run this again$"
+        InputError,
+        match=rf"^[^\n]*{name}: the file is damaged [^\n]*; remove {copy} and run this again$",
     ):
         run(copy)
 
 
 @pytest.mark.deep
 def test_no_bit_of_a_file_of_arrays_changes_unseen(tmp_path):
-    path, arrays, text = tmp_path / "a.npz", {"ticks": np.arange(6), "cells": np.eye(2)}, {"kind": "measure"}
+    path, arrays, text = (
+        tmp_path / "a.npz",
+        {"ticks": np.arange(6), "cells": np.eye(2)},
+        {"kind": "measure"},
+    )
     work.save_arrays(path, arrays, text)
     raw = path.read_bytes()
     n_seen = 0
@@ -225,7 +251,10 @@ def test_a_state_of_other_words_is_said_in_a_line(folder, words):
 
 
 def test_a_folder_of_another_run_is_refused(folder):
-    with locked(folder), pytest.raises(InputError, match=f"^{folder}: another run is writing there [^\n]*$"):
+    with (
+        locked(folder),
+        pytest.raises(InputError, match=f"^{folder}: another run is writing there [^\n]*$"),
+    ):
         run(folder)
 
 

@@ -1,4 +1,6 @@
-"""A part of a mesh on its own box of voxels: it is measured as in the whole, and leaves what it shares as it was."""
+"""A part of a mesh on its own box of voxels: it is measured as in the whole, and leaves what it
+shares as it was.
+"""
 
 from itertools import pairwise
 
@@ -48,14 +50,26 @@ def rounds_of(run, kind):
 
 
 def whole_mesh(parts, key):
-    return joined([getattr(part, key)["ticks"] for part in parts], [getattr(part, key)["cells"] for part in parts])
+    return joined(
+        [getattr(part, key)["ticks"] for part in parts],
+        [getattr(part, key)["cells"] for part in parts],
+    )
 
 
 def measured_whole(image, mesh, settings):
     """A run of the whole mesh in one piece, as it stands, with the normalisation of its parts."""
-    whole = Whole((0, 0, 0), image.shape, settings["bits"], settings["E_G"], settings["squares"], settings["noise"])
+    whole = Whole(
+        (0, 0, 0),
+        image.shape,
+        settings["bits"],
+        settings["E_G"],
+        settings["squares"],
+        settings["noise"],
+    )
     points = image.to_world(mesh.ticks * 2.0 ** -settings["bits"])
-    return Run(plain(image), tetopt.Mesh(points, mesh.cells), settings["k_D"], is_graded=True, whole=whole)
+    return Run(
+        plain(image), tetopt.Mesh(points, mesh.cells), settings["k_D"], is_graded=True, whole=whole
+    )
 
 
 def slabs_done(folder, image, ticks, cells, kind, bits):
@@ -66,7 +80,12 @@ def slabs_done(folder, image, ticks, cells, kind, bits):
     round_folder(folder, 0).mkdir()
     for number, piece in enumerate(pieces(Shared(ticks, cells, np.digitize(place, [0.3, 0.6])))):
         path = round_folder(folder, 0) / f"part-{number}.npz"
-        text = {"kind": kind, "settings": settings._asdict(), "iterations": (1, 0), "nodes": len(piece.ticks)}
+        text = {
+            "kind": kind,
+            "settings": settings._asdict(),
+            "iterations": (1, 0),
+            "nodes": len(piece.ticks),
+        }
         save_arrays(path, {"ticks": piece.ticks, "cells": piece.cells}, text)
         work_on(str(path))
         yield piece, *load_arrays(done_path(path))
@@ -92,7 +111,9 @@ def test_ticks_of_a_part_are_those_of_the_whole_to_the_last_one(name, tmp_path):
 
 @pytest.mark.parametrize("name", list(AFFINES))
 def test_a_cell_without_a_voxel_has_the_value_that_it_has_in_the_whole(name, tmp_path):
-    """Also where its middle lies between two voxels, and rounding to even numbers depends on the first one."""
+    """Also where its middle lies between two voxels, and rounding to even numbers depends on the
+    first one.
+    """
     image = balls((12, 10, 11), AFFINES[name])
     mesh = tetopt.lattice_mesh(image, blocks=(8, 8, 8))
     bits = grid_bits(image, mesh.points)
@@ -118,7 +139,9 @@ def test_what_parts_share_stays_node_for_node_and_facet_for_facet(run):
     for parts in rounds_of(run, "improve"):
         for part in parts:
             settings = part.text["settings"]
-            before, after = (seam(each["ticks"], each["cells"], settings) for each in (part.before, part.after))
+            before, after = (
+                seam(each["ticks"], each["cells"], settings) for each in (part.before, part.after)
+            )
             assert before == after
             n_facets += len(before)
     assert n_facets > 1000
@@ -126,7 +149,9 @@ def test_what_parts_share_stays_node_for_node_and_facet_for_facet(run):
 
 def test_nodes_that_are_not_shared_move_and_are_exchanged(run):
     for parts in rounds_of(run, "improve"):
-        before, after = (set(map(tuple, whole_mesh(parts, key).ticks.tolist())) for key in ("before", "after"))
+        before, after = (
+            set(map(tuple, whole_mesh(parts, key).ticks.tolist())) for key in ("before", "after")
+        )
         assert len(before & after) < 0.7 * len(before)
 
 
@@ -140,13 +165,25 @@ def test_each_round_begins_with_the_mesh_that_the_one_before_left(run):
 def test_parts_add_up_to_the_whole(run, image):
     """Voxels exactly, energies and their parts to rounding; of each round."""
     history = run[0].result.history
-    for record, parts in zip(history, [*rounds_of(run, "measure"), *rounds_of(run, "improve")], strict=True):
+    for record, parts in zip(
+        history, [*rounds_of(run, "measure"), *rounds_of(run, "improve")], strict=True
+    ):
         mesh, settings = whole_mesh(parts, "after"), parts[0].text["settings"]
         whole = measured_whole(image, mesh, settings)
         E_G, squares = content_energies(whole.state, whole.content)
         row = whole.record(0, 0.0, False, 0.0)
-        assert sum(part.numbers["n_voxels"] for part in parts) == record.n_voxels == row.n_voxels == image.data.size
-        for name, number in (("E_G", E_G), ("squares", squares), ("E_D", row.E_D), ("E", whole.E())):
+        assert (
+            sum(part.numbers["n_voxels"] for part in parts)
+            == record.n_voxels
+            == row.n_voxels
+            == image.data.size
+        )
+        for name, number in (
+            ("E_G", E_G),
+            ("squares", squares),
+            ("E_D", row.E_D),
+            ("E", whole.E()),
+        ):
             total = sum(part.numbers[name] for part in parts)
             assert total == pytest.approx(number, rel=1e-11), name
         assert record.E_D == pytest.approx(row.E_D, rel=1e-11)
@@ -155,5 +192,8 @@ def test_parts_add_up_to_the_whole(run, image):
 
 
 def test_a_part_sees_its_own_box_of_voxels_alone(run, image):
-    sizes = [np.ptp(part.before["ticks"] >> part.text["settings"]["bits"], axis=0).prod() for part in run[1][1]]
+    sizes = [
+        np.ptp(part.before["ticks"] >> part.text["settings"]["bits"], axis=0).prod()
+        for part in run[1][1]
+    ]
     assert max(sizes) < 0.5 * image.data.size

@@ -15,12 +15,16 @@ UNEVEN = np.random.default_rng(6).uniform(0.1, 1.0, len(PLACES))
 
 
 def shared_mesh(seed, part_of):
-    """A random mesh of a box of whole ticks, and its parts by a function of its centroids (M, 3), 0 to 1."""
+    """A random mesh of a box of whole ticks, and its parts by a function of its centroids (M,
+    3), 0 to 1.
+    """
     rng = np.random.default_rng(seed)
     index, cells = delaunay_box(rng, (14, 12, 11), 60)
     ticks = np.rint(index * 1024).astype(np.int64)
     centroids = (index[cells].mean(axis=1) + 0.5) / (14, 12, 11)
-    return Shared(ticks, cells.astype(np.int64), np.unique(part_of(centroids), return_inverse=True)[1])
+    return Shared(
+        ticks, cells.astype(np.int64), np.unique(part_of(centroids), return_inverse=True)[1]
+    )
 
 
 # Two planes of a chessboard touch in edges and nodes alone; single cells touch anyhow.
@@ -49,27 +53,35 @@ def by_places(ticks, cells):
 def test_parts_are_numbered_without_gaps_and_are_of_equal_weight(counts, shift, weights):
     part = cut(PLACES, weights, counts, shift)
     fractions = np.bincount(part, weights) / weights.sum()
-    # Shifted there is one more along each axis that is divided, and the first and last are `1 - shift` and `shift`.
+    # Shifted there is one more along each axis that is divided, and the first and last are `1 -
+    # shift` and `shift`.
     widths = [
-        np.array([1.0]) if count == 1
-        else np.full(count, 1.0 / count) if shift == 0.0
+        np.array([1.0])
+        if count == 1
+        else np.full(count, 1.0 / count)
+        if shift == 0.0
         else np.array([shift, *[1.0] * (count - 1), 1.0 - shift]) / count
         for count in counts
-    ]  # fmt: skip
+    ]
     expected = np.einsum("i,j,k->ijk", *widths).ravel()
     assert part.shape == (len(PLACES),)
     assert len(fractions) == len(expected)
     # A cell more or less at each of three divisions.
-    np.testing.assert_allclose(fractions, expected, rtol=0.0, atol=3.0 * weights.max() / weights.sum())
+    np.testing.assert_allclose(
+        fractions, expected, rtol=0.0, atol=3.0 * weights.max() / weights.sum()
+    )
 
 
 def test_a_part_is_a_box_of_centroids():
     part = cut(PLACES, UNEVEN, (2, 2, 1), 0.25)
     first = [PLACES[part == k, 0] for k in range(part.max() + 1)]
-    for some in range(0, len(first), 3):  # three along the second axis in each of three along the first
+    # three along the second axis in each of three along the first
+    for some in range(0, len(first), 3):
         assert all(np.ptp(each) > 0.0 for each in first[some : some + 3])
         if some + 3 < len(first):
-            assert max(map(np.max, first[some : some + 3])) <= min(map(np.min, first[some + 3 : some + 6]))
+            assert max(map(np.max, first[some : some + 3])) <= min(
+                map(np.min, first[some + 3 : some + 6])
+            )
 
 
 def test_more_parts_than_cells_are_a_cell_each():

@@ -1,4 +1,6 @@
-"""Rounds of parts: the mesh that comes of them, beside one in one piece, and the same bits however they are run."""
+"""Rounds of parts: the mesh that comes of them, beside one in one piece, and the same bits
+however they are run.
+"""
 
 import time
 
@@ -45,14 +47,18 @@ def test_a_requirement_that_is_violated_is_noticed(run, image):
 
 def test_nodes_that_the_octree_lacks_are_shared_among_the_parts(tmp_path):
     with one_thread():
-        result = recorded_run(tmp_path, balls((20, 18, 16)), request(200, 4, iterations=6))[0].result
+        result = recorded_run(tmp_path, balls((20, 18, 16)), request(200, 4, iterations=6))[
+            0
+        ].result
     assert len(result.initial.points) < 195
     assert len(result.mesh.points) == pytest.approx(200, abs=4)  # each part comes as near as it can
 
 
 def test_no_run_converges_while_nodes_are_exchanged(tmp_path):
     with one_thread():
-        result = recorded_run(tmp_path, balls((20, 18, 16)), request(200, 4, iterations=12, tolerance=1.0))[0].result
+        result = recorded_run(
+            tmp_path, balls((20, 18, 16)), request(200, 4, iterations=12, tolerance=1.0)
+        )[0].result
     assert result.ended == "converged"
     # Nodes are exchanged in the first 8, so that the first round without any is the fourth.
     assert [record.iteration for record in result.history] == [0, 3, 6, 9, 12]
@@ -77,7 +83,9 @@ def test_a_run_in_parts_is_nearly_as_good_as_one_in_one_piece(run, one):
 
 
 def assert_unseen(seams, others, fraction):
-    """Beside seams of any round E_D and rho, beside one piece, are as along any planes, to a fraction of E_D."""
+    """Beside seams of any round E_D and rho, beside one piece, are as along any planes, to a
+    fraction of E_D.
+    """
     (E_D, rho_less), (E_D_others, rho_less_others) = np.mean(seams, axis=0), np.mean(others, axis=0)
     assert E_D < (1.0 + fraction) * E_D_others
     assert rho_less > rho_less_others - 0.001
@@ -86,7 +94,9 @@ def assert_unseen(seams, others, fraction):
 
 
 def test_seams_are_not_seen(run, one, image):
-    """On parts so small chance is some per cent (`seams.py`); if planes stayed in place it would be double."""
+    """On parts so small chance is some per cent (`seams.py`); if planes stayed in place it would
+    be double.
+    """
     mesh = run[0].result.mesh
     seams, others = (
         [beside_one_piece(image, mesh, one.mesh, layer) for layer in layers]
@@ -106,7 +116,11 @@ def test_the_mni152_brain_in_parts_is_that_of_one_piece():
     assert numbers["mean rho"] == pytest.approx(numbers["mean rho of one piece"], abs=0.005)
     layers = numbers["layers"]
     assert_unseen(
-        *([layers[name][1:] for name in layers if name.startswith(kind)] for kind in ("seams", "other")), 0.01
+        *(
+            [layers[name][1:] for name in layers if name.startswith(kind)]
+            for kind in ("seams", "other")
+        ),
+        0.01,
     )
 
 

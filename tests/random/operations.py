@@ -1,8 +1,10 @@
-"""Random operations of the fast engine on small random worlds, with everything checked after each thousand of them.
+"""Random operations of the fast engine on small random worlds, with everything checked after each
+thousand of them.
 
     python tests/random/operations.py --seed 1 --operations 1000000
 
-Weights of shape and image, angle limits and numbers of nodes change at random between them, so that nothing settles.
+Weights of shape and image, angle limits and numbers of nodes change at random between them, so that
+nothing settles.
 """
 
 from __future__ import annotations
@@ -38,7 +40,13 @@ def begun(rng):
         start = tetopt.octree_mesh(content, int(rng.integers(60, 200)))
     except tetopt.InputError:
         return None
-    run = Run(content, start, float(rng.choice([0.1, 0.5, 0.85])), float(rng.uniform(1.0, 4.0)), is_graded=True)
+    run = Run(
+        content,
+        start,
+        float(rng.choice([0.1, 0.5, 0.85])),
+        float(rng.uniform(1.0, 4.0)),
+        is_graded=True,
+    )
     if content.memberships is not None:
         run.give_labels()
     return world, run
@@ -48,7 +56,9 @@ def operate(run, rng, made):
     """One random step; adds to `made` how many operations it was."""
     objective = run.state.objective
     fraction = 10.0 ** rng.uniform(-1.5, 1.5)
-    run.state = run.state._replace(objective=objective._replace(geometry=objective.geometry * fraction))
+    run.state = run.state._replace(
+        objective=objective._replace(geometry=objective.geometry * fraction)
+    )
     if run.n == 3:
         run.keep_min_dihedral(float(rng.choice([0.0, 3.0, 8.0, 12.0, 20.0])))
     run.hope[:] = np.inf
@@ -67,7 +77,9 @@ def operate(run, rng, made):
     elif kind == "moves to interfaces" and run.has_labels:
         run.attract(float(rng.choice([0.0, 4.0, 12.0])))
         made[kind] += int((run.state.complex.ticks != before).any(axis=1).sum())
-    run.state = run.state._replace(objective=run.state.objective._replace(geometry=objective.geometry))
+    run.state = run.state._replace(
+        objective=run.state.objective._replace(geometry=objective.geometry)
+    )
 
 
 def problems(run, is_manifold, n_folds):
@@ -76,17 +88,28 @@ def problems(run, is_manifold, n_folds):
     region, image = content.region, content.image
     wrong = tetopt.check_mesh(
         mesh, image, is_whole=region is None, is_filled=region is None, is_manifold=is_manifold
-    )  # fmt: skip
-    if run.has_labels and len(manifold_problems(mesh, run.state.complex.labels[: run.n_cells])) > n_folds:
+    )
+    if (
+        run.has_labels
+        and len(manifold_problems(mesh, run.state.complex.labels[: run.n_cells])) > n_folds
+    ):
         wrong.append("interfaces became no manifolds")
     state, cells = run.state, run.cells
-    if state.objective.image == 0.0:  # where cells begin uniform: moves leave their sums alone, and say so
+    # where cells begin uniform: moves leave their sums alone, and say so
+    if state.objective.image == 0.0:
         remeasure(state)
-    fresh = build(cells, state.complex.ticks, state.complex.is_frozen, state.objective, state.sides).complex
+    fresh = build(
+        cells, state.complex.ticks, state.complex.is_frozen, state.objective, state.sides
+    ).complex
     for name in ("across", "fluxes", "sums", "E_shape"):
-        if not np.array_equal(getattr(state.complex, name)[: len(cells)], getattr(fresh, name)[: len(cells)]):
+        if not np.array_equal(
+            getattr(state.complex, name)[: len(cells)], getattr(fresh, name)[: len(cells)]
+        ):
             wrong.append(f"{name} differ from those measured afresh")
-    n_voxels, covered = int(state.complex.sums[: len(cells), 0].sum()), int((cell_of_voxel(image, mesh) >= 0).sum())
+    n_voxels, covered = (
+        int(state.complex.sums[: len(cells), 0].sum()),
+        int((cell_of_voxel(image, mesh) >= 0).sum()),
+    )
     if region is None and n_voxels != image.data.size:
         wrong.append(f"{n_voxels} voxels of {image.data.size}")
     if n_voxels != covered:
@@ -95,7 +118,9 @@ def problems(run, is_manifold, n_folds):
 
 
 def operations(seed, n_operations, report=print):
-    """Operations by kind, checks made, what was wrong, in words, and in how many worlds cells of a mask overlap."""
+    """Operations by kind, checks made, what was wrong, in words, and in how many worlds cells of
+    a mask overlap.
+    """
     made, n_checks, faults, overlaps = Counter(), 0, [], 0
     for number in count():
         if made.total() >= n_operations:
@@ -106,7 +131,11 @@ def operations(seed, n_operations, report=print):
         world, run = pair
         first = run.mesh()
         is_manifold = not manifold_problems(first)
-        n_folds = len(manifold_problems(first, run.state.complex.labels[: run.n_cells])) if run.has_labels else 0
+        n_folds = (
+            len(manifold_problems(first, run.state.complex.labels[: run.n_cells]))
+            if run.has_labels
+            else 0
+        )
         end, checked = made.total() + min(WORLD_OPERATIONS, n_operations // 5), made.total()
         for step in range(400):
             operate(run, rng, made)
@@ -114,11 +143,17 @@ def operations(seed, n_operations, report=print):
             if is_last or made.total() - checked >= CHECKED_EVERY:
                 n_checks, checked = n_checks + 1, made.total()
                 wrong = problems(run, is_manifold, n_folds)
-                if world.mask is not None and wrong and all(words.startswith(OVERLAP) for words in wrong):
+                if (
+                    world.mask is not None
+                    and wrong
+                    and all(words.startswith(OVERLAP) for words in wrong)
+                ):
                     overlaps += 1
                     break
                 if wrong:
-                    faults.append(f"world {number} ({world.words}), step {step}: {'; '.join(wrong)}")
+                    faults.append(
+                        f"world {number} ({world.words}), step {step}: {'; '.join(wrong)}"
+                    )
                     report(faults[-1], flush=True)
                     break
             if is_last:
@@ -127,7 +162,9 @@ def operations(seed, n_operations, report=print):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--operations", type=int, default=1_000_000)
     options = parser.parse_args()
@@ -135,9 +172,12 @@ def main():
     made, n_checks, faults, overlaps = operations(options.seed, options.operations)
     seconds = time.perf_counter() - begin
     print(
-        f"seed {options.seed}: {made.total()} operations in {seconds:.0f} s, {n_checks} checks, {len(faults)} faults,"
+        f"seed {options.seed}: {made.total()} operations in {seconds:.0f} s, {n_checks} checks, "
+        f"{len(faults)} faults,"
     )
-    print(f"  {overlaps} worlds with overlaps; " + ", ".join(f"{made[kind]} {kind}" for kind in KINDS))
+    print(
+        f"  {overlaps} worlds with overlaps; " + ", ".join(f"{made[kind]} {kind}" for kind in KINDS)
+    )
     return 1 if faults else 0
 
 

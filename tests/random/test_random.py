@@ -1,4 +1,6 @@
-"""A small part of what `make test-random` runs: random worlds, whose meshes must meet the requirements."""
+"""A small part of what `make test-random` runs: random worlds, whose meshes must meet the
+requirements.
+"""
 
 import numpy as np
 import pytest
@@ -13,12 +15,19 @@ pytestmark = pytest.mark.full
 
 @pytest.mark.parametrize("seed", [11, 36])
 def test_no_node_leaves_a_box_that_a_mask_touches(seed):
-    """Sheared, flipped, with thick slices: there nodes slid on the level's continuation, up to 2.6 voxels away."""
+    """Sheared, flipped, with thick slices: there nodes slid on the level's continuation, up to
+    2.6 voxels away.
+    """
     rng = np.random.default_rng([19, seed])
     world = random_world(rng, needs_mask=True)
     nodes, k_D = int(rng.integers(80, 250)), float(rng.choice([0.02, 0.2, 0.85, 0.95]))
     result = tetopt.mesh_image(world.content(), nodes, iterations=6, k_D=k_D)
-    assert tetopt.check_mesh(result.mesh, world.image, is_whole=False, is_filled=False, is_manifold=False) == []
+    assert (
+        tetopt.check_mesh(
+            result.mesh, world.image, is_whole=False, is_filled=False, is_manifold=False
+        )
+        == []
+    )
     assert "box" not in result.violated
 
 
@@ -27,7 +36,10 @@ def test_operations_leave_a_mesh_and_exact_sums():
     assert faults == []
     assert made.total() >= 5_000
     assert n_checks >= 3
-    assert all(made[kind] > 0 for kind in ("moves", "flips", "splits and collapses", "lifts", "moves to interfaces"))
+    assert all(
+        made[kind] > 0
+        for kind in ("moves", "flips", "splits and collapses", "lifts", "moves to interfaces")
+    )
 
 
 def test_runs_meet_their_requirements_or_say_so():

@@ -1,4 +1,6 @@
-"""Random images, masks and labels on random grids: sheared, flipped, with thick slices; one seed, one world."""
+"""Random images, masks and labels on random grids: sheared, flipped, with thick slices; one
+seed, one world.
+"""
 
 from __future__ import annotations
 
@@ -30,13 +32,17 @@ class World(NamedTuple):
 
 
 def random_affine(rng, n):
-    """Voxels to mm: axes permuted and flipped, mostly turned and sheared, up to four times as thick as wide."""
+    """Voxels to mm: axes permuted and flipped, mostly turned and sheared, up to four times as
+    thick as wide.
+    """
     steps = rng.uniform(0.5, 2.0) * rng.uniform(0.5, 2.0, n)
     matrix = np.eye(n)[rng.permutation(n)] * rng.choice([-1.0, 1.0], n)
     if rng.random() < 0.7:
         matrix = matrix @ np.linalg.qr(rng.normal(size=(n, n)))[0]
     if rng.random() < 0.6:
-        matrix = matrix @ (np.eye(n) + np.triu(rng.uniform(-1.2, 1.2, (n, n)), 1)[rng.permutation(n)])
+        matrix = matrix @ (
+            np.eye(n) + np.triu(rng.uniform(-1.2, 1.2, (n, n)), 1)[rng.permutation(n)]
+        )
         if abs(np.linalg.det(matrix)) < 0.2:  # a grid so flat has no voxels to speak of
             matrix = np.eye(n) + np.triu(rng.uniform(-1.2, 1.2, (n, n)), 1)
     affine = np.eye(n + 1)
@@ -116,13 +122,23 @@ def random_world(rng, n=None, largest=22, needs_mask=False, needs_labels=False):
     affine = random_affine(rng, n)
     kind = str(rng.choice(KINDS_OF_IMAGE))
     image = tetopt.Image(random_data(rng, shape, kind), affine)
-    more = [tetopt.Image(random_data(rng, shape, "smooth"), affine) for _ in range(int(rng.random() < 0.2))]
+    more = [
+        tetopt.Image(random_data(rng, shape, "smooth"), affine)
+        for _ in range(int(rng.random() < 0.2))
+    ]
     of_mask = str(rng.choice(KINDS_OF_MASK[2:] if needs_mask else KINDS_OF_MASK))
     mask = None
     if of_mask != "none" and (inside := random_mask(rng, shape, of_mask)).sum() > 200:
         mask = tetopt.Image(1.0 * inside, affine)
-    labels = tetopt.Image(random_labels(rng, shape), affine) if needs_labels or rng.random() < 0.35 else None
-    if labels is not None and len(np.unique(labels.data if mask is None else labels.data[inside])) < 2:
+    labels = (
+        tetopt.Image(random_labels(rng, shape), affine)
+        if needs_labels or rng.random() < 0.35
+        else None
+    )
+    if (
+        labels is not None
+        and len(np.unique(labels.data if mask is None else labels.data[inside])) < 2
+    ):
         labels = None
     words = f"{n}-D {shape} {kind}, mask {of_mask if mask is not None else 'none'}"
     words += f", {1 + len(more)} contrasts" + ("" if labels is None else ", labels")

@@ -1,4 +1,6 @@
-"""The page to explore a mesh with: its data are the mesh's, and a browser shows what numpy says is there."""
+"""The page to explore a mesh with: its data are the mesh's, and a browser shows what numpy says
+is there.
+"""
 
 import base64
 import html
@@ -31,7 +33,11 @@ def cell_data(mesh):
     random = np.random.default_rng(1)
     mean = random.normal(50.0, 20.0, len(mesh.cells))
     mean[::9] = np.nan
-    return {"mean": mean, "strain": np.zeros((len(mesh.cells), 6)), "label": random.integers(0, 4, len(mesh.cells))}
+    return {
+        "mean": mean,
+        "strain": np.zeros((len(mesh.cells), 6)),
+        "label": random.integers(0, 4, len(mesh.cells)),
+    }
 
 
 def packed(page):
@@ -53,12 +59,18 @@ def test_volumes_of_curved_cells_are_theirs(mesh):
 def test_fields_are_labels_or_quantities(mesh, cell_data):
     mean, label = exhibit(mesh, cell_data).fields
     assert (mean.name, mean.unit, mean.categories) == ("mean", "intensity", [])
-    np.testing.assert_allclose(mean.limits, np.nanpercentile(cell_data["mean"].astype(np.float32), [1, 99]), rtol=1e-6)
+    np.testing.assert_allclose(
+        mean.limits, np.nanpercentile(cell_data["mean"].astype(np.float32), [1, 99]), rtol=1e-6
+    )
     assert [value for value, _ in label.categories] == [0, 1, 2, 3]
     assert label.categories[1:] == list(enumerate(LABEL_PALETTE[:3], 1))  # as in every picture
     # Not all whole numbers are labels.
     n = len(mesh.cells)
-    for name, values in (("n_voxels", np.full(n, 8)), ("depth", np.full(n, -1)), ("many", np.arange(n))):
+    for name, values in (
+        ("n_voxels", np.full(n, 8)),
+        ("depth", np.full(n, -1)),
+        ("many", np.arange(n)),
+    ):
         assert exhibit(mesh, {name: values}).fields[0].categories == []
 
 
@@ -82,7 +94,11 @@ def test_a_field_is_the_first_within_limits(mesh, cell_data):
 
 def test_a_field_without_range_or_values_has_limits(mesh):
     n = len(mesh.cells)
-    data = {"a": np.full(n, 0.5), "b": np.full(n, np.nan), "c": np.append(np.arange(n - 1) + 0.5, np.inf)}
+    data = {
+        "a": np.full(n, 0.5),
+        "b": np.full(n, np.nan),
+        "c": np.append(np.arange(n - 1) + 0.5, np.inf),
+    }
     constant, none, infinite = exhibit(mesh, data).fields
     assert constant.limits[0] < 0.5 < constant.limits[1]
     assert none.limits == (0.0, 1.0)
@@ -91,7 +107,10 @@ def test_a_field_without_range_or_values_has_limits(mesh):
 
 
 def test_without_fields_there_are_those_of_the_mesh(mesh, image):
-    names = [field.name for field in exhibit(mesh, {"strain": np.zeros((len(mesh.cells), 6))}, image).fields]
+    names = [
+        field.name
+        for field in exhibit(mesh, {"strain": np.zeros((len(mesh.cells), 6))}, image).fields
+    ]
     assert names == list(tetopt.cell_fields(mesh, image))
 
 
@@ -102,7 +121,9 @@ def test_the_data_are_the_meshs(mesh, cell_data, image):
     np.testing.assert_allclose(points, mesh.points, atol=1e-5)
     np.testing.assert_array_equal(array(data["cells"], "<u4").reshape(-1, 4), mesh.cells)
     assert [field["name"] for field in data["fields"]] == ["mean", "label"]
-    np.testing.assert_allclose(array(data["fields"][0]["values"], "<f4"), cell_data["mean"], rtol=1e-6)
+    np.testing.assert_allclose(
+        array(data["fields"][0]["values"], "<f4"), cell_data["mean"], rtol=1e-6
+    )
     assert data["skipped"] == ["strain"]
     np.testing.assert_array_equal(array(data["sets"][0]["triangles"], "<u4").reshape(-1, 3), top)
 
@@ -112,10 +133,14 @@ def test_the_image_is_where_its_affine_puts_it(mesh, image):
     packed_image = data["image"]
     index = np.random.default_rng(0).uniform(0, 13, (9, 3))
     relative = np.append(image.to_world(index) - data["centre"], np.ones((9, 1)), axis=1)
-    np.testing.assert_allclose((relative @ np.reshape(packed_image["toIndex"], (4, 4)))[:, :3], index, atol=1e-9)
+    np.testing.assert_allclose(
+        (relative @ np.reshape(packed_image["toIndex"], (4, 4)))[:, :3], index, atol=1e-9
+    )
     low, high = np.percentile(image.data, [0.5, 99.5])
     greys = array(packed_image["voxels"], "u1").reshape(image.shape, order="F")
-    np.testing.assert_allclose(greys, np.clip((image.data - low) / (high - low), 0, 1) * 255, atol=0.51)
+    np.testing.assert_allclose(
+        greys, np.clip((image.data - low) / (high - low), 0, 1) * 255, atol=0.51
+    )
 
 
 def test_a_large_image_is_averaged_over_the_same_box(mesh, image, monkeypatch):
@@ -124,7 +149,9 @@ def test_a_large_image_is_averaged_over_the_same_box(mesh, image, monkeypatch):
     assert np.prod(whole["shape"]) <= 600
     assert whole["original"] == list(image.shape)
     monkeypatch.undo()
-    np.testing.assert_allclose(whole["box"], packed(explorer_html(exhibit(mesh, {}, image)))["image"]["box"], atol=1e-9)
+    np.testing.assert_allclose(
+        whole["box"], packed(explorer_html(exhibit(mesh, {}, image)))["image"]["box"], atol=1e-9
+    )
 
 
 def test_the_page_is_one_file(mesh, cell_data, tmp_path):
@@ -136,7 +163,8 @@ def test_the_page_is_one_file(mesh, cell_data, tmp_path):
     assert packed(text)["fields"][0]["name"] == "</script>"
     assert "<title>&lt;/script&gt;&lt;b&gt;&#34;$DATA</title>" in text
     assert "needs JavaScript" in text
-    save_explorer(tmp_path / "b.html", exhibit(mesh, labels, title="\udce9"))  # as a name that is not UTF-8 comes
+    # as a name that is not UTF-8 comes
+    save_explorer(tmp_path / "b.html", exhibit(mesh, labels, title="\udce9"))
     assert "<title>\\udce9</title>" in (tmp_path / "b.html").read_text(encoding="utf-8")
 
 
@@ -152,7 +180,9 @@ def test_refusals(mesh, image):
         with pytest.raises(InputError, match="'top': expected \\(K, 3\\) whole numbers"):
             exhibit(mesh, {}, facet_sets={"top": nodes})
     for node in (-1, len(mesh.points)):
-        with pytest.raises(InputError, match=f"'top': expected nodes 0..{len(mesh.points) - 1}, got"):
+        with pytest.raises(
+            InputError, match=f"'top': expected nodes 0..{len(mesh.points) - 1}, got"
+        ):
             exhibit(mesh, {}, facet_sets={"top": np.full((1, 3), node)})
 
 
@@ -311,7 +341,8 @@ FRAME = """<body><script>addEventListener("message", (event) => {
 <iframe src="warped.html" width="1000" height="700"></iframe><iframe src="blind.html"></iframe>
 <iframe src="narrow.html" width="380" height="600"></iframe></body>"""
 TABLE = LabelTable({2: "left <lung>", 9: "not there"}, {2: (0.0, 1.0, 0.2)})
-AT = (0.23, -1.37, 3.1)  # mm from the middle: the coronal cut, the axial one, and the one the page begins with
+# mm from the middle: the coronal cut, the axial one, and the one the page begins with
+AT = (0.23, -1.37, 3.1)
 CLICKS = [[300, 300], [340, 390], [420, 280]]
 
 
@@ -320,50 +351,81 @@ def middle_of(mesh):
 
 
 def inner_facets(mesh, below):
-    """Facets without a node on the surface and under a level: from above, other cells hide them all."""
+    """Facets without a node on the surface and under a level: from above, other cells hide them
+    all.
+    """
     nodes = facets(mesh.cells).nodes
     is_outer = np.isin(nodes, boundary_facets(mesh.cells)).any(axis=1)
     return nodes[~is_outer & (mesh.points[nodes][..., 2].max(axis=1) < below)]
 
 
 def pressed(mesh):
-    """Results of two steps at the nodes of order 2 (those in the middles of edges are not drawn), and a temperature."""
+    """Results of two steps at the nodes of order 2 (those in the middles of edges are not
+    drawn), and a temperature.
+    """
     x, y, z = (mesh.points - mesh.points.min(axis=0)).T / np.ptp(mesh.points, axis=0).max()
     first = np.column_stack([0.6 * (x - 0.3) * z, -0.4 * y * z, 1.0 - z])
     second = np.column_stack([1.5 * z**2, 0.4 * x, 0.0 * x])
     heat = np.where(np.arange(len(x)) % 17 == 0, np.nan, x)
-    data = {"on_top": np.zeros((len(x), 2)), "displacement": first, "displacement_step2": second, "heat": heat}
-    data |= {"von_mises_nodes": z, "von_mises_nodes_step2": 2.0 * z, "strain_nodes": np.zeros((len(x), 9))}
+    data = {
+        "on_top": np.zeros((len(x), 2)),
+        "displacement": first,
+        "displacement_step2": second,
+        "heat": heat,
+    }
+    data |= {
+        "von_mises_nodes": z,
+        "von_mises_nodes_step2": 2.0 * z,
+        "strain_nodes": np.zeros((len(x), 9)),
+    }
     data["strain_nodes_step2"] = np.ones((len(x), 9))
-    return {name: np.concatenate([values, np.full_like(values, 1e9)]) for name, values in data.items()}
+    return {
+        name: np.concatenate([values, np.full_like(values, 1e9)]) for name, values in data.items()
+    }
 
 
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory, mesh, cell_data, image):
-    """What the page says and shows, in one run of a browser: as it is, deformed, without WebGL, in a narrow window."""
+    """What the page says and shows, in one run of a browser: as it is, deformed, without WebGL,
+    in a narrow window.
+    """
     folder = tmp_path_factory.mktemp("explore")
     middle = middle_of(mesh)
     thin = np.argmin(np.ptp(mesh.points, axis=0))
-    words = {"AT_0": middle[thin] + AT[2], "AT_1": middle[1] + AT[0], "AT_2": middle[2] + AT[1], "CLICKS": CLICKS}
+    words = {
+        "AT_0": middle[thin] + AT[2],
+        "AT_1": middle[1] + AT[0],
+        "AT_2": middle[2] + AT[1],
+        "CLICKS": CLICKS,
+    }
     probe = PROBE
     for word, value in words.items():
         probe = probe.replace(word, str(value))
     for title in ("page", "warped", "blind", "narrow"):
-        sets = {"outer": boundary_facets(mesh.cells), "inner": inner_facets(mesh, below=middle[2] + AT[1] - 5.0)}
+        sets = {
+            "outer": boundary_facets(mesh.cells),
+            "inner": inner_facets(mesh, below=middle[2] + AT[1] - 5.0),
+        }
         results = pressed(mesh) if title in ("warped", "narrow") else {}
         if title == "narrow":  # of one step
             del results["displacement_step2"]
         forces = {1: {"outer": [3.0, -4.0, 0.0]}, 2: {"outer": [0.0, 0.5, 1234.56]}}
         text = explorer_html(exhibit(mesh, cell_data, image, title, sets, results, forces, TABLE))
-        copied(text, folder / f"{title}.html", FRAMES + BLIND if title == "blind" else FRAMES, probe)
+        copied(
+            text, folder / f"{title}.html", FRAMES + BLIND if title == "blind" else FRAMES, probe
+        )
     frame = copied(FRAME, folder / "frame.html")
-    said = re.findall(r'data-(page|warped|blind|narrow)="([^"]*)"', document(frame, "--window-size=1500,2300"))
+    said = re.findall(
+        r'data-(page|warped|blind|narrow)="([^"]*)"', document(frame, "--window-size=1500,2300")
+    )
     return {name: json.loads(html.unescape(text)) for name, text in said}
 
 
 @pytest.mark.deep
 def test_counts_and_surfaces(shown, mesh, cell_data):
-    """Cells and volume within the limits, facets of what is left and polygons of the cut are those numpy finds."""
+    """Cells and volume within the limits, facets of what is left and polygons of the cut are
+    those numpy finds.
+    """
     page, mean, label = shown["page"], cell_data["mean"], cell_data["label"]
     middle = middle_of(mesh)
     extent = np.ptp(mesh.points, axis=0)
@@ -374,9 +436,13 @@ def test_counts_and_surfaces(shown, mesh, cell_data):
 
     def expected(is_counted, is_drawn, axis=None, at=0.0):
         volume = volumes(mesh.points, mesh.cells)[is_counted].sum()
-        height = mesh.points[:, 0 if axis is None else axis] - (0.0 if axis is None else middle[axis] + at)
+        height = mesh.points[:, 0 if axis is None else axis] - (
+            0.0 if axis is None else middle[axis] + at
+        )
         assert np.abs(height).min() > 1e-4 or axis is None  # else single precision decides
-        n_polygons = 0 if axis is None else len(plane_cut(mesh.points, mesh.cells[is_counted], height).cells)
+        n_polygons = (
+            0 if axis is None else len(plane_cut(mesh.points, mesh.cells[is_counted], height).cells)
+        )
         return is_counted.sum(), volume, len(boundary_facets(mesh.cells[is_drawn])), n_polygons
 
     for name, (count, volume, n_facets, n_polygons) in {
@@ -408,9 +474,12 @@ def places_of(page, mesh, radius=None):
 
 
 def cells_at(mesh, xyz):
-    """The cell around each place (K, 3), -1 for none, and how far the nearest of its facets is in the axial plane."""
+    """The cell around each place (K, 3), -1 for none, and how far the nearest of its facets is
+    in the axial plane.
+    """
     corners = mesh.points[mesh.cells]
-    inverse = np.linalg.inv(corners[:, 1:] - corners[:, :1])  # columns are the gradients of three barycentric functions
+    # columns are the gradients of three barycentric functions
+    inverse = np.linalg.inv(corners[:, 1:] - corners[:, :1])
     gradients = np.concatenate([-inverse.sum(axis=2, keepdims=True), inverse], axis=2)  # (M, 3, 4)
     cells, distances = np.full(len(xyz), -1), np.zeros(len(xyz))
     for k, place in enumerate(xyz):
@@ -434,7 +503,9 @@ def test_the_section_shows_the_cells_it_cuts(shown, mesh, cell_data):
     field, _ = exhibit(mesh, cell_data).fields
     low, high = field.limits
     step = np.rint(255 * np.clip((field.values[cells] - low) / (high - low), 0, 1))
-    expected = np.where(np.isnan(step)[:, None], 0xAA, colour_table()[np.nan_to_num(step).astype(int)].astype(int))
+    expected = np.where(
+        np.isnan(step)[:, None], 0xAA, colour_table()[np.nan_to_num(step).astype(int)].astype(int)
+    )
     np.testing.assert_allclose(np.array(page["cells"])[clear, 2:], expected[clear], atol=2)
 
 
@@ -444,12 +515,16 @@ def test_the_slice_shows_the_voxel_at_every_place(shown, mesh, image):
     xy, _ = places_of(page, mesh)
     z = middle_of(mesh)[2] + AT[1]
     index = image.to_index(np.column_stack([xy, np.full(len(xy), z)])) + 0.5
-    is_clear = (np.abs(index - np.rint(index)) > 0.02).all(axis=1)  # of voxels' sides, where rounding decides
-    is_inside = ((index > 0.15) & (index < np.array(image.shape) - 0.15)).all(axis=1)  # clear of smoothed outlines
+    # of voxels' sides, where rounding decides
+    is_clear = (np.abs(index - np.rint(index)) > 0.02).all(axis=1)
+    # clear of smoothed outlines
+    is_inside = ((index > 0.15) & (index < np.array(image.shape) - 0.15)).all(axis=1)
     inside = np.flatnonzero(is_clear & is_inside)
     assert len(inside) > 800
     low, high = np.percentile(image.data, [0.5, 99.5])
-    expected = np.clip((image.data[tuple(index[inside].astype(int).T)] - low) / (high - low), 0, 1) * 255
+    expected = (
+        np.clip((image.data[tuple(index[inside].astype(int).T)] - low) / (high - low), 0, 1) * 255
+    )
     colours = np.array(page["slice"])[inside, 2:]
     np.testing.assert_allclose(colours, np.repeat(expected[:, None], 3, axis=1), atol=1.01)
 
@@ -476,12 +551,18 @@ def moved(mesh, factor, name="displacement"):
 
 def test_results_at_the_nodes_are_fields_and_deformations(mesh, cell_data):
     shown = exhibit(mesh, cell_data, point_data=pressed(mesh))
-    names = [(field.name, field.unit, field.step, field.nodes is not None) for field in shown.fields]
+    names = [
+        (field.name, field.unit, field.step, field.nodes is not None) for field in shown.fields
+    ]
     assert names == [
-        ("displacement", "mm", 1, True), ("displacement", "mm", 2, True), ("heat", "", 0, True),
-        ("von_mises_nodes", "kPa", 1, True), ("von_mises_nodes", "kPa", 2, True),
-        ("mean", "intensity", 0, False), ("label", "", 0, False),
-    ]  # fmt: skip
+        ("displacement", "mm", 1, True),
+        ("displacement", "mm", 2, True),
+        ("heat", "", 0, True),
+        ("von_mises_nodes", "kPa", 1, True),
+        ("von_mises_nodes", "kPa", 2, True),
+        ("mean", "intensity", 0, False),
+        ("label", "", 0, False),
+    ]
     assert shown.skipped == ["strain", "on_top", "strain_nodes"]
     lengths = np.linalg.norm(pressed(mesh)["displacement_step2"][: len(mesh.points)], axis=1)
     np.testing.assert_allclose(shown.fields[1].nodes, lengths, rtol=1e-6)
@@ -492,14 +573,21 @@ def test_results_at_the_nodes_are_fields_and_deformations(mesh, cell_data):
     assert list(alone.displacements) == [0]
     assert alone.fields[0].step == 0
     for odd in (np.full((len(mesh.points), 3), np.nan), np.zeros((len(mesh.points), 2))):
-        assert exhibit(mesh, cell_data, point_data={"displacement": odd}).skipped == ["strain", "displacement"]
+        assert exhibit(mesh, cell_data, point_data={"displacement": odd}).skipped == [
+            "strain",
+            "displacement",
+        ]
     with pytest.raises(InputError, match=f"'heat' for each of {len(mesh.points)} nodes, got 3"):
         exhibit(mesh, cell_data, point_data={"heat": np.zeros(3)})
 
 
-@pytest.mark.parametrize(("times", "first"), [(1.0, 1.0), (0.1, 1.0), (1e-3, 50.0), (2.4e-3, 20.0), (0.0, 1.0)])
+@pytest.mark.parametrize(
+    ("times", "first"), [(1.0, 1.0), (0.1, 1.0), (1e-3, 50.0), (2.4e-3, 20.0), (0.0, 1.0)]
+)
 def test_a_displacement_is_drawn_so_that_it_is_seen(mesh, times, first):
-    """Its largest is some twentieth of the diagonal, by a round factor that is never less than 1."""
+    """Its largest is some twentieth of the diagonal, by a round factor that is never less than
+    1.
+    """
     along = np.zeros_like(mesh.points)
     along[3, 1] = -times * np.linalg.norm(np.ptp(mesh.points, axis=0))
     factors = warp_factors(exhibit(mesh, {}, point_data={"displacement": along}))
@@ -554,26 +642,41 @@ def test_the_second_step_is_drawn_interpolated_and_picked(shown, mesh, image):
     values = at_corners[:, 0] + (fractions * (at_corners[:, 1:] - at_corners[:, :1])).sum(axis=1)
     low, high = field.limits
     step = np.rint(255 * np.clip((values - low) / (high - low), 0, 1)).astype(int)
-    np.testing.assert_allclose(np.array(page["cells"])[clear, 2:], colour_table()[step].astype(int), atol=3)
+    np.testing.assert_allclose(
+        np.array(page["cells"])[clear, 2:], colour_table()[step].astype(int), atol=3
+    )
     rest = mesh.points[mesh.cells[cells[clear]]]
-    index = image.to_index(rest[:, 0] + (fractions[..., None] * (rest[:, 1:] - rest[:, :1])).sum(axis=1)) + 0.5
+    index = (
+        image.to_index(
+            rest[:, 0] + (fractions[..., None] * (rest[:, 1:] - rest[:, :1])).sum(axis=1)
+        )
+        + 0.5
+    )
     is_inside = ((index > 0.05) & (index < np.array(image.shape) - 0.05)).all(axis=1)
     is_inside &= (np.abs(index - np.rint(index)) > 0.02).all(axis=1)
     low, high = np.percentile(image.data, [0.5, 99.5])
-    grey = np.clip((image.data[tuple(index[is_inside].astype(int).T)] - low) / (high - low), 0, 1) * 255
+    grey = (
+        np.clip((image.data[tuple(index[is_inside].astype(int).T)] - low) / (high - low), 0, 1)
+        * 255
+    )
     colours = np.array(page["carried"])[clear[is_inside], 2:]
     assert len(grey) > 200
     np.testing.assert_allclose(colours, np.repeat(grey[:, None], 3, axis=1), atol=1.01)
     assert page["second"][1:3] == ["Deformation × 1.5", "displacement (mm)"]
     numbers = [float(text) for text in re.findall(r"[\d.]+", page["second"][3])]
     np.testing.assert_allclose(numbers, [field.nodes.min(), field.nodes.max()], rtol=1e-4)
-    clicked = np.array([[*places_of({**page, "cells": CLICKS[:1]}, mesh, radius)[0][0], middle[2] + AT[1]]])
+    clicked = np.array(
+        [[*places_of({**page, "cells": CLICKS[:1]}, mesh, radius)[0][0], middle[2] + AT[1]]]
+    )
     cell = cells_at(shape, clicked)[0][0]
     assert page["picked"].startswith(f"Cell {cell}\n")
     length = float(re.search(r"displacement \(mm\), mean of its nodes\t(\S+)", page["picked"])[1])
     assert length == pytest.approx(field.values[cell], rel=1e-5)
-    x, y, z = map(float, re.search(r"centroid \(RAS, mm\)\t(\S+), (\S+), (\S+)", page["picked"]).groups())
-    np.testing.assert_allclose([x, y, z], mesh.points[mesh.cells[cell]].mean(axis=0), atol=0.051)  # at rest
+    x, y, z = map(
+        float, re.search(r"centroid \(RAS, mm\)\t(\S+), (\S+), (\S+)", page["picked"]).groups()
+    )
+    # at rest
+    np.testing.assert_allclose([x, y, z], mesh.points[mesh.cells[cell]].mean(axis=0), atol=0.051)
     assert page["grey"]  # nodes without a value
     second, first, none = page["reactions"]
     assert second == "reaction 1,235 mN: R 0, A 0.5, S 1,235"
@@ -587,7 +690,9 @@ def test_labels_have_a_legend(shown, mesh, cell_data):
     assert (field.names, field.categories[2][1]) == ({2: "left <lung>"}, "#00ff33")
     rgb = [tuple(int(colour[i : i + 2], 16) for i in (1, 3, 5)) for _, colour in field.categories]
     names = ["0", "1", "2 left <lung>", "3"]
-    assert shown["page"]["labels"] == [[name, f"rgb{colour}"] for name, colour in zip(names, rgb, strict=True)]
+    assert shown["page"]["labels"] == [
+        [name, f"rgb{colour}"] for name, colour in zip(names, rgb, strict=True)
+    ]
     assert shown["page"]["rows"] == names
 
 
@@ -599,7 +704,9 @@ def test_labels_are_shown_by_name(shown, mesh, cell_data):
     rows = [page[name] for name in ("every", "only", "unglazed", "two", "none", "again")]
     of_all = (inner[:, 0] != inner[:, 1]) & ~np.isin(inner, [2]).any(axis=1)
     glass = [0, np.count_nonzero(of_all), 0, 0, 0, 0]
-    for row, labels, n_glass in zip(rows, [[0, 1, 2, 3], [2], [2], [0, 2], [], [0, 1, 2, 3]], glass, strict=True):
+    for row, labels, n_glass in zip(
+        rows, [[0, 1, 2, 3], [2], [2], [0, 2], [], [0, 1, 2, 3]], glass, strict=True
+    ):
         is_shown = np.isin(label, labels)
         n_facets = len(boundary_facets(mesh.cells[is_shown])) if labels else 0
         assert row[0].startswith(f"{is_shown.sum():,} of {len(label):,} cells")
@@ -611,9 +718,14 @@ def test_labels_are_shown_by_name(shown, mesh, cell_data):
     n_lines, picture, n_of_labels, picture_of_labels = page["lines"]
     height = mesh.points[:, 2] - middle_of(mesh)[2] - AT[1]
     is_above = height[mesh.cells] >= 0.0
-    is_cut = np.array([np.ptp(np.delete(is_above, k, axis=1).astype(int), axis=1) for k in range(4)]).T > 0
+    is_cut = (
+        np.array([np.ptp(np.delete(is_above, k, axis=1).astype(int), axis=1) for k in range(4)]).T
+        > 0
+    )
     of_side = sides.cells[sides.of_cell]
-    other = np.where(of_side[..., 0] == np.arange(len(label))[:, None], of_side[..., 1], of_side[..., 0])
+    other = np.where(
+        of_side[..., 0] == np.arange(len(label))[:, None], of_side[..., 1], of_side[..., 0]
+    )
     is_border = (other < 0) | (label[other] != label[:, None])
     assert (n_lines, n_of_labels) == (is_cut.sum(), (is_cut & is_border).sum())
     assert n_of_labels < n_lines
@@ -635,7 +747,10 @@ def test_it_fits_a_narrow_window(shown):
 
 @pytest.mark.deep
 def test_without_webgl_it_is_said(shown):
-    assert "This browser does not support WebGL 2, so the mesh cannot be shown" in shown["blind"]["words"]
+    assert (
+        "This browser does not support WebGL 2, so the mesh cannot be shown"
+        in shown["blind"]["words"]
+    )
 
 
 def ball(radius=30.0, n=600):
@@ -667,7 +782,13 @@ def test_nothing_is_drawn_beside_a_cut_body(tmp_path):
     text = explorer_html(exhibit(mesh, {"label": np.ones(len(mesh.cells), dtype=np.int64)}))
     shown = document(copied(text, tmp_path / "page.html", last=probe), "--window-size=1000,700")
     said = re.search(r'data-said="([^"]*)"', shown)[1].split(" ")
-    pictures = [PIL.Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))).convert("RGB") for url in said]
+    pictures = [
+        PIL.Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))).convert("RGB")
+        for url in said
+    ]
     assert len(pictures) == len(heights)
-    bodies = [ndimage.label(np.asarray(picture).min(axis=2) < 250, np.ones((3, 3)))[1] for picture in pictures]
+    bodies = [
+        ndimage.label(np.asarray(picture).min(axis=2) < 250, np.ones((3, 3)))[1]
+        for picture in pictures
+    ]
     assert bodies == [1] * len(heights)

@@ -1,4 +1,6 @@
-"""Pictures, judged by what they hold before they become pixels: sides, places, sections, curves, titles."""
+"""Pictures, judged by what they hold before they become pixels: sides, places, sections, curves,
+titles.
+"""
 
 from itertools import permutations, product
 
@@ -45,7 +47,9 @@ from tetopt.start.lattice import lattice_mesh
 DOLLARS = LabelTable({1: r"5 $\frac$ and a_b"}, {})
 SHAPE = (5, 7, 9)
 SPACING = (2.0, 1.0, 3.0)
-OBLIQUE = np.array([[-0.75, 0.31, 1.1, 12.5], [0.12, 0.68, -0.9, -33.0], [0.05, -0.22, 5.1, 7.25], [0, 0, 0, 1.0]])
+OBLIQUE = np.array(
+    [[-0.75, 0.31, 1.1, 12.5], [0.12, 0.68, -0.9, -33.0], [0.05, -0.22, 5.1, 7.25], [0, 0, 0, 1.0]]
+)
 SHEARED = np.array([[-2.0, 0.5, 1.0], [0.3, 1.0, 5.0], [0, 0, 1.0]])
 WORLD_LETTERS = ["LR", "PA", "IS"]
 
@@ -70,7 +74,8 @@ def image_steps(image, view):
     return image.spacing[view.axes]
 
 
-ORIENTATIONS = [(w, s) for w in permutations(range(3)) for s in product((1, -1), repeat=3)][::5]  # of 48
+# of 48
+ORIENTATIONS = [(w, s) for w in permutations(range(3)) for s in product((1, -1), repeat=3)][::5]
 
 
 def bent(image, blocks):
@@ -108,13 +113,16 @@ def test_pixels_lie_where_the_letters_say(worlds, signs, normal):
     view = SliceView(image, axis=worlds.index(normal), index=3)
     horizontal, vertical = (w for w in range(3) if w != normal)
     assert view.letters == [WORLD_LETTERS[horizontal], WORLD_LETTERS[vertical]]
-    # The world place of every voxel in the slice, and its value, put in rising order of the two coordinates.
+    # The world place of every voxel in the slice, and its value, put in rising order of the two
+    # coordinates.
     index = np.array([i for i in np.ndindex(SHAPE) if i[view.across] == 3])
     place = image.to_world(index)
     order = np.lexsort((place[:, vertical], place[:, horizontal]))
     assert np.ptp(place[:, normal]) == 0.0
     np.testing.assert_array_equal(view.pixels.ravel(), image.data[tuple(index[order].T)])
-    np.testing.assert_allclose(view.size, np.ptp(place[:, (horizontal, vertical)], axis=0) + image_steps(image, view))
+    np.testing.assert_allclose(
+        view.size, np.ptp(place[:, (horizontal, vertical)], axis=0) + image_steps(image, view)
+    )
 
 
 @pytest.mark.parametrize(("worlds", "signs"), ORIENTATIONS)
@@ -128,7 +136,8 @@ def test_an_oblique_image_is_laid_out_by_its_nearest_axes():
     image = noise(SHAPE, OBLIQUE)
     view = SliceView(image, None, None)
     assert (view.across, view.axes, view.letters) == (2, [0, 1], ["LR", "PA"])
-    np.testing.assert_array_equal(view.pixels, image.data[::-1, :, 4])  # the first axis runs to the left
+    # the first axis runs to the left
+    np.testing.assert_array_equal(view.pixels, image.data[::-1, :, 4])
     np.testing.assert_allclose(view.size, image.spacing[:2] * SHAPE[:2])
 
 
@@ -162,7 +171,9 @@ def test_cells_and_pixels_share_their_places(worlds, signs):
     n_inside = 0
     for pixel in np.ndindex(owner.shape):
         point = (np.array(pixel) + 0.5) * steps
-        around = [cell for polygon, cell in zip(polygons, cells, strict=True) if contains(polygon, point)]
+        around = [
+            cell for polygon, cell in zip(polygons, cells, strict=True) if contains(polygon, point)
+        ]
         assert len(around) <= 1
         if around:
             n_inside += 1
@@ -176,7 +187,9 @@ def test_cells_and_pixels_share_their_places(worlds, signs):
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("kind", ["bcc", "five-tet", "bent"])
-@pytest.mark.parametrize("affine", [np.diag([-1.0, 2.0, 3.0, 1.0]), OBLIQUE], ids=["flip", "oblique"])
+@pytest.mark.parametrize(
+    "affine", [np.diag([-1.0, 2.0, 3.0, 1.0]), OBLIQUE], ids=["flip", "oblique"]
+)
 def test_a_section_tiles_the_slice(affine, kind, axis):
     image = noise((8, 9, 10), affine)
     # 9 voxels in 3 blocks: the planes of nodes at index 2.5 and 5.5; 8 and 10 in 2: at 3.5 and 4.5.
@@ -186,7 +199,9 @@ def test_a_section_tiles_the_slice(affine, kind, axis):
         size = np.delete(image.spacing * image.shape, axis)
         assert areas(polygons).sum() == pytest.approx(size.prod(), rel=1e-12)
         assert polygons.min() >= -1e-9
-        assert (polygons.max(axis=(0, 1)) <= np.array(SliceView(image, axis, index).size) + 1e-9).all()
+        assert (
+            polygons.max(axis=(0, 1)) <= np.array(SliceView(image, axis, index).size) + 1e-9
+        ).all()
         assert len(np.unique(cells)) == len(cells)
 
 
@@ -236,7 +251,9 @@ def test_slice_figure_holds_each_mesh_under_its_title(n):
         assert over.images[0].origin == "lower"
         np.testing.assert_allclose(corners(collections(over)[0]), polygons.mean(axis=1))
         np.testing.assert_allclose(corners(collections(flat)[0]), polygons.mean(axis=1))
-        np.testing.assert_array_equal(collections(flat)[0].get_array(), cell_moments(image, mesh).mean[cells])
+        np.testing.assert_array_equal(
+            collections(flat)[0].get_array(), cell_moments(image, mesh).mean[cells]
+        )
         assert collections(flat)[0].get_clim() == over.images[0].get_clim()
 
 
@@ -265,7 +282,9 @@ def test_nothing_is_drawn_where_a_mesh_leaves_the_image_uncovered(n):
     for axes in figure.axes:
         (drawn,) = collections(axes)
         polygons = np.concatenate([path.vertices for path in drawn.get_paths()])
-        np.testing.assert_allclose([polygons.min(axis=0), polygons.max(axis=0)], [[0.0, 0.0], [4.0, 7.0]], atol=1e-9)
+        np.testing.assert_allclose(
+            [polygons.min(axis=0), polygons.max(axis=0)], [[0.0, 0.0], [4.0, 7.0]], atol=1e-9
+        )
         assert axes.get_xlim() == (0.0, 10.0)  # the whole image stays in view
     assert figure.axes[1].get_facecolor() == to_rgba(UNCOVERED_COLOUR)
 
@@ -273,21 +292,40 @@ def test_nothing_is_drawn_where_a_mesh_leaves_the_image_uncovered(n):
 # --------------------------------------------------------------------------------------------------
 # Labels
 
-# What red, green and blue of light, linear, become without red and without green cones (Machado et al. 2009).
-NO_RED = [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]]
-NO_GREEN = [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]
-TO_XYZ = [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
+# What red, green and blue of light, linear, become without red and without green cones (Machado et
+# al. 2009).
+NO_RED = [
+    [0.152286, 1.052583, -0.204868],
+    [0.114503, 0.786281, 0.099216],
+    [-0.003882, -0.048116, 1.051998],
+]
+NO_GREEN = [
+    [0.367322, 0.860646, -0.227968],
+    [0.280085, 0.672501, 0.047413],
+    [-0.011820, 0.042940, 0.968881],
+]
+TO_XYZ = [
+    [0.4124564, 0.3575761, 0.1804375],
+    [0.2126729, 0.7151522, 0.0721750],
+    [0.0193339, 0.1191920, 0.9503041],
+]
 
 
 def cielab(colours, seen):
     """CIELAB (K, 3) of sRGB colours as seen with given cones."""
     linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
-    xyz = np.clip(linear @ np.transpose(seen), 0.0, 1.0) @ np.transpose(TO_XYZ) / [0.95047, 1.0, 1.08883]
+    xyz = (
+        np.clip(linear @ np.transpose(seen), 0.0, 1.0)
+        @ np.transpose(TO_XYZ)
+        / [0.95047, 1.0, 1.08883]
+    )
     x, y, z = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16.0 / 116.0).T
     return np.column_stack([116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z)])
 
 
-@pytest.mark.parametrize("seen", [np.eye(3), NO_RED, NO_GREEN], ids=["all cones", "no red", "no green"])
+@pytest.mark.parametrize(
+    "seen", [np.eye(3), NO_RED, NO_GREEN], ids=["all cones", "no red", "no green"]
+)
 def test_colours_are_told_apart_by_the_colour_blind(seen):
     lab = cielab(to_rgba_array([*LABEL_PALETTE, BACKGROUND_COLOUR])[:, :3], seen)
     apart = np.linalg.norm(lab[:, None] - lab, axis=2) + np.where(np.eye(len(lab)), np.inf, 0.0)
@@ -297,15 +335,21 @@ def test_colours_are_told_apart_by_the_colour_blind(seen):
 
 
 def test_a_label_has_one_colour_whatever_else_is_there():
-    """So that the cells' labels look as the voxels', and a subject's as another's; in the file's table, too."""
+    """So that the cells' labels look as the voxels', and a subject's as another's; in the file's
+    table, too.
+    """
     few, many = (label_colours(np.arange(n)) for n in (8, 10))
     assert (few.shape, many.shape) == ((8, 3), (10, 3))
     np.testing.assert_array_equal(few, many[:8])
-    np.testing.assert_array_equal(many, to_rgba_array([BACKGROUND_COLOUR, *LABEL_PALETTE[:9]])[:, :3])
+    np.testing.assert_array_equal(
+        many, to_rgba_array([BACKGROUND_COLOUR, *LABEL_PALETTE[:9]])[:, :3]
+    )
     words = table_words(coloured(LabelTable({}, {2: (1.0, 0.0, 0.0)}), np.array([0, 7, 2, 7])))
     assert words == {
-        "0": {"colour": BACKGROUND_COLOUR}, "2": {"colour": "#ff0000"}, "7": {"colour": LABEL_PALETTE[6]}
-    }  # fmt: skip
+        "0": {"colour": BACKGROUND_COLOUR},
+        "2": {"colour": "#ff0000"},
+        "7": {"colour": LABEL_PALETTE[6]},
+    }
     black = coloured(LabelTable({}, {0: (0.0, 0.0, 0.0)}), np.array([0, 7]))
     assert table_words(black)["0"] == {"colour": BACKGROUND_COLOUR}
 
@@ -314,7 +358,9 @@ def test_labels_keep_colours_of_their_own_but_the_background():
     labels = np.array([0, 1, 2, 5, 7])
     colours = label_colours(labels, {0: (0, 0, 0), 2: (0.1, 0.2, 0.3), 9: (1, 1, 1)})
     np.testing.assert_array_equal(colours[2], [0.1, 0.2, 0.3])
-    np.testing.assert_array_equal(np.delete(colours, 2, axis=0), np.delete(label_colours(labels), 2, axis=0))
+    np.testing.assert_array_equal(
+        np.delete(colours, 2, axis=0), np.delete(label_colours(labels), 2, axis=0)
+    )
 
 
 def test_colours_begin_again_in_other_tints():
@@ -322,16 +368,23 @@ def test_colours_begin_again_in_other_tints():
     colours = label_colours(np.arange(3 * n + 2))
     assert len(np.unique(colours[: 3 * n + 1], axis=0)) == 3 * n + 1
     np.testing.assert_array_equal(colours[3 * n + 1], to_rgb(LABEL_PALETTE[0]))
-    np.testing.assert_array_equal(label_colours(np.array([2**31 - 1]))[0], colours[1 + (2**31 - 2) % (3 * n)])
+    np.testing.assert_array_equal(
+        label_colours(np.array([2**31 - 1]))[0], colours[1 + (2**31 - 2) % (3 * n)]
+    )
 
 
 def test_a_legend_lists_the_largest_and_counts_the_others():
     shown = np.array([50, 0, *range(1, LISTED_LABELS + 2)])  # 0, 2 .. 14; the least are 2 and 3
     colours = np.random.default_rng(0).uniform(size=(20, 3))
     entries = legend_patches(np.arange(len(shown)), colours, shown)
-    assert [entry.get_label() for entry in entries] == [*(str(k) for k in (0, *range(4, 15))), "and 2 more"]
+    assert [entry.get_label() for entry in entries] == [
+        *(str(k) for k in (0, *range(4, 15))),
+        "and 2 more",
+    ]
     assert entries[1].get_facecolor() == (*colours[4], 1.0)
-    dollars = label_figure(blocks_of_labels(2), lattice_mesh(blocks_of_labels(2), blocks=(2, 2, 2)), table=DOLLARS)
+    dollars = label_figure(
+        blocks_of_labels(2), lattice_mesh(blocks_of_labels(2), blocks=(2, 2, 2)), table=DOLLARS
+    )
     FigureCanvasAgg(dollars).draw()  # which would parse a formula
     named = legend_patches(np.arange(len(shown)), colours, shown, {4: "left lung", 1: "not shown"})
     assert [entry.get_label() for entry in named[:3]] == ["0", "4 left lung", "5"]
@@ -340,7 +393,9 @@ def test_a_legend_lists_the_largest_and_counts_the_others():
 
 
 def blocks_of_labels(n_labels, worlds=(0, 1, 2), signs=(1, 1, 1)):
-    """Labels 0 to n_labels - 1 in slabs along the first axis, two voxels thick, on the oriented image's voxels."""
+    """Labels 0 to n_labels - 1 in slabs along the first axis, two voxels thick, on the oriented
+    image's voxels.
+    """
     affine = oriented_image(worlds, signs).affine
     return Image(np.repeat(np.arange(n_labels), 2)[:, None, None] + np.zeros((1, 7, 9)), affine)
 
@@ -353,13 +408,16 @@ def test_voxels_and_cells_have_the_same_colours(worlds, signs):
     colours, of_cell = label_colours(np.arange(4)), cell_labels(labels, mesh)
     for (left, right), normal in zip(grid, (2, 1, 0), strict=True):
         view = SliceView(labels, worlds.index(normal), None)
-        np.testing.assert_array_equal(left.images[0].get_array(), colours[view.pixels.T.astype(int)])
+        np.testing.assert_array_equal(
+            left.images[0].get_array(), colours[view.pixels.T.astype(int)]
+        )
         assert left.images[0].get_extent() == [0.0, view.size[0], 0.0, view.size[1]]
         polygons, cells = view.section(mesh)
         (drawn,) = collections(right)
         np.testing.assert_allclose(corners(drawn), polygons.mean(axis=1))
         np.testing.assert_array_equal(drawn.get_facecolors()[:, :3], colours[of_cell[cells]])
-        assert [text.get_text() for text in left.texts] == [text.get_text() for text in right.texts]  # sides alone
+        # sides alone
+        assert [text.get_text() for text in left.texts] == [text.get_text() for text in right.texts]
         assert len(left.texts) == 4
     (legend,) = left.figure.legends
     assert [text.get_text() for text in legend.get_texts()] == ["0", "1", "2", "3"]
@@ -367,10 +425,15 @@ def test_voxels_and_cells_have_the_same_colours(worlds, signs):
 
 @pytest.mark.parametrize(("worlds", "signs"), ORIENTATIONS[::3])
 def test_interfaces_are_drawn_over_the_image(worlds, signs):
-    """Slabs whose borders the lattice's cells keep to: the lines lie on the borders, as long as these are."""
+    """Slabs whose borders the lattice's cells keep to: the lines lie on the borders, as long as
+    these are.
+    """
     labels = blocks_of_labels(4, worlds, signs)
     mesh = lattice_mesh(labels, blocks=(4, 3, 3), kind="five-tet")  # whose cells lie in its blocks
-    image, table = noise(labels.shape, labels.affine), LabelTable({2: "left lung"}, {2: (0.0, 1.0, 0.5)})
+    image, table = (
+        noise(labels.shape, labels.affine),
+        LabelTable({2: "left lung"}, {2: (0.0, 1.0, 0.5)}),
+    )
     figure = label_figure(labels, mesh, image=image, table=table)
     grid = np.array(figure.axes).reshape(3, 3)
     of_cell = cell_labels(labels, mesh)
@@ -383,7 +446,9 @@ def test_interfaces_are_drawn_over_the_image(worlds, signs):
         np.testing.assert_array_equal(np.array(under.get_segments()), lines)
         _, sides = view.interfaces(mesh, of_cell)
         rarer = np.where(n_cells[sides[:, 0]] <= n_cells[sides[:, 1]], sides[:, 0], sides[:, 1])
-        np.testing.assert_array_equal(over.get_colors()[:, :3], label_colours(np.arange(4), table.colours)[rarer])
+        np.testing.assert_array_equal(
+            over.get_colors()[:, :3], label_colours(np.arange(4), table.colours)[rarer]
+        )
         if worlds.index(normal) != 0:
             along = view.axes.index(0)
             np.testing.assert_allclose(lines[:, 0, along], lines[:, 1, along], atol=1e-9)
@@ -404,7 +469,9 @@ def test_interfaces_of_a_plane():
 def test_labels_of_a_part_and_of_a_plane():
     labels = blocks_of_labels(4)
     figure = label_figure(labels, lower_part(labels, 0, 4))
-    polygons = np.concatenate([path.vertices for path in collections(figure.axes[1])[0].get_paths()])
+    polygons = np.concatenate(
+        [path.vertices for path in collections(figure.axes[1])[0].get_paths()]
+    )
     assert polygons[:, 0].max() == pytest.approx(8.0)  # of 16 mm
     flat = Image(labels.data[:, :, 0], np.diag([2.0, 1.0, 1.0]))
     assert len(label_figure(flat, lattice_mesh(flat, blocks=(2, 2))).axes) == 2
@@ -423,7 +490,10 @@ def test_numbers_stand_in_their_labels_where_a_legend_is_too_short():
     # In slabs of 0.1 mm, beside 7 mm, a number has no room.
     thin = Image(labels.data[::2], labels.affine @ np.diag([0.05, 1.0, 1.0, 1.0]))
     figure = label_figure(thin, lattice_mesh(thin, blocks=(4, 2, 2)))
-    numbers = [[text.get_text() for text in axes.texts if text.get_text().isdigit()] for axes in figure.axes]
+    numbers = [
+        [text.get_text() for text in axes.texts if text.get_text().isdigit()]
+        for axes in figure.axes
+    ]
     assert numbers == [[], [], [], [], ["7"], []]  # the sagittal slice is one label alone
 
 
@@ -438,9 +508,12 @@ def lines(axes):
 
 @pytest.mark.parametrize(("worlds", "signs"), ORIENTATIONS[::3])
 def test_boundary_and_outline_lie_between_the_same_pixels(worlds, signs):
-    """The mesh covers just the voxels of the mask, which ends in a plane: both lines are where the pixels change."""
+    """The mesh covers just the voxels of the mask, which ends in a plane: both lines are where
+    the pixels change.
+    """
     image = oriented_image(worlds, signs)
-    axis, normal = worlds.index(0), worlds.index(1)  # ends along the picture's horizontal, seen from the front
+    # ends along the picture's horizontal, seen from the front
+    axis, normal = worlds.index(0), worlds.index(1)
     mask = Image(np.moveaxis(np.zeros(SHAPE), axis, 0).copy(), np.eye(4)).data.copy()
     mask[:3] = 1.0
     mask = Image(np.moveaxis(mask, 0, axis), image.affine)
@@ -448,16 +521,24 @@ def test_boundary_and_outline_lie_between_the_same_pixels(worlds, signs):
     pixels = SliceView(mask, normal, 2).pixels
     place = SPACING[axis] * (np.flatnonzero(np.diff(pixels[:, 0]))[0] + 1)
     for axes in figure.axes:
-        np.testing.assert_array_equal(axes.images[0].get_array(), SliceView(image, normal, 2).pixels.T)
+        np.testing.assert_array_equal(
+            axes.images[0].get_array(), SliceView(image, normal, 2).pixels.T
+        )
         for drawn in lines(axes):
             np.testing.assert_allclose(drawn[..., 0], place, atol=1e-4)
-            np.testing.assert_allclose([drawn[..., 1].min(), drawn[..., 1].max()], [0.0, figure.axes[0].get_ylim()[1]])
-            assert np.abs(np.diff(drawn[..., 1], axis=1)).sum() == pytest.approx(figure.axes[0].get_ylim()[1])
+            np.testing.assert_allclose(
+                [drawn[..., 1].min(), drawn[..., 1].max()], [0.0, figure.axes[0].get_ylim()[1]]
+            )
+            assert np.abs(np.diff(drawn[..., 1], axis=1)).sum() == pytest.approx(
+                figure.axes[0].get_ylim()[1]
+            )
 
 
 @pytest.mark.parametrize("index", range(7))
 def test_a_closed_boundary_is_closed_in_every_slice(index):
-    """Also where nodes lie on the plane, as at index 3; and it holds what the cells' polygons hold."""
+    """Also where nodes lie on the plane, as at index 3; and it holds what the cells' polygons
+    hold.
+    """
     image = Image(np.zeros((9, 9, 7)))
     mesh = lattice_mesh(image, blocks=(3, 3, 2)) if index == 3 else bent(image, (3, 3, 2))
     on_box = (np.abs(image.to_index(mesh.points) - [4.0, 4.0, 3.0]) > [4.4, 4.4, 3.4]).any(axis=1)
@@ -469,11 +550,15 @@ def test_a_closed_boundary_is_closed_in_every_slice(index):
     polygons, _ = view.section(inner)
     assert (len(segments) > 0) == (len(polygons) > 0) == (1 < index < 5)
     if len(polygons):
-        np.testing.assert_allclose([ends.min(axis=0), ends.max(axis=0)], [polygons.min((0, 1)), polygons.max((0, 1))])
+        np.testing.assert_allclose(
+            [ends.min(axis=0), ends.max(axis=0)], [polygons.min((0, 1)), polygons.max((0, 1))]
+        )
 
 
 def test_the_detail_is_where_the_outline_bends_most():
-    """A half plane with a slot: the square of 25 voxels around the slot, marked in the whole slice."""
+    """A half plane with a slot: the square of 25 voxels around the slot, marked in the whole
+    slice.
+    """
     image = Image(np.zeros((80, 90)), np.diag([2.0, 2.0, 1.0]))
     mask = np.zeros((80, 90))
     mask[:40] = 1.0
@@ -499,7 +584,9 @@ def test_the_slice_is_in_the_middle_of_the_mask():
 @pytest.mark.parametrize("value", [0.0, 1.0])
 def test_a_mask_without_outline_can_be_drawn(tmp_path, value):
     image = noise(SHAPE)
-    figure = boundary_figure(image, Image(np.full(SHAPE, value)), lattice_mesh(image, blocks=(1, 1, 1)))
+    figure = boundary_figure(
+        image, Image(np.full(SHAPE, value)), lattice_mesh(image, blocks=(1, 1, 1))
+    )
     assert [len(drawn) for drawn in lines(figure.axes[0])] == [0, 0]
     save_figure(figure, tmp_path / "a.png", dpi=40)
 
@@ -511,7 +598,9 @@ def test_a_mask_of_another_shape_is_refused():
 
 
 def test_curved_cells_are_drawn_as_straight_pieces(tmp_path):
-    """Their outline is nearer to the disc than that of the corners; titles say so, and no title of straight cells."""
+    """Their outline is nearer to the disc than that of the corners; titles say so, and no title
+    of straight cells.
+    """
     labels = load_phantom("disc_2d").label_image()
     result = mesh_image(content(labels, labels), 300, order=2, iterations=6)
     mesh, view = result.mesh, SliceView(labels, None, None)
@@ -533,7 +622,9 @@ def test_curved_cells_are_drawn_as_straight_pieces(tmp_path):
         mask = Image(labels.data == 1, labels.affine)
         (legend,) = boundary_figure(labels, mask, each).legends
         assert legend.get_texts()[1].get_text().endswith(words) == is_curved
-        save_thumbnail(tmp_path / f"{is_curved}.png", labels, each, labels=labels, of_cell=result.labels)
+        save_thumbnail(
+            tmp_path / f"{is_curved}.png", labels, each, labels=labels, of_cell=result.labels
+        )
     assert (tmp_path / "True.png").read_bytes() != (tmp_path / "False.png").read_bytes()
 
 
@@ -544,7 +635,10 @@ def test_curved_cells_are_drawn_as_straight_pieces(tmp_path):
 @pytest.mark.parametrize("n", [2, 3])
 def test_histograms_are_fractions(n):
     image = noise(SHAPE[:n], np.diag([*SPACING[:n], 1.0]))
-    meshes = [("first", lattice_mesh(image, blocks=(2, 2, 2)[:n])), ("second", bent(image, (2, 3, 2)[:n]))]
+    meshes = [
+        ("first", lattice_mesh(image, blocks=(2, 2, 2)[:n])),
+        ("second", bent(image, (2, 3, 2)[:n])),
+    ]
     figure = histogram_figure(meshes)
     outlines = [p for p in figure.axes[0].patches if p.get_label()]
     assert [p.get_label().split(":")[0] for p in outlines] == ["first", "second"]
@@ -558,7 +652,17 @@ def test_histograms_are_fractions(n):
 
 def history(*E_D):
     return [
-        IterationRecord(k, 1.0 - 0.1 * k, 2.0 + 0.1 * k, value, 0.0 if k == 0 else 0.1**k, k == 2, 50, 99, float(k))
+        IterationRecord(
+            k,
+            1.0 - 0.1 * k,
+            2.0 + 0.1 * k,
+            value,
+            0.0 if k == 0 else 0.1**k,
+            k == 2,
+            50,
+            99,
+            float(k),
+        )
         for k, value in enumerate(E_D)
     ]
 
@@ -575,7 +679,8 @@ def test_energy_lines_hold_the_history():
         assert line.get_label().endswith(f": {line.get_ydata()[-1]:.3f}")
     np.testing.assert_array_equal(bottom.lines[0].get_xdata(), [1, 2, 3])
     np.testing.assert_allclose(bottom.lines[0].get_ydata(), [0.1, 0.01, 0.001])
-    assert [(p.get_x(), p.get_x() + p.get_width()) for p in top.patches] == [(1.5, 2.5)]  # connected anew in 2
+    # connected anew in 2
+    assert [(p.get_x(), p.get_x() + p.get_width()) for p in top.patches] == [(1.5, 2.5)]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -592,7 +697,10 @@ def run():
 @pytest.mark.drawn
 def test_pictures_are_written_and_not_blank(tmp_path, run):
     image, initial, result = run
-    paths = [tmp_path / name for name in ("slice.png", "rho.png", "energies.png", "boundary.png", "labels.png")]
+    paths = [
+        tmp_path / name
+        for name in ("slice.png", "rho.png", "energies.png", "boundary.png", "labels.png")
+    ]
     save_run_figures(paths[:3], image, initial, result)
     domain = Image(image.data / 9.0)
     save_figure(boundary_figure(image, domain, result.mesh), paths[3])

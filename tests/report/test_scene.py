@@ -16,7 +16,9 @@ from tetopt.report.scene import (
     view_of,
 )
 
-TILTED = np.array([[1.8, -0.5, 0.0, 7.0], [0.5, 1.8, 0.0, -20.0], [0.0, 0.0, 2.5, 3.0], [0.0, 0.0, 0.0, 1.0]])
+TILTED = np.array(
+    [[1.8, -0.5, 0.0, 7.0], [0.5, 1.8, 0.0, -20.0], [0.0, 0.0, 2.5, 3.0], [0.0, 0.0, 0.0, 1.0]]
+)
 
 
 def dark_ball(shape=(30, 32, 28), centre=(13.0, 15.0, 12.0), radius=7.0):
@@ -31,7 +33,9 @@ def dark_ball(shape=(30, 32, 28), centre=(13.0, 15.0, 12.0), radius=7.0):
 def test_dark_structure_surface_is_the_ball_without_the_sheet():
     image, inside = dark_ball()
     surface = dark_structure_surface(image, 50.0, inside)
-    distance = np.linalg.norm(image.to_index(np.asarray(surface.points)) - [13.0, 15.0, 12.0], axis=1)
+    distance = np.linalg.norm(
+        image.to_index(np.asarray(surface.points)) - [13.0, 15.0, 12.0], axis=1
+    )
     assert np.median(np.abs(distance - 7.0)) < 0.05
     assert distance.max() < 10.0  # two voxels of the sheet grow back, no more
     assert surface.volume == pytest.approx(
@@ -48,7 +52,10 @@ def test_scenes_are_drawn_side_by_side(tmp_path, opengl):
     image, _ = dark_ball()
     mesh = tetopt.lattice_mesh(image, nodes=300)
     cells = np.flatnonzero(tetopt.cell_moments(image, mesh).mean < 50.0)
-    scenes = [("one", slices_in_mesh(image, mesh)), ("two", structure_before_slices(image, mesh, cells))]
+    scenes = [
+        ("one", slices_in_mesh(image, mesh)),
+        ("two", structure_before_slices(image, mesh, cells)),
+    ]
     save_scenes(tmp_path / "a.png", scenes)
     pixels = np.asarray(PIL.Image.open(tmp_path / "a.png").convert("RGB")).astype(int)
     left, right = pixels[:, :1100], pixels[:, 1100:]

@@ -17,12 +17,16 @@ from tetopt.report.summary import SHOWN_VERSIONS, image_summary, mesh_hash, run_
 from tetopt.start.lattice import lattice_mesh
 from tetopt.system.files import save_json
 
-AFFINE = np.array([[0.0, 2.0, 5.0], [-1.5, 0.5, 7.0], [0.0, 0.0, 1.0]])  # 1.5 and sqrt(4.25) mm, 3 mm^2
+# 1.5 and sqrt(4.25) mm, 3 mm^2
+AFFINE = np.array([[0.0, 2.0, 5.0], [-1.5, 0.5, 7.0], [0.0, 0.0, 1.0]])
 
 
 @pytest.fixture(scope="module")
 def image():
-    return Image(np.random.default_rng(0).normal(50.0, 9.0, (12, 15)) + 40.0 * (np.arange(12)[:, None] > 5), AFFINE)
+    return Image(
+        np.random.default_rng(0).normal(50.0, 9.0, (12, 15)) + 40.0 * (np.arange(12)[:, None] > 5),
+        AFFINE,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +54,9 @@ def test_energies_are_those_of_the_meshes(summary, image, initial, result):
     assert energies["E_D_relative"] == pytest.approx(fit / fit_initial, rel=1e-9)
     assert energies["E"] == pytest.approx(0.8 * shape + 0.2 * fit / fit_initial, rel=1e-9)
     assert energies["E_D_fraction_of_variance"] == pytest.approx(fit / total, rel=1e-9)
-    assert energies["E_D_fraction_of_variance_initial"] == pytest.approx(fit_initial / total, rel=1e-9)
+    assert energies["E_D_fraction_of_variance_initial"] == pytest.approx(
+        fit_initial / total, rel=1e-9
+    )
     assert energies["E_D_relative"] < 0.9  # so that before and after differ
 
 
@@ -64,10 +70,16 @@ def test_the_summary_is_json(tmp_path, summary, initial, result):
     assert [row["E"] for row in back["history"]] == [row.E for row in result.history]
     for name, mesh in (("quality_initial", initial), ("quality", result.mesh)):
         shape = quality(mesh.points, mesh.cells)
-        assert (back[name]["errors"]["worst"], back[name]["kinds"]) == (shape.errors.worst, shape.kinds)
+        assert (back[name]["errors"]["worst"], back[name]["kinds"]) == (
+            shape.errors.worst,
+            shape.kinds,
+        )
     assert back["image_properties"]["affine"] == AFFINE.tolist()
     assert list(back["versions"]) == ["tetopt", "python", *SHOWN_VERSIONS]
-    assert (back["versions"]["tetopt"], back["versions"]["numpy"]) == (tetopt.__version__, np.__version__)
+    assert (back["versions"]["tetopt"], back["versions"]["numpy"]) == (
+        tetopt.__version__,
+        np.__version__,
+    )
 
 
 def test_image_properties(image):
@@ -78,12 +90,16 @@ def test_image_properties(image):
     assert properties["volume_mm"] == pytest.approx(180 * 3.0)
     assert (properties["min"], properties["max"]) == (image.data.min(), image.data.max())
     assert properties["mean"] == pytest.approx(image.data.mean())
-    assert properties["total_variation"] == pytest.approx(((image.data - image.data.mean()) ** 2).sum() * 3.0)
+    assert properties["total_variation"] == pytest.approx(
+        ((image.data - image.data.mean()) ** 2).sum() * 3.0
+    )
 
 
 def test_total_variation_is_E_D_of_one_cell_around_everything():
     image = Image(np.random.default_rng(0).normal(size=(5, 6, 7)), np.diag([0.5, 2.0, 3.0, 1.0]))
-    mesh = Mesh([[-99, -99, -99], [500, -99, -99], [-99, 500, -99], [-99, -99, 500]], [[0, 1, 2, 3]])
+    mesh = Mesh(
+        [[-99, -99, -99], [500, -99, -99], [-99, 500, -99], [-99, -99, 500]], [[0, 1, 2, 3]]
+    )
     assert image_summary(image)["total_variation"] == pytest.approx(E_D(image, mesh), rel=1e-9)
 
 

@@ -1,4 +1,6 @@
-"""The small picture of a subject: which side is which, proportions, what is drawn, and that it is small."""
+"""The small picture of a subject: which side is which, proportions, what is drawn, and that it
+is small.
+"""
 
 import io
 from itertools import pairwise
@@ -70,18 +72,29 @@ def test_left_is_left_and_front_is_up():
 
 
 def test_letters_say_which_side_is_which():
-    """L and P on the left of the views, R and A on the right; their shapes: an L has most of itself on its left."""
+    """L and P on the left of the views, R and A on the right; their shapes: an L has most of
+    itself on its left.
+    """
     image = ball()
     rgb = pixels(image, coarse(image))
     is_letter = rgb[-LETTER_ROWS:].min(axis=-1) > 60  # the mesh's orange has no blue
-    ends = [0, 12, SIDE_PIXELS - 12, SIDE_PIXELS, SIDE_PIXELS + 12, 2 * SIDE_PIXELS - 12, 2 * SIDE_PIXELS]
+    ends = [
+        0,
+        12,
+        SIDE_PIXELS - 12,
+        SIDE_PIXELS,
+        SIDE_PIXELS + 12,
+        2 * SIDE_PIXELS - 12,
+        2 * SIDE_PIXELS,
+    ]
     left, between, right, back, middle, front = (is_letter[:, a:b] for a, b in pairwise(ends))
     assert not between.any()
     assert not middle.any()
     assert min(each.sum() for each in (left, right, back, front)) >= 5
     of_left, of_back = (np.flatnonzero(each.any(axis=1)) for each in (left, back))
     assert left[of_left[-1]].sum() > left[of_left[0]].sum()  # an L stands on its long side
-    assert back[of_back[-1]].sum() < back[of_back[0] : of_back[-1]].sum(axis=1).max()  # a P on its short one
+    # a P on its short one
+    assert back[of_back[-1]].sum() < back[of_back[0] : of_back[-1]].sum(axis=1).max()
     plane = Image(image.data[:, :, 7], np.diag([1.0, 1.0, 1.0]))
     assert not (pixels(plane, coarse(plane))[-LETTER_ROWS:].min(axis=-1) > 60).any()
 
@@ -111,7 +124,8 @@ def test_voxels_of_other_lengths_keep_a_ball_round():
     for view in (rgb[:, :SIDE_PIXELS], rgb[:, SIDE_PIXELS:]):
         y, x = np.nonzero(view[:-LETTER_ROWS, :, 2] > 90)  # orange has no blue
         assert np.ptp(x) / np.ptp(y) == pytest.approx(1.0, abs=0.2)  # a fifth: voxels are 3 mm high
-        assert np.ptp(x) / SIDE_PIXELS == pytest.approx(24.0 / (1.16 * 50.0), abs=0.06)  # mm, of the side's
+        # mm, of the side's
+        assert np.ptp(x) / SIDE_PIXELS == pytest.approx(24.0 / (1.16 * 50.0), abs=0.06)
 
 
 def test_mesh_mask_and_labels_are_drawn():
@@ -119,7 +133,8 @@ def test_mesh_mask_and_labels_are_drawn():
     mesh, dark = coarse(image), Image(np.zeros(SHAPE), image.affine)
     plain = pixels(dark, mesh)
     red, green, blue = np.moveaxis(plain, -1, 0)
-    assert ((red > 200) & (green > 120) & (blue < 80)).sum() > 4 * 80  # the boundary, at least, in both views
+    # the boundary, at least, in both views
+    assert ((red > 200) & (green > 120) & (blue < 80)).sum() > 4 * 80
     masked = pixels(dark, mesh, Image(image.data / 100.0, image.affine))
     assert (masked[..., 2] > 150).sum() > 60 > (plain[..., 2] > 150).sum()
     labels = Image(image.data / 100.0, image.affine)

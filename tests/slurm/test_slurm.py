@@ -1,7 +1,9 @@
-"""A real SLURM of one node, this machine: Debian's slurm-wlm and munge, started by hand in a folder of ours.
+"""A real SLURM of one node, this machine: Debian's slurm-wlm and munge, started by hand in a folder
+of ours.
 
-Run by `make test-slurm`, which installs them. There are no control groups (linuxproc, task/none), so that SLURM grants
-memory and counts it but does not enforce it, and no database, so that `scontrol` tells of jobs, not `sacct`.
+Run by `make test-slurm`, which installs them. There are no control groups (linuxproc, task/none),
+so that SLURM grants memory and counts it but does not enforce it, and no database, so that
+`scontrol` tells of jobs, not `sacct`.
 """
 
 import getpass
@@ -23,7 +25,9 @@ from tetopt.io.meshes import load_mesh
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif("TETOPT_SLURM" not in os.environ, reason="starts daemons; run by make test-slurm"),
+    pytest.mark.skipif(
+        "TETOPT_SLURM" not in os.environ, reason="starts daemons; run by make test-slurm"
+    ),
 ]
 CONFIGURATION = """
 ClusterName=tetopt
@@ -70,7 +74,9 @@ def told(*command):
 @pytest.fixture(scope="module")
 def slurm():
     """Munge, the controller and one node; all of them end with the tests."""
-    missing = [name for name in ("munged", "slurmctld", "slurmd", "sbatch") if shutil.which(name) is None]
+    missing = [
+        name for name in ("munged", "slurmctld", "slurmd", "sbatch") if shutil.which(name) is None
+    ]
     assert missing == [], f"{missing}: install slurm-wlm and munge"
     # Short, as a socket's path may have 108 letters; for the owner alone, as munge demands.
     folder = Path("/tmp") / f"tetopt-slurm-{secrets.token_hex(4)}"
@@ -79,14 +85,24 @@ def slurm():
         (folder / name).mkdir()
     (folder / "munge.key").write_bytes(secrets.token_bytes(1024))
     (folder / "munge.key").chmod(0o600)
-    megabytes = int(re.search(r"MemTotal: +(\d+)", Path("/proc/meminfo").read_text()).group(1)) // 1024 - 500
+    megabytes = (
+        int(re.search(r"MemTotal: +(\d+)", Path("/proc/meminfo").read_text()).group(1)) // 1024
+        - 500
+    )
     (folder / "slurm.conf").write_text(
         CONFIGURATION.format(
-            host=socket.gethostname().split(".")[0], user=getpass.getuser(), folder=folder,
-            ports=(free_port(), free_port()), cores=os.cpu_count(), megabytes=megabytes,
+            host=socket.gethostname().split(".")[0],
+            user=getpass.getuser(),
+            folder=folder,
+            ports=(free_port(), free_port()),
+            cores=os.cpu_count(),
+            megabytes=megabytes,
         )
-    )  # fmt: skip
-    names = [f"--{name}={folder}/munge.{name.split('-')[0]}" for name in ("key-file", "socket", "pid-file", "log-file")]
+    )
+    names = [
+        f"--{name}={folder}/munge.{name.split('-')[0]}"
+        for name in ("key-file", "socket", "pid-file", "log-file")
+    ]
     os.environ["SLURM_CONF"] = str(folder / "slurm.conf")
     daemons = []
     try:
@@ -100,8 +116,15 @@ def slurm():
             log.close()
             time.sleep(1)
         ended = time.monotonic() + 60
-        while subprocess.run(["sinfo", "-h", "-o", "%T"], capture_output=True, text=True).stdout.strip() != "idle":
-            assert time.monotonic() < ended, "\n".join(path.read_text() for path in folder.glob("*.log"))
+        while (
+            subprocess.run(
+                ["sinfo", "-h", "-o", "%T"], capture_output=True, text=True
+            ).stdout.strip()
+            != "idle"
+        ):
+            assert time.monotonic() < ended, "\n".join(
+                path.read_text() for path in folder.glob("*.log")
+            )
             time.sleep(0.5)
         yield folder
         ended = time.monotonic() + 30  # a job that was cancelled completes
@@ -139,9 +162,15 @@ def study(image, tmp_path):
 
 
 def code_of(language, *changes):
-    """The page's block of a language that names SLURM, with other words in place of some of its own."""
+    """The page's block of a language that names SLURM, with other words in place of some of its
+    own.
+    """
     page = (ROOT / "docs" / "howto" / "clusters.md").read_text(encoding="utf-8")
-    (code,) = [each for each in re.findall(rf"```{language}\n(.*?)```", page, re.S) if "slurm" in each.lower()]
+    (code,) = [
+        each
+        for each in re.findall(rf"```{language}\n(.*?)```", page, re.S)
+        if "slurm" in each.lower()
+    ]
     for old, new in changes:
         assert code.count(old) == 1, old
         code = code.replace(old, new)
@@ -158,7 +187,9 @@ def checked(out):
 
 
 def test_the_program_of_the_page(slurm, study):
-    """Two jobs as workers; one is cancelled while its subject runs, which runs again, and a job takes its place."""
+    """Two jobs as workers; one is cancelled while its subject runs, which runs again, and a job
+    takes its place.
+    """
     port = free_port()
     program = code_of(
         "python",
@@ -169,16 +200,32 @@ def test_the_program_of_the_page(slurm, study):
     (study / "scheduler.py").write_text(program)
     before, out = set(jobs_of_slurm()), study / "out"
     command = [sys.executable, "scheduler.py"]
-    with subprocess.Popen(command, cwd=study, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as scheduler:
+    with subprocess.Popen(
+        command, cwd=study, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as scheduler:
         try:
             address = f"tcp://127.0.0.1:{port}"
             assert f":{port}: press Enter" in scheduler.stdout.readline()
-            words = ["cohort", "subjects.tsv", "-o", out, "--nodes", 500, "--iterations", 3, "--scheduler", address]
-            with subprocess.Popen([sys.executable, "-m", "tetopt", *map(str, words)], cwd=study) as run:
+            words = [
+                "cohort",
+                "subjects.tsv",
+                "-o",
+                out,
+                "--nodes",
+                500,
+                "--iterations",
+                3,
+                "--scheduler",
+                address,
+            ]
+            with subprocess.Popen(
+                [sys.executable, "-m", "tetopt", *map(str, words)], cwd=study
+            ) as run:
                 (job, *_) = until(lambda: under_way(out) and set(jobs_of_slurm()) - before)
                 subprocess.run(["scancel", str(job)], check=True)
                 assert run.wait(600) == 0
-            # The six may be done before the next job is requested; two are kept as long as the scheduler runs.
+            # The six may be done before the next job is requested; two are kept as long as the
+            # scheduler runs.
             until(lambda: len(set(jobs_of_slurm()) - before) >= 3)
         finally:
             scheduler.communicate("\n", timeout=60)
@@ -203,13 +250,20 @@ def until(condition):
 def test_the_job_array_of_the_page(slurm, study):
     """Six jobs into one folder, a subject each."""
     script = code_of(
-        "bash", ("1-50", "1-6"), ("--cpus-per-task=4 --mem=8G", "--cpus-per-task=1 --mem=1G"),
-        ("--nodes 20000", "--nodes 500 --iterations 3"), ("--threads 4", "--threads 1"),
-    )  # fmt: skip
+        "bash",
+        ("1-50", "1-6"),
+        ("--cpus-per-task=4 --mem=8G", "--cpus-per-task=1 --mem=1G"),
+        ("--nodes 20000", "--nodes 500 --iterations 3"),
+        ("--threads 4", "--threads 1"),
+    )
     assert script.count("tetopt cohort") == 1
     (study / "array.sh").write_text(script)
     environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
-    subprocess.run(["sbatch", "--wait", "array.sh"], cwd=study, env=environment, check=True, timeout=600)
+    subprocess.run(
+        ["sbatch", "--wait", "array.sh"], cwd=study, env=environment, check=True, timeout=600
+    )
     words = [study / "subjects.tsv", "-o", study / "OUT", "--collect"]
-    assert exit_code("cohort", *words) == 0, "\n".join(path.read_text() for path in study.glob("slurm-*.out"))
+    assert exit_code("cohort", *words) == 0, "\n".join(
+        path.read_text() for path in study.glob("slurm-*.out")
+    )
     checked(study / "OUT")

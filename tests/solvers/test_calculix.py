@@ -1,4 +1,6 @@
-"""CalculiX runs what `tetopt.io.abaqus` writes, and finds what our own elements and scikit-fem find."""
+"""CalculiX runs what `tetopt.io.abaqus` writes, and finds what our own elements and scikit-fem
+find.
+"""
 
 import re
 import shutil
@@ -26,7 +28,9 @@ from tetopt.model.model import Model, in_space, in_units
 from tetopt.model.sets import box_of, facet_triples, nodes_of, standard_sets, with_requested
 
 CCX = shutil.which("ccx")
-pytestmark = pytest.mark.skipif(CCX is None, reason="no CalculiX: ccx is not on the PATH (apt install calculix-ccx)")
+pytestmark = pytest.mark.skipif(
+    CCX is None, reason="no CalculiX: ccx is not on the PATH (apt install calculix-ccx)"
+)
 
 NU = 0.45
 PRINTED = 6e-7  # half a unit of the seventh digit, which is the last that CalculiX prints, at most
@@ -36,7 +40,8 @@ LOADS = {"compression": ["compress:5%"], "shear": ["hold:superior", "move:inferi
 class Answer(NamedTuple):
     """What CalculiX printed."""
 
-    tables: dict[tuple[str, str], np.ndarray]  # by quantity and set: rows of item and values; of sums, one row
+    # by quantity and set: rows of item and values; of sums, one row
+    tables: dict[tuple[str, str], np.ndarray]
     u: np.ndarray  # (N, 3) of the .frd file
     output: str
 
@@ -44,12 +49,18 @@ class Answer(NamedTuple):
 def answer(raw, folder):
     """Runs CalculiX on an input file; any error or warning that it prints fails the test."""
     (folder / "job.inp").write_bytes(raw)
-    run = subprocess.run([CCX, "job"], cwd=folder, capture_output=True, text=True, timeout=120, check=False)
+    run = subprocess.run(
+        [CCX, "job"], cwd=folder, capture_output=True, text=True, timeout=120, check=False
+    )
     output = run.stdout + run.stderr
     assert run.returncode == 0, output
     assert "Job finished" in output, output
     assert not re.search("error|warning", output, re.IGNORECASE), output
-    return Answer(tables((folder / "job.dat").read_text()), displacements((folder / "job.frd").read_text()), output)
+    return Answer(
+        tables((folder / "job.dat").read_text()),
+        displacements((folder / "job.frd").read_text()),
+        output,
+    )
 
 
 def tables(text):
@@ -58,7 +69,9 @@ def tables(text):
     for part in re.split(r"\n(?= [a-z])", text)[1:]:
         head, _, body = part.partition("\n")
         quantity, name = re.match(r" (.*?) (?:\(.*\) )?for set (\S+)", head).groups()
-        blocks[quantity, name.lower()] = np.array([line.split() for line in body.split("\n") if line], dtype=float)
+        blocks[quantity, name.lower()] = np.array(
+            [line.split() for line in body.split("\n") if line], dtype=float
+        )
     return blocks
 
 
@@ -76,9 +89,22 @@ def pressed_model(loading="compression"):
     mesh = tetopt.lattice_mesh(image, nodes=400)
     fields = tetopt.cell_fields(mesh, image)
     sets = standard_sets(mesh, box_of(image), (fields["mean"] > 15.0).astype(np.int64))
-    sets = with_requested(mesh, sets, ["dark-cells=below:20", "Patch=point:40,0,0:15"], fields["mean"])
-    table = binned(materials(0.5 + fields["mean"] / 7.0, NU, len(mesh.cells)), volumes(mesh.points, mesh.cells), 16)
-    return Model(mesh, fields, sets, table, parse_loads(LOADS[loading], mesh, sets), about={"image": "two spheres & ü"})
+    sets = with_requested(
+        mesh, sets, ["dark-cells=below:20", "Patch=point:40,0,0:15"], fields["mean"]
+    )
+    table = binned(
+        materials(0.5 + fields["mean"] / 7.0, NU, len(mesh.cells)),
+        volumes(mesh.points, mesh.cells),
+        16,
+    )
+    return Model(
+        mesh,
+        fields,
+        sets,
+        table,
+        parse_loads(LOADS[loading], mesh, sets),
+        about={"image": "two spheres & ü"},
+    )
 
 
 def prescribed(model, n_nodes, nodes_of_rows):
@@ -92,7 +118,9 @@ def prescribed(model, n_nodes, nodes_of_rows):
 
 def ours(model):
     """Displacement and energy by tetopt's elements."""
-    is_given, values = prescribed(model, len(model.mesh.points), lambda rows: nodes_of(model.mesh, rows))
+    is_given, values = prescribed(
+        model, len(model.mesh.points), lambda rows: nodes_of(model.mesh, rows)
+    )
     system = constrained(model.mesh, young_of(model), NU, is_given, values)
     u = solved(system)
     return u, 0.5 * float(u.ravel() @ (system.K @ u.ravel())), (system.K @ u.ravel()).reshape(-1, 3)
@@ -125,7 +153,9 @@ def test_energy_displacement_and_reactions_are_our_own(loading, tmp_path):
 
 
 def test_a_ratio_and_a_material_for_each_cell(tmp_path):
-    """All of a model's moduli and ratios reach their cells; ours as the sum of two matrices of one ratio each."""
+    """All of a model's moduli and ratios reach their cells; ours as the sum of two matrices of
+    one ratio each.
+    """
     model = sample_model(bins=None)
     printed = answer(abaqus(model), tmp_path)
     assert len(model.materials.young) > 50
@@ -133,7 +163,9 @@ def test_a_ratio_and_a_material_for_each_cell(tmp_path):
     assert len(np.unique(ratios)) == 2
     parts = [(ratios == nu, nu) for nu in np.unique(ratios)]
     young, mesh = young_of(model), model.mesh
-    K = sum(stiffness(Mesh(mesh.points, mesh.cells[is_in]), young[is_in], nu) for is_in, nu in parts).tocsr()
+    K = sum(
+        stiffness(Mesh(mesh.points, mesh.cells[is_in]), young[is_in], nu) for is_in, nu in parts
+    ).tocsr()
     is_given, values = prescribed(model, len(mesh.points), lambda rows: nodes_of(mesh, rows))
     free, u = np.flatnonzero(~is_given), values.ravel()
     u[free] = spsolve(K[free][:, free], -(K @ u)[free])
@@ -151,7 +183,8 @@ def test_megapascals_give_millijoules_and_lps_turns_the_displacement(tmp_path):
     np.testing.assert_allclose(1e3 * energy(in_mpa), energy(printed), rtol=2.0 * PRINTED)
     assert_printed(in_mpa.u, printed.u, 1e-5)
     in_metres = answer(abaqus(in_units(model, "Pa")), tmp_path)
-    np.testing.assert_allclose(1e6 * energy(in_metres), energy(printed), rtol=2.0 * PRINTED)  # uJ in a J
+    # uJ in a J
+    np.testing.assert_allclose(1e6 * energy(in_metres), energy(printed), rtol=2.0 * PRINTED)
     assert_printed(1e3 * in_metres.u, printed.u, 1e-5)
     turned = answer(abaqus(in_space(model, "lps")), tmp_path)
     np.testing.assert_allclose(energy(turned), energy(printed), rtol=2.0 * PRINTED)
@@ -159,19 +192,24 @@ def test_megapascals_give_millijoules_and_lps_turns_the_displacement(tmp_path):
 
 
 def second_order(model):
-    """scikit-fem's quadratic solution on the same tetrahedra: displacement at the model's nodes, energy."""
+    """scikit-fem's quadratic solution on the same tetrahedra: displacement at the model's nodes,
+    energy.
+    """
     mesh = skfem.MeshTet(model.mesh.points.T.copy(), model.mesh.cells.T.copy())
     basis = skfem.Basis(mesh, skfem.ElementVector(skfem.ElementTetP2()), intorder=2)
     lame, mu = lame_constants(young_of(model), NU, 3)
 
     @skfem.BilinearForm
     def form(u, v, w):
-        return w.lame * trace(sym_grad(u)) * trace(sym_grad(v)) + 2.0 * w.mu * ddot(sym_grad(u), sym_grad(v))
+        return w.lame * trace(sym_grad(u)) * trace(sym_grad(v)) + 2.0 * w.mu * ddot(
+            sym_grad(u), sym_grad(v)
+        )
 
     by_cell = basis.with_element(skfem.ElementTetP0())
     K = form.assemble(basis, lame=by_cell.interpolate(lame), mu=by_cell.interpolate(mu))
     u, fixed = np.zeros(basis.N), []
-    for load, side in zip(model.loads, (30.0, -30.0), strict=True):  # z of the block's faces, held first
+    # z of the block's faces, held first
+    for load, side in zip(model.loads, (30.0, -30.0), strict=True):
         for d in range(3):
             dofs = np.flatnonzero(np.abs(basis.doflocs[2] - side) < 1e-9)
             dofs = np.intersect1d(dofs, np.concatenate([basis.nodal_dofs[d], basis.edge_dofs[d]]))
@@ -193,7 +231,9 @@ def test_quadratic_cells_are_scikit_fem_s(tmp_path):
 
 @pytest.mark.parametrize("order", [1, 2])
 def test_every_set_arrives(order, tmp_path):
-    """Asked for by name, CalculiX lists the members of node and element sets, though surfaces share their names."""
+    """Asked for by name, CalculiX lists the members of node and element sets, though surfaces
+    share their names.
+    """
     model = pressed_model()._replace(order=order)
     cells = quadratic(model.mesh.points, model.mesh.cells)[1] if order == 2 else model.mesh.cells
     requests = [f"*NODE PRINT, NSET={name}\nU\n" for name in model.sets.facets]
@@ -208,7 +248,9 @@ def test_every_set_arrives(order, tmp_path):
 
 
 def test_pressure_on_each_surface_pushes_its_facets_inwards(tmp_path):
-    """Of 1 kPa on a facet, each of its nodes takes a third; nodes on a held side also bear what holds them."""
+    """Of 1 kPa on a facet, each of its nodes takes a third; nodes on a held side also bear what
+    holds them.
+    """
     model = pressed_model()
     mesh, every = model.mesh, f"*NSET, NSET=every, GENERATE\n1, {len(model.mesh.points)}\n"
     for name, rows in model.sets.facets.items():
@@ -227,13 +269,17 @@ def test_pressure_on_each_surface_pushes_its_facets_inwards(tmp_path):
 
 
 def test_numbers_of_full_length_arrive(tmp_path):
-    """A mesh near 0, where 17 digits and an exponent would be cut off: as stiff as it is without rounding."""
+    """A mesh near 0, where 17 digits and an exponent would be cut off: as stiff as it is without
+    rounding.
+    """
     model = pressed_model()
     shrunk = Mesh(model.mesh.points * (np.pi * 1e-6), model.mesh.cells)
     assert max(len(repr(x)) for x in shrunk.points.ravel().tolist()) > 20
     loads = tuple(load._replace(numbers=load.numbers * (np.pi * 1e-6)) for load in model.loads)
     small = model._replace(mesh=shrunk, loads=loads)
-    np.testing.assert_allclose(energy(answer(abaqus(small), tmp_path)), ours(small)[1], rtol=PRINTED)
+    np.testing.assert_allclose(
+        energy(answer(abaqus(small), tmp_path)), ours(small)[1], rtol=PRINTED
+    )
 
 
 # Every kind of load, both orders, moduli of cells and moduli that vary within them
@@ -248,11 +294,14 @@ def test_each_load_is_what_fem_makes_of_it(case, order, moduli, tmp_path):
     np.testing.assert_allclose(energy(printed), own.strain_energy, rtol=PRINTED)
     assert own.strain_energy > 1.0
     assert_printed(printed.u, own.u, 6e-6)
-    if case in ("gravity", "all"):  # what CalculiX prints leaves out what acts on the held nodes themselves
+    # what CalculiX prints leaves out what acts on the held nodes themselves
+    if case in ("gravity", "all"):
         return
     for name in {load.set_name for load in model.loads if load.kind == "displacement"}:
         total = printed.tables["total force", name].ravel()
-        np.testing.assert_allclose(total, own.reactions[name], rtol=0.0, atol=1e-5 * np.abs(own.reactions[name]).max())
+        np.testing.assert_allclose(
+            total, own.reactions[name], rtol=0.0, atol=1e-5 * np.abs(own.reactions[name]).max()
+        )
 
 
 STEPS = [
@@ -264,10 +313,14 @@ STEPS = [
 
 @pytest.mark.parametrize("order", [1, 2])
 def test_each_step_is_a_case_of_its_own(order, tmp_path):
-    """Nothing of a step is left in the next: pressures, forces, weights and displacements come and go."""
+    """Nothing of a step is left in the next: pressures, forces, weights and displacements come
+    and go.
+    """
     model = loaded_model(STEPS, order=order)
     answer(abaqus(model), tmp_path)
-    totals = re.findall(r"total internal energy.*\n\s*\n\s*(\S+)", (tmp_path / "job.dat").read_text())
+    totals = re.findall(
+        r"total internal energy.*\n\s*\n\s*(\S+)", (tmp_path / "job.dat").read_text()
+    )
     blocks = (tmp_path / "job.frd").read_text().split(" DISP ")[1:]
     assert len(totals) == len(blocks) == 5
     for step, (total, block) in enumerate(zip(totals, blocks, strict=True), 1):
@@ -299,7 +352,9 @@ def test_lps_and_megapascals_are_the_same_loads(tmp_path):
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize("kind", ["compress", "pressure"])
 def test_large_deformation_begins_as_the_linear_step(kind, order, moduli, tmp_path):
-    """A hundredth of the load: the same within a few per cent of that hundredth; the whole of it runs, and differs."""
+    """A hundredth of the load: the same within a few per cent of that hundredth; the whole of it
+    runs, and differs.
+    """
     energies = []
     for fraction in (0.01, 1.0):
         pressed = ["hold:superior", f"pressure:inferior:{0.1 * fraction}"]

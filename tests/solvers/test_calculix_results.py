@@ -16,7 +16,9 @@ import tetopt
 from tetopt.io.frd import read_frd
 
 CCX = shutil.which("ccx")
-pytestmark = pytest.mark.skipif(CCX is None, reason="no CalculiX: ccx is not on the PATH (apt install calculix-ccx)")
+pytestmark = pytest.mark.skipif(
+    CCX is None, reason="no CalculiX: ccx is not on the PATH (apt install calculix-ccx)"
+)
 
 
 def run(folder, name):
@@ -28,27 +30,65 @@ def test_the_files_that_reading_is_tested_with_are_what_it_writes(order, tmp_pat
     (tmp_path / "job.inp").write_bytes(input_file(order))
     run(tmp_path, "job")
     mesh = solved_model(order).mesh
-    anew, kept = (read_frd(path, mesh) for path in (tmp_path / "job.frd", FOLDER / f"order_{order}.frd"))
+    anew, kept = (
+        read_frd(path, mesh) for path in (tmp_path / "job.frd", FOLDER / f"order_{order}.frd")
+    )
     assert list(anew.point_data) == list(kept.point_data)
     for name, values in kept.point_data.items():
-        np.testing.assert_allclose(anew.point_data[name], values, rtol=0.0, atol=1e-5 * np.abs(values).max())
+        np.testing.assert_allclose(
+            anew.point_data[name], values, rtol=0.0, atol=1e-5 * np.abs(values).max()
+        )
 
 
 @pytest.mark.parametrize("units", ["MPa", "Pa"])
 def test_from_image_to_solver_and_back(tmp_path, units):
-    """By the commands, in other units and LPS there: the displacements are those of `tetopt fem`."""
+    """By the commands, in other units and LPS there: the displacements are those of `tetopt
+    fem`.
+    """
     image = tetopt.load_phantom("two_spheres").image(voxel_mm=4.0)
     tetopt.save_image(tmp_path / "a.nii.gz", image)
     mapping = ["--young", "0.5 + h/7", "--nu", "0.3"]
-    mesh = ["mesh", tmp_path / "a.nii.gz", "-o", tmp_path / "a.vtu", "--spacing", "12", "--iterations", "0"]
+    mesh = [
+        "mesh",
+        tmp_path / "a.nii.gz",
+        "-o",
+        tmp_path / "a.vtu",
+        "--spacing",
+        "12",
+        "--iterations",
+        "0",
+    ]
     assert exit_code(*mesh) == 0
-    inp = ["convert", tmp_path / "a.vtu", tmp_path / "a.inp", "--image", tmp_path / "a.nii.gz", *mapping]
+    inp = [
+        "convert",
+        tmp_path / "a.vtu",
+        tmp_path / "a.inp",
+        "--image",
+        tmp_path / "a.nii.gz",
+        *mapping,
+    ]
     assert exit_code(*inp, "--load", "compress:3%", "--units", units, "--space", "lps") == 0
     run(tmp_path, "a")
-    assert exit_code("convert", tmp_path / "a.vtu", tmp_path / "b.vtu", "--results", tmp_path / "a.frd") == 0
-    fem = ["fem", tmp_path / "a.nii.gz", tmp_path / "a.vtu", *mapping, "--compress", "3", "-o", tmp_path / "c.vtu"]
+    assert (
+        exit_code(
+            "convert", tmp_path / "a.vtu", tmp_path / "b.vtu", "--results", tmp_path / "a.frd"
+        )
+        == 0
+    )
+    fem = [
+        "fem",
+        tmp_path / "a.nii.gz",
+        tmp_path / "a.vtu",
+        *mapping,
+        "--compress",
+        "3",
+        "-o",
+        tmp_path / "c.vtu",
+    ]
     assert exit_code(*fem) == 0
-    theirs, ours = (tetopt.load_mesh(tmp_path / name).point_data["displacement"] for name in ("b.vtu", "c.vtu"))
+    theirs, ours = (
+        tetopt.load_mesh(tmp_path / name).point_data["displacement"] for name in ("b.vtu", "c.vtu")
+    )
     np.testing.assert_allclose(theirs, ours, rtol=0.0, atol=1e-5 * np.abs(ours).max())
     assert np.abs(ours).max() > 1.5
 
@@ -60,7 +100,10 @@ def test_an_organ_is_pressed_and_its_displacement_is_on_the_voxels(tmp_path, mon
     lines = [shlex.split(line) for line in block.replace("\\\n", " ").splitlines()]
     assert [words[0] for words in lines] == ["tetopt", "tetopt", "ccx", "tetopt"]
     place = np.indices((36, 30, 32))
-    near = [np.sqrt(sum((x - c) ** 2 for x, c in zip(place, at, strict=True))) for at in ((14, 14, 14), (22, 15, 17))]
+    near = [
+        np.sqrt(sum((x - c) ** 2 for x, c in zip(place, at, strict=True)))
+        for at in ((14, 14, 14), (22, 15, 17))
+    ]
     seg = np.where(np.minimum(*near) <= 10, 5, np.where(place[2] > 26, 3, 0))
     affine = np.diag([-2.0, 2.0, 2.0, 1.0])
     affine[:3, 3] = 40.0, -70.0, 900.0

@@ -1,4 +1,6 @@
-"""Our XDMF files in FEniCSx: read by the program in the writer's docstring, every bit of it, and pressed there."""
+"""Our XDMF files in FEniCSx: read by the program in the writer's docstring, every bit of it, and
+pressed there.
+"""
 
 import os
 import subprocess
@@ -7,7 +9,14 @@ import textwrap
 
 import numpy as np
 import pytest
-from models import LOAD_CASES, loaded_model, our_compression, sample_model, with_one_ratio, with_two_sides
+from models import (
+    LOAD_CASES,
+    loaded_model,
+    our_compression,
+    sample_model,
+    with_one_ratio,
+    with_two_sides,
+)
 from scipy.spatial import KDTree
 
 import tetopt.io.xdmf
@@ -89,7 +98,9 @@ np.savez("read.npz", **read)
 
 
 def pressed_model(n):
-    """A model of one ratio, with sets that overlap: the interface from both sides, and cells twice."""
+    """A model of one ratio, with sets that overlap: the interface from both sides, and cells
+    twice.
+    """
     model = with_two_sides(with_one_ratio(sample_model(n, None), NU))
     cell_sets = model.sets.cells | {"bright_cells": model.sets.cells["label_1"]}
     return model._replace(sets=model.sets._replace(cells=cell_sets))
@@ -104,7 +115,10 @@ def python_with_dolfinx():
     """dolfinx comes by conda or with the system, seldom into a virtual environment."""
     looked = "import importlib.util, sys; sys.exit(importlib.util.find_spec('dolfinx') is None)"
     for python in (sys.executable, "/usr/bin/python3"):
-        if os.path.exists(python) and subprocess.run([python, "-c", looked], env=environment()).returncode == 0:
+        if (
+            os.path.exists(python)
+            and subprocess.run([python, "-c", looked], env=environment()).returncode == 0
+        ):
             return python
     return pytest.skip("no Python with dolfinx (FEniCSx), as Debian's python3-dolfinx brings it")
 
@@ -130,7 +144,11 @@ def run(program, folder):
     """Has dolfinx run a program in a folder."""
     folder.joinpath("run.py").write_text(program)
     done = subprocess.run(
-        [python_with_dolfinx(), "run.py"], cwd=folder, env=environment(), capture_output=True, text=True
+        [python_with_dolfinx(), "run.py"],
+        cwd=folder,
+        env=environment(),
+        capture_output=True,
+        text=True,
     )
     if "CompileError" in done.stderr:
         pytest.skip("dolfinx finds no C compiler for its forms")
@@ -157,7 +175,9 @@ def test_dolfinx_reads_mesh_and_moduli_exactly_though_in_another_order(answer):
 
 def test_dolfinx_finds_every_set_by_its_name(answer):
     model, read = answer
-    facets = {name: facet_triples(model.mesh.cells, rows) for name, rows in model.sets.facets.items()}
+    facets = {
+        name: facet_triples(model.mesh.cells, rows) for name, rows in model.sets.facets.items()
+    }
     for name, triples in facets.items():
         assert same_rows(read[f"facets {name}"], triples), name
     for name, cells in model.sets.cells.items():
@@ -252,13 +272,16 @@ def solved_cases(tmp_path_factory):
         loaded = LOADED.format(order=order, is_nodal=moduli == "nodes")
         programs.append(f"{BEFORE}{reading}{loaded}{applying}{AT_NODES}{SOLVE_LOADED}")
     each = (
-        "import os\nfor number, program in enumerate({}):\n    os.chdir({!r} + str(number))\n    exec(program, {{}})\n"
+        "import os\nfor number, program in enumerate({}):\n    os.chdir({!r} + "
+        "str(number))\n    exec(program, {{}})\n"
     )
     run(each.format(programs, f"{folder}/"), folder)
     return folder
 
 
-@pytest.mark.parametrize("number", range(len(CASES)), ids=lambda number: "-".join(map(str, CASES[number])))
+@pytest.mark.parametrize(
+    "number", range(len(CASES)), ids=lambda number: "-".join(map(str, CASES[number]))
+)
 def test_each_load_is_what_fem_makes_of_it(solved_cases, number):
     """Displacements found by their places, which dolfinx orders otherwise."""
     case, n, order, moduli = CASES[number]

@@ -1,4 +1,6 @@
-"""Our MFEM files pressed by MFEM itself: sets by name, moduli by attribute, and the energy of our own solver."""
+"""Our MFEM files pressed by MFEM itself: sets by name, moduli by attribute, and the energy of
+our own solver.
+"""
 
 import numpy as np
 import pytest
@@ -14,16 +16,21 @@ NU = 0.4
 
 
 def pressed(path, model):
-    """Displacement (N, n) and strain energy by MFEM, of the mesh in a file with the constants and loads of a model."""
+    """Displacement (N, n) and strain energy by MFEM, of the mesh in a file with the constants
+    and loads of a model.
+    """
     mesh = ser.Mesh(str(path), 1, 0)
     n = mesh.Dimension()
-    space = ser.FiniteElementSpace(mesh, ser.H1_FECollection(model.order, n), n, ser.Ordering.byVDIM)
+    space = ser.FiniteElementSpace(
+        mesh, ser.H1_FECollection(model.order, n), n, ser.Ordering.byVDIM
+    )
     lame, mu = ser.Vector(mesh.attributes.Max()), ser.Vector(mesh.attributes.Max())
     for k, constants in enumerate(np.transpose(lame_constants(model.materials.young, NU, n)), 1):
         for attribute in mesh.attribute_sets.GetAttributeSet(f"material_{k}").ToList():
             lame[attribute - 1], mu[attribute - 1] = constants.tolist()
     lame_of, mu_of = ser.PWConstCoefficient(lame), ser.PWConstCoefficient(mu)
-    form, whole = ser.BilinearForm(space), ser.BilinearForm(space)  # the first loses its prescribed rows and columns
+    # the first loses its prescribed rows and columns
+    form, whole = ser.BilinearForm(space), ser.BilinearForm(space)
     for each in (form, whole):
         each.AddDomainIntegrator(ser.ElasticityIntegrator(lame_of, mu_of))
         each.Assemble()
@@ -32,7 +39,9 @@ def pressed(path, model):
     u.Assign(0.0)
     for load in model.loads:
         marker = mesh.bdr_attribute_sets.GetAttributeSetMarker(load.set_name)
-        u.ProjectBdrCoefficient(ser.VectorConstantCoefficient(ser.Vector(load.numbers.tolist())), marker)
+        u.ProjectBdrCoefficient(
+            ser.VectorConstantCoefficient(ser.Vector(load.numbers.tolist())), marker
+        )
         dofs = ser.intArray()
         space.GetEssentialTrueDofs(marker, dofs)
         prescribed.Append(dofs)

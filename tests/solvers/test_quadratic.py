@@ -1,4 +1,5 @@
-"""Files of order 2 pressed by others as they read them: dolfinx (XDMF), scikit-fem through meshio (VTU, gmsh).
+"""Files of order 2 pressed by others as they read them: dolfinx (XDMF), scikit-fem through meshio
+(VTU, gmsh).
 
 MFEM is in `test_pymfem`, CalculiX in `test_calculix`.
 """
@@ -19,7 +20,8 @@ from tetopt.model.sets import facet_triples
 
 NU = 0.4
 
-# Each set's facets as the places of their corners, and the strain energy, of elements of the mesh's own order.
+# Each set's facets as the places of their corners, and the strain energy, of elements of the mesh's
+# own order.
 DOLFINX = """
 import json
 
@@ -76,14 +78,18 @@ def pressed_model(n):
 
 @pytest.mark.parametrize("n", [3, 2])
 def test_dolfinx(n, tmp_path):
-    """Nodes to the last bit, sets by name, and the energy: measured within 4e-14 of ours. Its own file is read, too."""
+    """Nodes to the last bit, sets by name, and the energy: measured within 4e-14 of ours. Its
+    own file is read, too.
+    """
     python, model = python_with_dolfinx(), pressed_model(n)
     save_model(tmp_path / "model.xdmf", model)
     loads = {load.set_name: load.numbers.tolist() for load in model.loads}
     tmp_path.joinpath("loads.json").write_text(str(loads).replace("'", '"'))
     program = snippet().replace('"superior"', f'"{model.loads[0].set_name}"')
     tmp_path.joinpath("read.py").write_text(BEFORE + program + DOLFINX)
-    done = subprocess.run([python, "read.py"], cwd=tmp_path, env=environment(), capture_output=True, text=True)
+    done = subprocess.run(
+        [python, "read.py"], cwd=tmp_path, env=environment(), capture_output=True, text=True
+    )
     if "CompileError" in done.stderr:
         pytest.skip("dolfinx finds no C compiler for its forms")
     assert done.returncode == 0, done.stderr
@@ -97,18 +103,23 @@ def test_dolfinx(n, tmp_path):
             assert np.array_equal(np.sort(read[f"cells {name}"]), members), name
         ours = solve(model)
         assert float(read["energy"]) == pytest.approx(ours.strain_energy, rel=1e-11)
-    pressed = load_mesh(tmp_path / "pressed_p0_000000.vtu")  # of VTK's Lagrange cells, in dolfinx's order of nodes
+    # of VTK's Lagrange cells, in dolfinx's order of nodes
+    pressed = load_mesh(tmp_path / "pressed_p0_000000.vtu")
     assert (pressed.order, list(pressed.point_data)) == (2, ["displacement"])
     back = quadratic(pressed.mesh.points, pressed.mesh.cells)[0]
     off, node = KDTree(back).query(points)
     assert off.max() < 1e-12
-    np.testing.assert_allclose(pressed.point_data["displacement"][node, :n], ours.u, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(
+        pressed.point_data["displacement"][node, :n], ours.u, rtol=0, atol=1e-11
+    )
 
 
 @pytest.mark.parametrize("suffix", ["vtu", "vtk"])
 @pytest.mark.parametrize("n", [3, 2])
 def test_scikit_fem_through_meshio(n, suffix, tmp_path):
-    """Its quadratic mesh of meshio's cells, sets from the file's point data: displacement and energy are ours."""
+    """Its quadratic mesh of meshio's cells, sets from the file's point data: displacement and
+    energy are ours.
+    """
     meshio, skfem = pytest.importorskip("meshio"), pytest.importorskip("skfem")
     elasticity = pytest.importorskip("skfem.models.elasticity")
     model, path = pressed_model(n), tmp_path / f"model.{suffix}"
@@ -117,14 +128,22 @@ def test_scikit_fem_through_meshio(n, suffix, tmp_path):
     plain = meshio.Mesh(file.points[:, :n], file.cells)
     mesh = pytest.importorskip("skfem.io").from_meshio(plain)
     assert isinstance(mesh, skfem.MeshTet2 if n == 3 else skfem.MeshTri2)
-    basis = skfem.Basis(mesh, skfem.ElementVector(skfem.ElementTetP2() if n == 3 else skfem.ElementTriP2()), intorder=2)
+    basis = skfem.Basis(
+        mesh,
+        skfem.ElementVector(skfem.ElementTetP2() if n == 3 else skfem.ElementTriP2()),
+        intorder=2,
+    )
     on_cells = basis.with_element(skfem.ElementTetP0() if n == 3 else skfem.ElementTriP0())
     law = elasticity.lame_parameters if n == 3 else elasticity.plane_stress
     moduli = law(file.cell_data["young"][0].astype(float).ravel(), NU)
-    K = elasticity.linear_elasticity(*(np.asarray(on_cells.interpolate(each)) for each in moduli)).assemble(basis)
+    K = elasticity.linear_elasticity(
+        *(np.asarray(on_cells.interpolate(each)) for each in moduli)
+    ).assemble(basis)
     ours = solve(model)
     u, prescribed, of_node = basis.zeros(), [], []
-    for d, dofs in enumerate(np.hstack([basis.nodal_dofs, basis.edge_dofs if n == 3 else basis.facet_dofs])):
+    for d, dofs in enumerate(
+        np.hstack([basis.nodal_dofs, basis.edge_dofs if n == 3 else basis.facet_dofs])
+    ):
         off, node = KDTree(file.points[:, :n]).query(basis.doflocs[:, dofs].T)
         assert off.max() < 1e-12
         of_node.append(dofs[np.argsort(node)])

@@ -1,4 +1,6 @@
-"""A model pressed by scikit-fem: sets by name, moduli cell by cell, and the energy of our own solver."""
+"""A model pressed by scikit-fem: sets by name, moduli cell by cell, and the energy of our own
+solver.
+"""
 
 import numpy as np
 import pytest
@@ -26,7 +28,9 @@ def pressed(model):
     table = model.materials
     law = elasticity.lame_parameters if n == 3 else elasticity.plane_stress
     on_cells = basis.with_element(constant)
-    lame, mu = (np.asarray(on_cells.interpolate(c[table.of_cell])) for c in law(table.young, table.nu))
+    lame, mu = (
+        np.asarray(on_cells.interpolate(c[table.of_cell])) for c in law(table.young, table.nu)
+    )
     K = elasticity.linear_elasticity(lame, mu).assemble(basis)
     u, fixed = basis.zeros(), []
     for load in model.loads:
@@ -93,7 +97,11 @@ def loaded(model):
             continue
         side = skfem.FacetBasis(mesh, element, facets=mesh.boundaries[load.set_name], intorder=2)
         ones = np.ones_like(side.normals)
-        stress = {"pressure": -vector * side.normals, "traction": vector * ones, "spring": vector * ones}[load.kind]
+        stress = {
+            "pressure": -vector * side.normals,
+            "traction": vector * ones,
+            "spring": vector * ones,
+        }[load.kind]
         target = springs if load.kind == "spring" else forces
         target += push.assemble(side, force=np.asarray(stress))
     dofs = np.unique(np.concatenate(prescribed)) if prescribed else np.empty(0, dtype=np.int64)

@@ -22,13 +22,17 @@ def pieces():
 
 def test_each_component_of_the_mask_keeps_its_largest(pieces):
     target, _, result = pieces
-    assert components(result.mesh.cells).max() + 1 == scipy.ndimage.label(target.region.inside)[1] == 2
+    assert (
+        components(result.mesh.cells).max() + 1 == scipy.ndimage.label(target.region.inside)[1] == 2
+    )
     assert result.n_dropped == 0
     assert carved(result.mesh, target.image, target.region).is_kept.all()
 
 
 def test_components_that_the_mask_does_not_have_are_dropped_unless_they_are_kept(pieces):
-    """Loose cells beside the ball: single ones go, a half of the ball stays, and so does a twentieth."""
+    """Loose cells beside the ball: single ones go, a half of the ball stays, and so does a
+    twentieth.
+    """
     image, _ = shaped("ball")
     mask = tetopt.Image(1.0 * (distance(image.shape, 13.3, 14.1, 15.7) < 11.0))
     target = content(image, mask=mask)
@@ -57,10 +61,14 @@ def test_components_that_the_mask_does_not_have_are_dropped_unless_they_are_kept
 def test_what_a_mesh_tears_off_is_kept_and_told():
     """A ball with a bulb at a thin winding tail, which octree cells of that size tear."""
     image, _ = shaped("ball")
-    inside = (distance(image.shape, 13.3, 14.1, 9.7) < 8.0) | (distance(image.shape, 10.5, 16.6, 24.5) < 2.3)
+    inside = (distance(image.shape, 13.3, 14.1, 9.7) < 8.0) | (
+        distance(image.shape, 10.5, 16.6, 24.5) < 2.3
+    )
     for k in range(7):
         i, j = k // 2, (k + 1) // 2
-        inside[13 - j, 14 + i, 16 + k] = inside[13 - i, 14 + i, 16 + k] = inside[13 - j, 14 + j, 16 + k] = True
+        inside[13 - j, 14 + i, 16 + k] = inside[13 - i, 14 + i, 16 + k] = inside[
+            13 - j, 14 + j, 16 + k
+        ] = True
     mask = tetopt.Image(1.0 * inside)
     target = content(image, mask=mask)
     assert scipy.ndimage.label(target.region.inside)[1] == 1
@@ -69,7 +77,8 @@ def test_what_a_mesh_tears_off_is_kept_and_told():
     assert components(result.mesh.cells).max() == 1
     assert list(result.violated) == ["components"]
     labels = tetopt.Image(np.where(distance(image.shape, 10.5, 16.6, 24.5) < 2.3, 7.0, 3.0))
-    named = tetopt.mesh_image(content(image, labels, mask), 400, iterations=1)  # the bulb is a label of its own
+    # the bulb is a label of its own
+    named = tetopt.mesh_image(content(image, labels, mask), 400, iterations=1)
     assert (named.n_dropped, set(named.labels.tolist())) == (0, {3, 7})
     kept = tetopt.mesh_image(content(image, mask=mask, keep_components=True), 400, iterations=3)
     assert kept.n_dropped == 0

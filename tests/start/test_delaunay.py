@@ -27,7 +27,12 @@ def as_set(cells):
 
 
 def grid_nodes(*sizes):
-    return np.stack(np.meshgrid(*map(np.arange, sizes), indexing="ij"), axis=-1).reshape(-1, len(sizes)) * 1.0
+    return (
+        np.stack(np.meshgrid(*map(np.arange, sizes), indexing="ij"), axis=-1).reshape(
+            -1, len(sizes)
+        )
+        * 1.0
+    )
 
 
 def random_box_nodes(rng, n, n_nodes, per_wall=0.1):
@@ -58,7 +63,9 @@ def check_tiling(index, cells, box):
 
 @given(seeds, dimensions)
 def test_generic_nodes_get_scipy_s_cells(seed, n):
-    """Random nodes without a box around them: the cells as sets of nodes, in the world of a sheared affine."""
+    """Random nodes without a box around them: the cells as sets of nodes, in the world of a
+    sheared affine.
+    """
     rng = np.random.default_rng(seed)
     index, affine = rng.uniform(0, 10, (int(rng.integers(n + 3, 80)), n)), random_affine(rng, n)
     assert as_set(delaunay(index, affine)) == as_set(Delaunay(world(index, affine)).simplices)
@@ -81,7 +88,9 @@ def test_cells_tile_the_box(seed, n):
 
 @pytest.mark.parametrize("sizes", [(2, 2), (3, 4), (9, 9), (2, 2, 2), (4, 3, 5), (6, 6, 6)])
 def test_a_cubic_grid_has_no_flat_cell(sizes):
-    """Cells with corners on a unit cube have 1/2, or 1/6 or 1/3; Qhull by itself makes cells of 0 here."""
+    """Cells with corners on a unit cube have 1/2, or 1/6 or 1/3; Qhull by itself makes cells of
+    0 here.
+    """
     index = grid_nodes(*sizes)
     n = len(sizes)
     cells = delaunay(index, IDENTITY[n])
@@ -94,7 +103,9 @@ def test_a_cubic_grid_has_no_flat_cell(sizes):
 
 @pytest.mark.parametrize(("n", "kind"), [(2, "criss-cross"), (3, "bcc"), (3, "five-tet")])
 def test_nodes_of_lattices(n, kind):
-    image = Image(np.zeros((12, 9, 10)[:n]), np.diag([-1.0, 1.0, 1.0, 1.0])[-n - 1 :, -n - 1 :] * 1.0)
+    image = Image(
+        np.zeros((12, 9, 10)[:n]), np.diag([-1.0, 1.0, 1.0, 1.0])[-n - 1 :, -n - 1 :] * 1.0
+    )
     mesh = lattice_mesh(image, kind, blocks=(4, 3, 3)[:n])
     index = image.to_index(mesh.points)
     cells = delaunay(index, image.affine)

@@ -18,7 +18,9 @@ def slabs():
 
 
 def target_of(made, labels, label):
-    return float(np.median(made.sizes.on_voxels(tetopt.Image(labels.astype(float)))[labels == label]))
+    return float(
+        np.median(made.sizes.on_voxels(tetopt.Image(labels.astype(float)))[labels == label])
+    )
 
 
 def test_a_label_is_as_many_cells_across_as_asked_for(slabs):
@@ -61,7 +63,9 @@ def test_background_has_no_cells_across_but_where_it_has_a_size(slabs):
     assert [row.label for row in made.layers] == [3, 1, 0]
     assert made.layers[-1].cells_across < 1.0
     assert made.layers[-1].below == 0.0
-    made = sizes_by_label(tetopt.Sizes(edge_size=9.0, cells_across=2, by_label={0: "0.5t"}), content)
+    made = sizes_by_label(
+        tetopt.Sizes(edge_size=9.0, cells_across=2, by_label={0: "0.5t"}), content
+    )
     assert target_of(made, labels, 0) == pytest.approx(1.5, abs=0.05)
     made = sizes_by_label(tetopt.Sizes(edge_size=9.0, cells_across=2, by_label={"*": 5.0}), content)
     assert target_of(made, labels, 0) == 5.0
@@ -106,7 +110,20 @@ def test_texts():
 
 @pytest.mark.parametrize(
     "text",
-    ["fluid", "fluid=", "=1", "1=0", "1=-2", "1=1e999", "1=nan", "1=0.6x", "1=t", "1=1,1=2", "1=2t[5:1]", "1=[1:2]"],
+    [
+        "fluid",
+        "fluid=",
+        "=1",
+        "1=0",
+        "1=-2",
+        "1=1e999",
+        "1=nan",
+        "1=0.6x",
+        "1=t",
+        "1=1,1=2",
+        "1=2t[5:1]",
+        "1=[1:2]",
+    ],
 )
 def test_other_texts_are_refused(text):
     with pytest.raises(InputError, match=r"^label_size: "):

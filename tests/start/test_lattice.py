@@ -56,7 +56,9 @@ def test_one_square():
 def test_one_cube_in_five():
     mesh = lattice_mesh(Image(np.zeros((2, 2, 2))), "five-tet", blocks=(1, 1, 1))
     assert len(mesh.points) == 8
-    assert np.sort(volumes(mesh.points, mesh.cells)) == pytest.approx(8 * np.array([1, 1, 1, 1, 2]) / 6)
+    assert np.sort(volumes(mesh.points, mesh.cells)) == pytest.approx(
+        8 * np.array([1, 1, 1, 1, 2]) / 6
+    )
 
 
 def test_one_cube_of_bcc_is_twelve_congruent_cells():
@@ -90,7 +92,9 @@ def test_every_lattice_is_a_mesh_of_its_box(seed, dimension_and_kind):
     index = image.to_index(mesh.points)
     of_boundary = index[sides.nodes[sides.n_cells == 1]]  # (B, n, n)
     low, high = -0.5, np.array(image.shape) - 0.5
-    is_on_box = (np.abs(of_boundary - low) < 1e-9).all(axis=1) | (np.abs(of_boundary - high) < 1e-9).all(axis=1)
+    is_on_box = (np.abs(of_boundary - low) < 1e-9).all(axis=1) | (
+        np.abs(of_boundary - high) < 1e-9
+    ).all(axis=1)
     assert is_on_box.any(axis=1).all()
     assert index.min(axis=0) == pytest.approx([low] * n, abs=1e-9)
     assert index.max(axis=0) == pytest.approx(high, abs=1e-9)
@@ -100,14 +104,20 @@ def test_every_lattice_is_a_mesh_of_its_box(seed, dimension_and_kind):
 
 
 def test_shapes_of_bcc_on_cubes():
-    """Inside every cell has angles 60 (4) and 90 (2) and rho sqrt(10)/10; at the box none is under 45 degrees."""
-    mesh = lattice_mesh(Image(np.zeros((6, 4, 5)), np.diag([2.0, 2, 2, 1])), "bcc", blocks=(6, 4, 5))
+    """Inside every cell has angles 60 (4) and 90 (2) and rho sqrt(10)/10; at the box none is
+    under 45 degrees.
+    """
+    mesh = lattice_mesh(
+        Image(np.zeros((6, 4, 5)), np.diag([2.0, 2, 2, 1])), "bcc", blocks=(6, 4, 5)
+    )
     is_centre = np.arange(len(mesh.points)) >= 7 * 5 * 6
     is_inside = is_centre[mesh.cells].sum(axis=1) == 2
     assert is_inside.sum() == 4 * (5 * 4 * 5 + 6 * 3 * 5 + 6 * 4 * 4)
     assert len(mesh.cells) - is_inside.sum() == 2 * 2 * (6 * 4 + 4 * 5 + 5 * 6)
     angles = np.sort(dihedral_angles(mesh.points, mesh.cells), axis=1)
-    np.testing.assert_allclose(angles[is_inside], np.tile([60.0] * 4 + [90.0] * 2, (is_inside.sum(), 1)), rtol=1e-13)
+    np.testing.assert_allclose(
+        angles[is_inside], np.tile([60.0] * 4 + [90.0] * 2, (is_inside.sum(), 1)), rtol=1e-13
+    )
     np.testing.assert_allclose(rho(mesh.points, mesh.cells)[is_inside], sqrt(10) / 10, rtol=1e-13)
     assert round(sqrt(10) / 10, 4) == 0.3162
     assert angles.min() == pytest.approx(45, rel=1e-13)
@@ -120,7 +130,9 @@ def test_shapes_of_bcc_on_cubes():
 @pytest.mark.parametrize("kind", ["bcc", "five-tet"])
 @pytest.mark.parametrize(("nodes", "fraction"), [(100, 0.1), (1000, 0.06), (14000, 0.03)])
 def test_node_counts_on_a_brain(kind, nodes, fraction):
-    """A few hundred nodes leave few lattices of cubes to choose from; from some thousands 3 % are kept."""
+    """A few hundred nodes leave few lattices of cubes to choose from; from some thousands 3 %
+    are kept.
+    """
     mesh = lattice_mesh(BRAIN, kind, nodes=nodes)
     assert abs(len(mesh.points) - nodes) <= fraction * nodes
 
@@ -142,7 +154,9 @@ def test_node_counts_on_boxes_like_brains(seed, nodes, kind):
 
 @given(seeds, kinds)
 def test_the_count_asked_for_is_found_where_cubes_have_it(seed, dimension_and_kind):
-    """A box of b blocks that are exact cubes is cut into them when asked for their number of nodes."""
+    """A box of b blocks that are exact cubes is cut into them when asked for their number of
+    nodes.
+    """
     n, kind = dimension_and_kind
     blocks = tuple(int(b) for b in np.random.default_rng(seed).integers(3, 12, n))
     image = Image(np.zeros(tuple(2 * b for b in blocks), dtype=np.uint8))
@@ -163,9 +177,17 @@ def test_fewest_nodes(n, kind):
 
 def test_spacing_is_in_mm_and_the_nearest_that_divides_the_box():
     image = Image(np.zeros((10, 20, 6)), np.diag([-2.0, 0.5, 5.0, 1.0]))  # 20 x 10 x 30 mm
-    for spacing, blocks in [(5.0, (4, 2, 6)), (4.0, (5, 2, 8)), (7.0, (3, 1, 4)), (100.0, (1, 1, 1)), (9.9, (2, 1, 3))]:
+    for spacing, blocks in [
+        (5.0, (4, 2, 6)),
+        (4.0, (5, 2, 8)),
+        (7.0, (3, 1, 4)),
+        (100.0, (1, 1, 1)),
+        (9.9, (2, 1, 3)),
+    ]:
         mesh = lattice_mesh(image, "five-tet", spacing=spacing)
-        np.testing.assert_array_equal(mesh.points, lattice_mesh(image, "five-tet", blocks=blocks).points)
+        np.testing.assert_array_equal(
+            mesh.points, lattice_mesh(image, "five-tet", blocks=blocks).points
+        )
 
 
 def test_default_kinds():
@@ -184,7 +206,12 @@ def test_default_kinds():
     ("shape", "kind", "size", "message"),
     [
         ((4, 4), "bcc", {"nodes": 50}, "expected one of criss-cross in 2-D, got 'bcc'"),
-        ((4, 4, 4), "criss-cross", {"nodes": 50}, "expected one of bcc, five-tet in 3-D, got 'criss-cross'"),
+        (
+            (4, 4, 4),
+            "criss-cross",
+            {"nodes": 50},
+            "expected one of bcc, five-tet in 3-D, got 'criss-cross'",
+        ),
         ((4, 4, 4), None, {}, "exactly one of nodes, spacing and blocks"),
         ((4, 4, 4), None, {"nodes": 50, "spacing": 1.0}, "exactly one"),
         ((4, 4, 4), None, {"nodes": 0}, "expected 9 to 50000000 nodes"),
@@ -214,6 +241,7 @@ def test_sizes_and_kinds_that_no_lattice_has_are_refused(shape, kind, size, mess
 )
 def test_sizes_of_the_wrong_kind(size):
     with pytest.raises(
-        InputError, match=f"lattice(_mesh: {next(iter(size))}: expected|: expected .*{next(iter(size))})"
+        InputError,
+        match=f"lattice(_mesh: {next(iter(size))}: expected|: expected .*{next(iter(size))})",
     ):
         lattice_mesh(Image(np.zeros((5, 6, 7))), **size)

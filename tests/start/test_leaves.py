@@ -1,4 +1,6 @@
-"""An octree's leaves joined by templates: whole meshes of the box, Delaunay where blocks are cubes."""
+"""An octree's leaves joined by templates: whole meshes of the box, Delaunay where blocks are
+cubes.
+"""
 
 import sys
 
@@ -37,17 +39,25 @@ def joined(roots, divided, to_world=lambda places: places):
 
 @given(seeds, dimensions)
 def test_cells_fill_the_box(seed, n):
-    """Conforming, positive, every node used, whatever the affine; the same in however many pieces they are made."""
+    """Conforming, positive, every node used, whatever the affine; the same in however many
+    pieces they are made.
+    """
     rng = np.random.default_rng(seed)
     roots, divided = random_leaves(rng, n)
     image = tetopt.Image(np.zeros(rng.integers(3, 9, n)), random_affine(rng, n))
-    mesh = joined(roots, divided, lambda places: image.to_world(places / np.array(roots) * image.shape - 0.5))
+    mesh = joined(
+        roots, divided, lambda places: image.to_world(places / np.array(roots) * image.shape - 0.5)
+    )
     assert tetopt.check_mesh(mesh, image) == []
     assert volumes(mesh.points, mesh.cells).sum() == pytest.approx(image.volume, rel=1e-12)
     assert np.unique(mesh.cells).tolist() == list(range(len(mesh.points)))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(leaves, "LEAVES_AT_A_TIME", 7)
-        again = joined(roots, divided, lambda places: image.to_world(places / np.array(roots) * image.shape - 0.5))
+        again = joined(
+            roots,
+            divided,
+            lambda places: image.to_world(places / np.array(roots) * image.shape - 0.5),
+        )
     assert set(map(tuple, again.cells.tolist())) == set(map(tuple, mesh.cells.tolist()))
 
 
@@ -67,7 +77,9 @@ def test_cells_of_cubes_are_delaunay(seed, n):
 
 @given(seeds)
 def test_blocks_that_are_no_cubes(seed):
-    """Half as long again along one axis as along another, and sheared by a fifth: no angle comes near 12 degrees."""
+    """Half as long again along one axis as along another, and sheared by a fifth: no angle comes
+    near 12 degrees.
+    """
     rng = np.random.default_rng(seed)
     roots, divided = random_leaves(rng, 3)
     stretched = np.diag(rng.uniform(1.0, 1.5, 3)) + np.triu(rng.uniform(-0.2, 0.2, (3, 3)), 1)
@@ -88,7 +100,9 @@ def test_undivided_blocks_are_a_lattice(kind, blocks):
 
 
 def test_a_square_between_two_leaves_is_cut_along_their_face():
-    """No cell has both of their centres, where smaller leaves on two sides put nodes on opposite edges of the face."""
+    """No cell has both of their centres, where smaller leaves on two sides put nodes on opposite
+    edges of the face.
+    """
     divided = np.zeros((3, 1, 2), dtype=bool)
     divided[[0, 2], 0, 0] = True
     mesh = joined((3, 1, 2), [divided])
@@ -112,7 +126,9 @@ def test_triangles_of_a_square(mask):
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_within_a_mask_one_octree_is_enough(monkeypatch, n):
-    """The nodes of the leaves that a mask touches foretell those of the mesh; all its cells lie within."""
+    """The nodes of the leaves that a mask touches foretell those of the mesh; all its cells lie
+    within.
+    """
     made = []
     octree = sys.modules["tetopt.start.octree"]
     monkeypatch.setattr(octree, "leaf_cells", lambda *args: made.append(args) or leaf_cells(*args))

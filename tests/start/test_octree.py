@@ -1,4 +1,6 @@
-"""Graded starts: where the nodes are, how many, and the hard cases; and the mesh that comes of them."""
+"""Graded starts: where the nodes are, how many, and the hard cases; and the mesh that comes of
+them.
+"""
 
 import sys
 import warnings
@@ -14,7 +16,9 @@ from tetopt.start import octree
 from tetopt.start.clip import lost_fraction
 from tetopt.start.octree import octree_mesh
 
-OBLIQUE = np.array([[0.9, 0.3, 0.2, -7.0], [-0.25, 1.1, 0.1, 3.0], [0.0, 0.4, -1.5, 11.0], [0.0, 0.0, 0.0, 1.0]])
+OBLIQUE = np.array(
+    [[0.9, 0.3, 0.2, -7.0], [-0.25, 1.1, 0.1, 3.0], [0.0, 0.4, -1.5, 11.0], [0.0, 0.0, 0.0, 1.0]]
+)
 
 
 def grid(*shape):
@@ -58,7 +62,9 @@ IMAGES = {
 }
 
 
-@pytest.mark.parametrize("name", ["noisy ball", "oblique", "surfaces a voxel apart", "touching the box", "2-D"])
+@pytest.mark.parametrize(
+    "name", ["noisy ball", "oblique", "surfaces a voxel apart", "touching the box", "2-D"]
+)
 def test_octree_is_a_good_mesh_of_the_box(name):
     image, nodes = IMAGES[name]
     mesh = octree_mesh(image, nodes)
@@ -73,9 +79,13 @@ def test_octree_is_a_good_mesh_of_the_box(name):
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("name", ["oblique", "one-voxel sheet", "constant", "0.5 x 0.5 x 5 mm", "2-D noise"])
+@pytest.mark.parametrize(
+    "name", ["oblique", "one-voxel sheet", "constant", "0.5 x 0.5 x 5 mm", "2-D noise"]
+)
 def test_mesh_image(name):
-    """The whole way: no flat cell, that many nodes, every voxel in one cell, no more E_D than before."""
+    """The whole way: no flat cell, that many nodes, every voxel in one cell, no more E_D than
+    before.
+    """
     image, nodes = IMAGES[name]
     result = tetopt.mesh_image(image, nodes, iterations=8)
     first, last = result.history[0], result.history[-1]
@@ -87,7 +97,9 @@ def test_mesh_image(name):
     if "nois" not in name and name != "constant":
         assert last.E_D < 0.6 * first.E_D
     if image.ndim == 3:
-        assert tetopt.quality(result.mesh.points, result.mesh.cells).min_dihedral >= 12.0 * (1 - 1e-9)
+        assert tetopt.quality(result.mesh.points, result.mesh.cells).min_dihedral >= 12.0 * (
+            1 - 1e-9
+        )
 
 
 @pytest.mark.full
@@ -102,7 +114,9 @@ def test_less_error_than_a_uniform_mesh():
 
 
 def test_nodes_do_not_follow_noise(monkeypatch):
-    """Noise everywhere, a wave in half of the box: more nodes go to the wave if noise is known for what it is."""
+    """Noise everywhere, a wave in half of the box: more nodes go to the wave if noise is known
+    for what it is.
+    """
     rng = np.random.default_rng(2)
     data = rng.normal(0.0, 20.0, (64, 40, 40))
     data[:32] += 30.0 * np.sin(grid(64, 40, 40)[:32, ..., 1] / 3.0)
@@ -123,7 +137,8 @@ def test_noise_alone_gets_a_uniform_mesh():
     image = IMAGES["noise only"][0]
     mesh = octree_mesh(image, 1500)
     volume = np.abs(np.linalg.det(mesh.points[mesh.cells[:, 1:]] - mesh.points[mesh.cells[:, :1]]))
-    assert volume.max() < 17.0 * np.median(volume)  # 8 times for a level; a block's corner is cut into unequal cells
+    # 8 times for a level; a block's corner is cut into unequal cells
+    assert volume.max() < 17.0 * np.median(volume)
     halves = (image.to_index(mesh.points) < 19.5).mean(axis=0)
     assert (np.abs(halves - 0.5) < 0.1).all()
 
@@ -177,7 +192,9 @@ def test_every_number_of_nodes(kind, nodes):
 def test_scale_of_intensities(scale):
     image = ball(30, 30, 30, noise=3.0)
     expected = octree_mesh(image, 800).points
-    np.testing.assert_array_equal(octree_mesh(tetopt.Image(image.data * scale), 800).points, expected)
+    np.testing.assert_array_equal(
+        octree_mesh(tetopt.Image(image.data * scale), 800).points, expected
+    )
 
 
 def test_intensities_that_overflow():
@@ -202,9 +219,14 @@ def test_same_bits_for_any_number_of_threads():
 
 
 def test_a_bound_beyond_all_boxes_bounds_nothing():
-    """Its cube overflows, which is no error and no warning: the mesh is that under a bound that just holds the box."""
+    """Its cube overflows, which is no error and no warning: the mesh is that under a bound that
+    just holds the box.
+    """
     image = tetopt.Image(np.random.default_rng(1).normal(size=(6, 6, 6)))
-    meshes = [tetopt.mesh_image(image, 50, iterations=0, sizes=tetopt.Sizes(longest=mm)).mesh for mm in (1e3, 1e300)]
+    meshes = [
+        tetopt.mesh_image(image, 50, iterations=0, sizes=tetopt.Sizes(longest=mm)).mesh
+        for mm in (1e3, 1e300)
+    ]
     np.testing.assert_array_equal(meshes[0].points, meshes[1].points)
 
 
@@ -220,7 +242,8 @@ def lost(content, mesh):
 
 
 def test_a_wall_thinner_than_the_cells_is_whole():
-    """Of a shell of two voxels, an octree of 500 nodes would lose a third; it has more, which the run removes.
+    """Of a shell of two voxels, an octree of 500 nodes would lose a third; it has more, which the
+    run removes.
 
     With the bound on edges of 500 nodes, 1440 would be needed.
     """
@@ -259,7 +282,9 @@ def test_one_octree_that_loses_more_by_chance_does_not_end_the_search():
 
 @pytest.mark.parametrize("sigma", [0.0, 3.0])
 def test_facets_of_a_ball_cut_off_what_it_lacks(monkeypatch, sigma):
-    """Also of a blurred one, whose level rises by an eighth per voxel, not by 1, so that depths count for less."""
+    """Also of a blurred one, whose level rises by an eighth per voxel, not by 1, so that depths
+    count for less.
+    """
     monkeypatch.setattr(octree, "FINER_STEPS", 0)
     ball = np.linalg.norm(grid(40, 40, 40) - 19.5, axis=-1) < 14.0
     mask = tetopt.Image(ndimage.gaussian_filter(1.0 * ball, sigma))
@@ -279,14 +304,18 @@ def test_a_wall_that_no_octree_keeps_has_the_one_that_loses_least():
     assert octree.nodes_for_walls(content, whole, enough, None) is None
 
 
-def test_without_room_for_finer_octrees_the_initial_mesh_warns_and_the_search_for_a_number_does_not(monkeypatch):
+def test_without_room_for_finer_octrees_the_initial_mesh_warns_and_the_search_for_a_number_does_not(
+    monkeypatch,
+):
     def full(_, what, remedy):
         if remedy == "use fewer nodes":  # of an octree finer than the first
             raise tetopt.InputError(f"{what}: expected no more memory than there is; {remedy}")
 
     content = shell(34, 13.0)
     monkeypatch.setattr(octree, "check_memory", full)
-    with pytest.warns(UserWarning, match="nodes: expected no more memory .* walls of the mask with fewer nodes"):
+    with pytest.warns(
+        UserWarning, match="nodes: expected no more memory .* walls of the mask with fewer nodes"
+    ):
         mesh = octree_mesh(content, 300)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -306,7 +335,9 @@ def test_the_memory_of_a_finer_octree_ends_the_search_not_the_run(monkeypatch):
     monkeypatch.setattr(octree, "bytes_of", lambda content, nodes: 1e18 * (nodes > 900))
     mesh = octree_mesh(content, 200)
     assert len(mesh.points) == 588  # of 314, 206, 514, 588 and 958
-    monkeypatch.setattr(octree, "check_memory", lambda *words: (_ for _ in ()).throw(tetopt.InputError("no memory")))
+    monkeypatch.setattr(
+        octree, "check_memory", lambda *words: (_ for _ in ()).throw(tetopt.InputError("no memory"))
+    )
     with pytest.raises(tetopt.InputError, match="no memory"):
         octree_mesh(content, 500)
 

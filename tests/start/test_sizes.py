@@ -1,4 +1,6 @@
-"""Sizes: targets that a run comes near to, limits that it keeps but for a few edges; what they are made of."""
+"""Sizes: targets that a run comes near to, limits that it keeps but for a few edges; what they
+are made of.
+"""
 
 import re
 import sys
@@ -13,7 +15,14 @@ import tetopt
 from tetopt.engine.meshing import Aim, MeshSearch
 from tetopt.start import octree
 from tetopt.start.octree import _Blocks, _divided, nearest_octree, nodes_of_sizes, octree_mesh
-from tetopt.start.sizes import EQUILATERAL_NODES, RATIO_BINS, Sizes, _around, edge_ratios, equilateral_nodes
+from tetopt.start.sizes import (
+    EQUILATERAL_NODES,
+    RATIO_BINS,
+    Sizes,
+    _around,
+    edge_ratios,
+    equilateral_nodes,
+)
 
 
 def edges(mesh):
@@ -27,18 +36,23 @@ def edges(mesh):
 @pytest.mark.full
 @pytest.mark.parametrize(("shape", "affine"), [((48, 40, 44), OBLIQUE), ((90, 70), None)])
 def test_largest(shape, affine):
-    """No edge of the octree is longer; of the run's, one in a hundred by 5 %. It holds cells back that would grow."""
+    """No edge of the octree is longer; of the run's, one in a hundred by 5 %. It holds cells
+    back that would grow.
+    """
     image, nodes = ball(*shape, affine=affine), 1000 if len(shape) == 3 else 500
     free = octree_mesh(image, nodes, Sizes(longest=np.inf))
     largest = 0.65 * edges(free)[1].max()
     sizes = Sizes(longest=largest)
     mesh = octree_mesh(image, nodes, sizes)
-    slant = 1.3 if affine is not None else 1.0  # blocks are parallelepipeds, whose diagonals are longer
+    # blocks are parallelepipeds, whose diagonals are longer
+    slant = 1.3 if affine is not None else 1.0
     assert edges(mesh)[1].max() <= largest * slant * (1 + 1e-9)
     assert edges(mesh)[1].max() > 0.6 * largest
     after = edges(tetopt.mesh_image(image, nodes, sizes=sizes, iterations=8).mesh)[1]
     assert np.percentile(after, 99) <= 1.05 * slant * largest
-    unbounded = edges(tetopt.mesh_image(image, nodes, sizes=Sizes(longest=np.inf), iterations=8).mesh)[1]
+    unbounded = edges(
+        tetopt.mesh_image(image, nodes, sizes=Sizes(longest=np.inf), iterations=8).mesh
+    )[1]
     assert unbounded.max() > 1.1 * after.max()
 
 
@@ -76,7 +90,8 @@ def half_sized(image, size, elsewhere=0.0, stretch=1.0):
 @pytest.mark.full
 @pytest.mark.parametrize(("shape", "stretch"), [((48, 40, 44), 2.5), ((90, 70), 1.0)])
 def test_targets_in_one_half(shape, stretch):
-    """With 1.5 times the nodes of equilateral cells the mean edge is no longer than its target, hardly any over sqrt 2.
+    """With 1.5 times the nodes of equilateral cells the mean edge is no longer than its target,
+    hardly any over sqrt 2.
 
     So many nodes come out; the other half, which has no target, has longer edges.
     """
@@ -94,13 +109,17 @@ def test_targets_in_one_half(shape, stretch):
     ends, length = edges(mesh)
     has_none = (sizes.prepared(len(shape)).at(mesh.points)[ends] == np.inf).all(axis=1)
     assert length[has_none].mean() > 1.2 * length[~has_none].mean()
-    with pytest.raises(tetopt.InputError, match=r"nodes are too few for .* voxels and these limits .* use"):
+    with pytest.raises(
+        tetopt.InputError, match=r"nodes are too few for .* voxels and these limits .* use"
+    ):
         tetopt.mesh_image(image, nodes // 3, sizes=sizes)
 
 
 @pytest.mark.full
 def test_targets_ask_for_nothing_that_is_there():
-    """Where they are longer than all edges, or infinite, they say no more than that there is no bound."""
+    """Where they are longer than all edges, or infinite, they say no more than that there is no
+    bound.
+    """
     image = ball(48, 40, 44)
     free = tetopt.mesh_image(image, 400, sizes=Sizes(longest=np.inf), iterations=3).mesh
     for largest in (np.inf, 500.0):
@@ -126,7 +145,9 @@ def test_targets_from_any_mesh(count):
 @pytest.mark.full
 @pytest.mark.parametrize("shape", [(48, 40, 44), (90, 70)])
 def test_targets_without_the_image(shape):
-    """With k_D = 0 they are met too, by cells of as good a shape as an image's: in 3-D better, in 2-D the same."""
+    """With k_D = 0 they are met too, by cells of as good a shape as an image's: in 3-D better,
+    in 2-D the same.
+    """
     image = ball(*shape)
     sizes = Sizes(field=half_sized(image, 5.0 if len(shape) == 3 else 4.0))
     nodes = nodes_of_sizes(image, sizes)[0]
@@ -145,7 +166,9 @@ def test_targets_without_the_image(shape):
 
 @pytest.mark.full
 def test_nodes_follow_from_sizes():
-    """Without a number of nodes; a bound of the longest edge says nothing of it, nor does a field of one half."""
+    """Without a number of nodes; a bound of the longest edge says nothing of it, nor does a
+    field of one half.
+    """
     image = ball(30, 30, 30)
     sizes = Sizes(edge_size=6.0)
     result = tetopt.mesh_image(image, sizes=sizes, iterations=6)
@@ -156,20 +179,32 @@ def test_nodes_follow_from_sizes():
     assert tetopt.mesh_image(image, sizes=Sizes(longest=20.0), iterations=0).nodes == usual
     half = Sizes(field=half_sized(image, 6.0))
     needed, fraction = nodes_of_sizes(image, half)
-    assert tetopt.mesh_image(image, sizes=half, iterations=0).nodes == round(needed + (1.0 - fraction) * usual)
+    assert tetopt.mesh_image(image, sizes=half, iterations=0).nodes == round(
+        needed + (1.0 - fraction) * usual
+    )
     with pytest.raises(tetopt.InputError, match="give only one of nodes and target_error"):
         tetopt.mesh_image(image, 300, target_error=0.1, sizes=sizes)
 
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_equilateral_nodes(n):
-    """Those inside, in closed form, and half of a boundary's; in 2-D a strip of triangles that can be counted."""
+    """Those inside, in closed form, and half of a boundary's; in 2-D a strip of triangles that
+    can be counted.
+    """
     shape = (60, 52, 45)[:n]
     image = tetopt.Image(np.zeros(shape), np.diag([*(1.0, 2.0, 0.5)[:n], 1.0]))
     lengths = image.spacing * shape
-    density = 2.0 / 3.0**0.5 / 9.0 if n == 2 else 6.0 * 2.0**0.5 / (4.0 * np.pi / 0.551285598 / 4.0) / 27.0
+    density = (
+        2.0 / 3.0**0.5 / 9.0
+        if n == 2
+        else 6.0 * 2.0**0.5 / (4.0 * np.pi / 0.551285598 / 4.0) / 27.0
+    )
     half_a_side = 0.5 / 3.0 if n == 2 else 1.0 / 3.0**0.5 / 9.0
-    sides = 2.0 * lengths.sum() if n == 2 else 2.0 * sum(np.prod(np.delete(lengths, d)) for d in range(3))
+    sides = (
+        2.0 * lengths.sum()
+        if n == 2
+        else 2.0 * sum(np.prod(np.delete(lengths, d)) for d in range(3))
+    )
     expected = density * np.prod(lengths) + half_a_side * sides
     target = np.full(shape, 3.0, dtype=np.float32)
     assert equilateral_nodes(target, image) == pytest.approx(expected, rel=1e-6)
@@ -189,7 +224,11 @@ def test_equilateral_nodes_of_a_mask(shape):
     target = np.full(shape, 4.0, dtype=np.float32)
     whole = equilateral_nodes(target, image, inside)
     body = EQUILATERAL_NODES[n] * inside.sum() / 4.0**n
-    around = 0.5 * 2.0 * np.pi * radius / 4.0 if n == 2 else EQUILATERAL_NODES[2] * 2.0 * np.pi * radius**2 / 16.0
+    around = (
+        0.5 * 2.0 * np.pi * radius / 4.0
+        if n == 2
+        else EQUILATERAL_NODES[2] * 2.0 * np.pi * radius**2 / 16.0
+    )
     assert whole - body == pytest.approx(around, rel=0.05)
     content = tetopt.content(tetopt.Image(1.0 * inside), mask=tetopt.Image(1.0 * inside))
     assert nodes_of_sizes(content, Sizes(edge_size=4.0))[0] == pytest.approx(1.5 * whole, abs=1.0)
@@ -207,10 +246,14 @@ def test_edge_ratios():
     assert (ratios.above, ratios.below) == (0.0, 0.0)
     tight = edge_ratios(mesh.points, mesh.cells, Sizes(edge_size=4.0))
     assert tight.above == pytest.approx(n_long / (n_short + n_long))
-    assert edge_ratios(mesh.points, mesh.cells, Sizes(edge_size=8.0)).below == pytest.approx(1.0 - tight.above)
+    assert edge_ratios(mesh.points, mesh.cells, Sizes(edge_size=8.0)).below == pytest.approx(
+        1.0 - tight.above
+    )
     in_half = edge_ratios(mesh.points, mesh.cells, Sizes(field=half_sized(image, 5.0)))
     n_short, n_long = 2 * 25 + 2 * 2 * 4 * 5, 4 * 4 * 2 + 2 * (2 * 4 * 5)
-    assert in_half.mean == pytest.approx((n_short + 2.0**0.5 * n_long) / (n_short + n_long), rel=0.05)
+    assert in_half.mean == pytest.approx(
+        (n_short + 2.0**0.5 * n_long) / (n_short + n_long), rel=0.05
+    )
     assert edge_ratios(mesh.points, mesh.cells, Sizes(longest=5.0)) is None
 
 
@@ -223,7 +266,9 @@ def test_gradation():
     far = {}
     for gradation in (1.0, 0.25):
         mesh = octree_mesh(
-            image, 3000 if gradation == 1.0 else 11000, Sizes(longest=40.0, gradation=gradation, field=spot)
+            image,
+            3000 if gradation == 1.0 else 11000,
+            Sizes(longest=40.0, gradation=gradation, field=spot),
         )
         ends, length = edges(mesh)
         distance = np.linalg.norm(mesh.points[ends].mean(axis=1) - 31.5, axis=1)
@@ -236,20 +281,28 @@ def test_gradation():
 
 @pytest.mark.parametrize("rings", [1, 2, 3])
 def test_blocks_around_a_divided_one(rings):
-    """As many of its size exist in every direction, that is, their parents are divided; and no other."""
+    """As many of its size exist in every direction, that is, their parents are divided; and no
+    other.
+    """
     sizes = [8, 16, 32]
     error = [np.zeros((s, s)) for s in sizes]
     error[1][7, 9] = 1.0
-    levels = [_Blocks(e, np.zeros(e.shape, dtype=bool), np.ones(e.shape, dtype=bool)) for e in error]
+    levels = [
+        _Blocks(e, np.zeros(e.shape, dtype=bool), np.ones(e.shape, dtype=bool)) for e in error
+    ]
     divided = _divided(levels, 0.5, rings)
     assert np.argwhere(divided[1]).tolist() == [[7, 9]]
-    parents = {(i // 2, j // 2) for i in range(7 - rings, 8 + rings) for j in range(9 - rings, 10 + rings)}
+    parents = {
+        (i // 2, j // 2) for i in range(7 - rings, 8 + rings) for j in range(9 - rings, 10 + rings)
+    }
     assert {(int(i), int(j)) for i, j in np.argwhere(divided[0])} == parents
 
 
 @pytest.mark.parametrize("shape", [(9, 8), (7, 6, 5)])
 def test_field_is_lowered_to_its_gradation(shape):
-    """Against shortest ways over the faces of voxels, found for every pair; voxels without a size stay so."""
+    """Against shortest ways over the faces of voxels, found for every pair; voxels without a
+    size stay so.
+    """
     rng = np.random.default_rng(0)
     data = rng.uniform(1.0, 30.0, shape)
     data[data > 28.0] = 0.0
@@ -265,7 +318,9 @@ def test_field_is_lowered_to_its_gradation(shape):
 
 
 def test_sizes_around_are_the_twin_s():
-    """The least of the other nodes' sizes + gradation x way along edges: against Dijkstra's algorithm."""
+    """The least of the other nodes' sizes + gradation x way along edges: against Dijkstra's
+    algorithm.
+    """
     mesh = octree_mesh(ball(30, 30, 30), 300)
     ends, length = edges(mesh)
     n = len(mesh.points)
@@ -299,7 +354,9 @@ def test_the_coarsest_octree_is_counted_without_blocks(monkeypatch, sizes):
     within = len(octree._clipped_octree(content, 60, limits, content.region).points)
     monkeypatch.setattr(octree, "_blocks_by_depth", None)
     assert count > 100
-    with pytest.raises(tetopt.InputError, match=f"which need at least .*; use {count}, or allow longer edges"):
+    with pytest.raises(
+        tetopt.InputError, match=f"which need at least .*; use {count}, or allow longer edges"
+    ):
         octree_mesh(image, 60, sizes)
     enough = octree._coarsest_nodes(content, 60, limits)
     assert 0.5 * within < enough < 1.1 * within
@@ -327,7 +384,9 @@ def test_the_longest_edge_of_any_number_of_nodes():
         (Sizes(edge_size=1e-6), "cells are smaller than voxels"),
         (Sizes(field=tetopt.Image(np.full((30, 30, 30), 1e-20))), "cells are smaller than voxels"),
         (
-            Sizes(field=tetopt.Image(np.ones((9, 9, 9)), np.diag([1, 1, 1, 1]) + 99 * np.eye(4, k=3))),
+            Sizes(
+                field=tetopt.Image(np.ones((9, 9, 9)), np.diag([1, 1, 1, 1]) + 99 * np.eye(4, k=3))
+            ),
             "no voxel above 0",
         ),
     ],
@@ -355,11 +414,14 @@ def test_longest_at_nodes():
     sizes = Sizes(longest=20.0, field=field).prepared(3)
     has_one = sizes.at(mesh.points) == 7.0
     np.testing.assert_array_equal(
-        has_one, field.data[tuple(np.rint(field.to_index(mesh.points)).astype(int).clip(0, 9).T)] > 0.0
+        has_one,
+        field.data[tuple(np.rint(field.to_index(mesh.points)).astype(int).clip(0, 9).T)] > 0.0,
     )
     target = sizes.around(mesh.points, mesh.cells)
     np.testing.assert_allclose(target[has_one], 7.0)
-    grown = np.minimum(sizes.at(mesh.points), _around(sizes.at(mesh.points), mesh.points, mesh.cells, 1.0))
+    grown = np.minimum(
+        sizes.at(mesh.points), _around(sizes.at(mesh.points), mesh.points, mesh.cells, 1.0)
+    )
     np.testing.assert_array_equal(target, grown)
     assert target.max() > 15.0
     longest = sizes.longest_edges(image, 300, mesh.points, mesh.cells, own, target)
@@ -376,7 +438,9 @@ def test_longest_at_nodes():
 
 @pytest.mark.full
 def test_a_stop_keeps_what_has_the_error():
-    """A run cut short does not replace a mesh that has the error already; without one it is what there is."""
+    """A run cut short does not replace a mesh that has the error already; without one it is what
+    there is.
+    """
     image = ball(40, 40, 40)
     for stops_at, has_error in ((1, False), (3, True)):
         initials = []
@@ -386,7 +450,9 @@ def test_a_stop_keeps_what_has_the_error():
             search.tell(attempt.run(stop=(lambda: True) if len(initials) >= stops_at else None))
         result = search.result
         assert len(initials) == stops_at
-        fraction = result.history[-1].E_D / (float(np.var(image.data, dtype=np.float64)) * image.volume)
+        fraction = result.history[-1].E_D / (
+            float(np.var(image.data, dtype=np.float64)) * image.volume
+        )
         assert (fraction <= 0.0005) == has_error
         assert result.ended == "stopped"
         assert (result.initial is initials[-1]) != has_error
@@ -408,7 +474,9 @@ def test_target_error(shape, noise):
 
 @pytest.mark.deep
 def test_target_error_within_limits():
-    """Limits on sizes that ask for more nodes than the error does, or for fewer, have the last word."""
+    """Limits on sizes that ask for more nodes than the error does, or for fewer, have the last
+    word.
+    """
     image = ball(40, 40, 40)
     total = float(np.var(image.data, dtype=np.float64)) * image.volume
     fine = tetopt.mesh_image(image, target_error=0.5, sizes=Sizes(longest=9.0))
@@ -425,7 +493,11 @@ def test_target_error_within_limits():
     ("image", "arguments", "words"),
     [
         (ball(30, 30, 30), {"nodes": 100, "target_error": 0.1}, "only one of"),
-        (ball(30, 30, 30), {"target_error": 1.0}, "expected a fraction of the image's variance, 0 to 1"),
+        (
+            ball(30, 30, 30),
+            {"target_error": 1.0},
+            "expected a fraction of the image's variance, 0 to 1",
+        ),
         (ball(30, 30, 30), {"target_error": float("nan")}, "expected a fraction"),
         (tetopt.Image(np.ones((30, 30, 30))), {"target_error": 0.1}, "the image is constant"),
         (ball(30, 30, 30, noise=20.0), {"target_error": 0.1}, "below the noise fraction"),
@@ -455,7 +527,9 @@ def test_exchanges_do_not_follow_noise(monkeypatch):
         with monkeypatch.context() as patched:
             patched.setattr(fast, "exchange", counted)
             if not known:
-                patched.setattr(sys.modules["tetopt.contents.content"], "noise_level", lambda data, inside: 0.0)
+                patched.setattr(
+                    sys.modules["tetopt.contents.content"], "noise_level", lambda data, inside: 0.0
+                )
             tetopt.optimize(image, start, k_D=0.85, nodes=len(start.points), iterations=3)
         count[known] = sum(made)
     assert count[False] > 30

@@ -1,4 +1,6 @@
-"""Octrees of stored images: those of the same voxels in memory, to the last bit, from boxes of bounded size."""
+"""Octrees of stored images: those of the same voxels in memory, to the last bit, from boxes of
+bounded size.
+"""
 
 import sys
 
@@ -13,7 +15,9 @@ from tetopt.contents.statistics import statistics
 from tetopt.start.octree import nearest_octree, octree_mesh
 from tetopt.start.sums import _add_rows, block_sums, channels_of
 
-OBLIQUE = np.array([[0.9, 0.3, 0.2, -7.0], [-0.25, 1.1, 0.1, 3.0], [0.0, 0.4, -1.5, 11.0], [0.0, 0.0, 0.0, 1.0]])
+OBLIQUE = np.array(
+    [[0.9, 0.3, 0.2, -7.0], [-0.25, 1.1, 0.1, 3.0], [0.0, 0.4, -1.5, 11.0], [0.0, 0.0, 0.0, 1.0]]
+)
 THICK = np.diag([0.7, 0.8, 2.5, 1.0])
 
 
@@ -21,7 +25,13 @@ class Recorded:
     """Voxels of an array, and how many each read was of."""
 
     def __init__(self, data, chunks=None):
-        self.data, self.shape, self.dtype, self.chunks, self.reads = data, data.shape, data.dtype, chunks, []
+        self.data, self.shape, self.dtype, self.chunks, self.reads = (
+            data,
+            data.shape,
+            data.dtype,
+            chunks,
+            [],
+        )
 
     def __getitem__(self, box):
         part = self.data[box]
@@ -30,7 +40,9 @@ class Recorded:
 
 
 def noisy(shape, dtype, noise=6.0):
-    place = np.stack(np.meshgrid(*[np.arange(s) for s in shape], indexing="ij"), -1) - 0.4 * np.array(shape)
+    place = np.stack(
+        np.meshgrid(*[np.arange(s) for s in shape], indexing="ij"), -1
+    ) - 0.4 * np.array(shape)
     data = 100.0 + 300.0 * ((place**2).sum(-1) < (0.25 * min(shape)) ** 2)
     return (data + np.random.default_rng(4).normal(0.0, noise, shape)).astype(dtype)
 
@@ -97,11 +109,15 @@ def test_boxes_are_of_whole_chunks_within_what_may_be_read(shape, itemsize, chun
     assert sum((i.stop - i.start) * (j.stop - j.start) for i, j, _ in boxes) == shape[0] * shape[1]
 
 
-@pytest.mark.parametrize("sizes", [tetopt.Sizes(smallest=3.0), tetopt.Sizes(longest=9.0, gradation=0.4)])
+@pytest.mark.parametrize(
+    "sizes", [tetopt.Sizes(smallest=3.0), tetopt.Sizes(longest=9.0, gradation=0.4)]
+)
 def test_limits_on_sizes(sizes):
     data = noisy((40, 33, 45), np.uint16)
     stored = tetopt.Image.stored(data, OBLIQUE)
-    assert_same(nearest_octree(stored, 500, sizes), nearest_octree(tetopt.Image(data, OBLIQUE), 500, sizes))
+    assert_same(
+        nearest_octree(stored, 500, sizes), nearest_octree(tetopt.Image(data, OBLIQUE), 500, sizes)
+    )
 
 
 @pytest.mark.parametrize("dtype", [np.uint16, np.float32, np.float64])
@@ -120,10 +136,14 @@ def test_statistics(dtype):
     assert constant.scale == 1.0
 
 
-@pytest.mark.parametrize(("shape", "counts"), [((17, 20, 23), (4, 8, 5)), ((6, 5, 9), (12, 5, 16)), ((31, 25), (4, 9))])
+@pytest.mark.parametrize(
+    ("shape", "counts"), [((17, 20, 23), (4, 8, 5)), ((6, 5, 9), (12, 5, 16)), ((31, 25), (4, 9))]
+)
 @pytest.mark.parametrize("is_masked", [False, True])
 def test_sums_are_those_of_each_block_s_voxels(shape, counts, is_masked, monkeypatch):
-    """Two contrasts, in whole numbers, with and without a mask; also where blocks are smaller than voxels."""
+    """Two contrasts, in whole numbers, with and without a mask; also where blocks are smaller
+    than voxels.
+    """
     monkeypatch.setattr("tetopt.image.PIECE_VOXELS", 3 * shape[-1])
     rng = np.random.default_rng(5)
     images = [tetopt.Image(rng.integers(0, 50, shape)) for _ in range(2)]
@@ -131,7 +151,9 @@ def test_sums_are_those_of_each_block_s_voxels(shape, counts, is_masked, monkeyp
     source = plain(content(images, mask=mask))
     channels = channels_of(source)._replace(means=[3.0, -7.0], scale=1.0)
     sums = block_sums(source, channels, np.array(counts))
-    h = np.stack([values - mean for values, mean in zip(all_channels(source), channels.means, strict=True)])
+    h = np.stack(
+        [values - mean for values, mean in zip(all_channels(source), channels.means, strict=True)]
+    )
     inside = np.ones(shape, dtype=bool) if source.inside is None else source.inside
     for place in np.ndindex(*counts):
         part = tuple(
@@ -142,7 +164,9 @@ def test_sums_are_those_of_each_block_s_voxels(shape, counts, is_masked, monkeyp
         assert sums.voxels(slice(None))[place] == within.size
         assert sums.inside is None or sums.inside[place] == within.sum()
         assert sums.second[place] == (of_block**2 * within).sum()
-        assert [first[place] for first in sums.firsts] == [(each * within).sum() for each in of_block]
+        assert [first[place] for first in sums.firsts] == [
+            (each * within).sum() for each in of_block
+        ]
 
 
 @pytest.mark.kernel
@@ -178,10 +202,14 @@ def test_voxels_that_no_image_takes(data, words, monkeypatch):
     assert str(stored.value) == str(in_memory.value)
 
 
-@pytest.mark.parametrize("sizes", [tetopt.Sizes(edge_size=5.0), tetopt.Sizes(field=tetopt.Image(np.ones((2, 2, 2))))])
+@pytest.mark.parametrize(
+    "sizes", [tetopt.Sizes(edge_size=5.0), tetopt.Sizes(field=tetopt.Image(np.ones((2, 2, 2))))]
+)
 def test_targets_take_voxels_in_memory(sizes):
     voxels = Recorded(noisy((12, 12, 12), np.uint8))
-    with pytest.raises(tetopt.InputError, match=r"largest and field .* this image is stored; use smallest, longest"):
+    with pytest.raises(
+        tetopt.InputError, match=r"largest and field .* this image is stored; use smallest, longest"
+    ):
         octree_mesh(tetopt.Image.stored(voxels), 100, sizes)
     assert voxels.reads == []
 
@@ -193,5 +221,9 @@ def test_blocks_are_bounded(monkeypatch):
         monkeypatch.setattr(sys.modules["tetopt.start.octree"], "MOST_BLOCKS", most)
         mesh = nearest_octree(tetopt.Image.stored(data), 1500, sizes)
         assert_same(mesh, nearest_octree(tetopt.Image(data), 1500, sizes))
-        shortest.append(np.linalg.norm(mesh.points[mesh.cells[:, 1]] - mesh.points[mesh.cells[:, 0]], axis=1).min())
+        shortest.append(
+            np.linalg.norm(
+                mesh.points[mesh.cells[:, 1]] - mesh.points[mesh.cells[:, 0]], axis=1
+            ).min()
+        )
     assert shortest[0] > 1.5 * shortest[1]

@@ -42,7 +42,10 @@ def crash_and_refuse(job):
 
 def wrap(job):
     """A shell whose program crashed."""
-    raise Crashed(f"mine crashed ({signal_words(subprocess.run(['sh', '-c', 'kill -11 $$; true']).returncode)})")
+    raise Crashed(
+        "mine crashed "
+        f"({signal_words(subprocess.run(['sh', '-c', 'kill -11 $$; true']).returncode)})"
+    )
 
 
 def absent(job):
@@ -55,7 +58,9 @@ def quit_early(job):
 
 
 def escape(job):
-    """Orphans in sessions of their own, one of which takes memory; their ids stand in the file named by PIPES_PID."""
+    """Orphans in sessions of their own, one of which takes memory; their ids stand in the file
+    named by PIPES_PID.
+    """
     program = (
         "import os, sys, time\n"
         "if os.fork(): os._exit(0)\n"
@@ -71,7 +76,10 @@ def escape(job):
 
 def hoard_below(job):
     """Memory of a process in a session of its own."""
-    program = "import time; a = bytearray(900_000_000); a[::4096] = b'x' * len(a[::4096]); time.sleep(600)"
+    program = (
+        "import time; a = bytearray(900_000_000); a[::4096] = b'x' * len(a[::4096]); "
+        "time.sleep(600)"
+    )
     subprocess.run([sys.executable, "-c", program], start_new_session=True)
 
 
@@ -95,4 +103,6 @@ def leave(job):
 
 
 def fine(job):
-    return Produced(tetopt.lattice_mesh(job.image, nodes=job.nodes), {"first": 1.5, "second": 0.25}, ["a note"])
+    return Produced(
+        tetopt.lattice_mesh(job.image, nodes=job.nodes), {"first": 1.5, "second": 0.25}, ["a note"]
+    )

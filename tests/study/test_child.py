@@ -40,7 +40,9 @@ def test_same_bits_as_in_process():
 
 def test_job_arrives_whole():
     """Affine, labels, seconds in their order, and notes."""
-    image = tetopt.Image(IMAGE.data + 0.1, np.array([[0, -2.0, 0, 5], [3, 0, 0.5, 1], [0, 0, 1.5, 2], [0, 0, 0, 1]]))
+    image = tetopt.Image(
+        IMAGE.data + 0.1, np.array([[0, -2.0, 0, 5], [3, 0, 0.5, 1], [0, 0, 1.5, 2], [0, 0, 0, 1]])
+    )
     labels = tetopt.Image((IMAGE.data > 50).astype(int), image.affine)
     outcome = run_in_child(pipes.fine, PipelineInput(image, labels, 200), max_seconds=60.0)
     assert outcome.mesh.points.tobytes() == tetopt.lattice_mesh(image, nodes=200).points.tobytes()
@@ -100,7 +102,12 @@ def test_modules_of_the_current_folder_are_not_run(tmp_path, monkeypatch):
 
 def test_signals_in_words():
     """A shell's 130 and 143 are of somebody who ended it, not of a crash."""
-    words = {-11: "signal 11, SIGSEGV", 139: "signal 11, SIGSEGV", -15: "signal 15, SIGTERM", -99: "signal 99"}
+    words = {
+        -11: "signal 11, SIGSEGV",
+        139: "signal 11, SIGSEGV",
+        -15: "signal 15, SIGTERM",
+        -99: "signal 99",
+    }
     assert {code: signal_words(code) for code in words} == words
     assert {signal_words(code) for code in (0, 1, 127, 130, 143, 255)} == {None}
 
@@ -164,9 +171,13 @@ def test_the_end_of_the_parent_ends_the_child(tmp_path, sent):
     temporary.mkdir()
     paths = [str(Path(__file__).parent), str(Path(tetopt.__file__).parents[1])]
     environment = os.environ | {
-        "PIPES_PID": str(pid_file), "PYTHONPATH": os.pathsep.join(paths), "TMPDIR": str(temporary)
-    }  # fmt: skip
-    parent = subprocess.Popen([sys.executable, "-c", program], env=environment, stderr=subprocess.PIPE)
+        "PIPES_PID": str(pid_file),
+        "PYTHONPATH": os.pathsep.join(paths),
+        "TMPDIR": str(temporary),
+    }
+    parent = subprocess.Popen(
+        [sys.executable, "-c", program], env=environment, stderr=subprocess.PIPE
+    )
     try:
         wait_for(lambda: pid_file.exists() and pid_file.read_text(), 60.0)
         assert len(list(temporary.iterdir())) == 1
@@ -180,7 +191,9 @@ def test_the_end_of_the_parent_ends_the_child(tmp_path, sent):
 
 
 def is_running(pid):
-    """Whether a process lives; killed ones may stay a moment, and as zombies if nobody collects them."""
+    """Whether a process lives; killed ones may stay a moment, and as zombies if nobody collects
+    them.
+    """
     for _ in range(40):
         try:
             if Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in "ZX":

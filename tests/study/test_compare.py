@@ -1,4 +1,6 @@
-"""`tetopt compare` and `tetopt baseline`: files, numbers recomputed, failures, one line for bad input."""
+"""`tetopt compare` and `tetopt baseline`: files, numbers recomputed, failures, one line for bad
+input.
+"""
 
 import json
 import pipes
@@ -64,15 +66,25 @@ def run(head, opengl):
 
 def test_files(run):
     meshes = {f"{name}{order}.vtu" for name in ("tetopt", "bcc") for order in ("", ".quadratic")}
-    assert {p.name for p in run.iterdir()} == {"report.json", "report.html", *COMPARE_PICTURES, *meshes}
+    assert {p.name for p in run.iterdir()} == {
+        "report.json",
+        "report.html",
+        *COMPARE_PICTURES,
+        *meshes,
+    }
 
 
 def dice_of(painted, true):
-    return [2 * ((painted == k) & (true == k)).sum() / ((painted == k).sum() + (true == k).sum()) for k in range(3)]
+    return [
+        2 * ((painted == k) & (true == k)).sum() / ((painted == k).sum() + (true == k).sum())
+        for k in range(3)
+    ]
 
 
 def test_numbers_are_those_of_the_meshes(run, head):
-    """E_D, Dice and volumes, recomputed voxel by voxel from the mesh file: of labels of most voxels, and of its own."""
+    """E_D, Dice and volumes, recomputed voxel by voxel from the mesh file: of labels of most
+    voxels, and of its own.
+    """
     report = json.loads((run / "report.json").read_text())
     image, labels = (tetopt.load_image(head / name) for name in ("image.nii.gz", "labels.nii.gz"))
     h, true = image.data.astype(float).ravel(), labels.data.astype(int).ravel()
@@ -85,17 +97,23 @@ def test_numbers_are_those_of_the_meshes(run, head):
         means = np.bincount(owner, weights=h) / np.maximum(np.bincount(owner), 1)
         within = ((h - means[owner]) ** 2).sum()
         median = pipeline["median"]
-        assert median["E_D_fraction"] == pytest.approx(within / ((h - h.mean()) ** 2).sum(), rel=1e-9)
+        assert median["E_D_fraction"] == pytest.approx(
+            within / ((h - h.mean()) ** 2).sum(), rel=1e-9
+        )
         assert median["n_missed_voxels"] == 0
         votes = np.zeros((len(mesh.cells), true.max() + 1), dtype=int)
         np.add.at(votes, (owner, true), 1)
-        assert [row["dice"] for row in median["labels"]] == pytest.approx(dice_of(votes.argmax(axis=1)[owner], true))
+        assert [row["dice"] for row in median["labels"]] == pytest.approx(
+            dice_of(votes.argmax(axis=1)[owner], true)
+        )
         majority = tetopt.measure.fidelity.cell_labels(labels, mesh)
         for of_cell, key in ((majority, "labels"), (own, "own_labels")):
             if of_cell is None:
                 assert median[key] == []
                 continue
-            assert [row["dice"] for row in median[key]] == pytest.approx(dice_of(of_cell.astype(int)[owner], true))
+            assert [row["dice"] for row in median[key]] == pytest.approx(
+                dice_of(of_cell.astype(int)[owner], true)
+            )
             volumes = np.abs(np.linalg.det(np.diff(mesh.points[mesh.cells], axis=1))) / 6.0
             for row in median[key]:
                 assert row["mesh_volume"] == pytest.approx(volumes[of_cell == row["label"]].sum())
@@ -118,14 +136,20 @@ def test_the_reference_is_as_fine_as_memory_allows(monkeypatch):
 def test_a_cell_without_a_label_of_its_own_has_that_of_most_voxels(head):
     image, labels = (tetopt.load_image(head / name) for name in ("image.nii.gz", "labels.nii.gz"))
     mapping, _ = compare.default_mapping(image)
-    standard = compare.prepared(image, labels, mapping, Settings(200, nus=(0.3,), reference_dofs=1000))
+    standard = compare.prepared(
+        image, labels, mapping, Settings(200, nus=(0.3,), reference_dofs=1000)
+    )
     mesh = tetopt.lattice_mesh(image, nodes=200)
     none, first = np.full(len(mesh.cells), -1), tetopt.measure.fidelity.cell_labels(labels, mesh)
     made = compare.measured(standard, mesh, 1.0, own=none)
     assert repr(made.own_labels) == repr(made.labels)
     first[: len(first) // 2] = 0
     made = compare.measured(standard, mesh, 1.0, own=first)
-    assert repr(made.own_labels) == repr(tetopt.label_fidelity(labels, mesh, first)) != repr(made.labels)
+    assert (
+        repr(made.own_labels)
+        == repr(tetopt.label_fidelity(labels, mesh, first))
+        != repr(made.labels)
+    )
 
 
 def test_the_image_helps_and_the_reference_is_one(run):
@@ -142,12 +166,17 @@ def test_the_image_helps_and_the_reference_is_one(run):
 
 
 def test_the_quadratic_mesh_is_a_coarser_one(run, head):
-    """About as many nodes in all; its errors are those of the library, solved anew from its file."""
+    """About as many nodes in all; its errors are those of the library, solved anew from its
+    file.
+    """
     report = json.loads((run / "report.json").read_text())
     image = tetopt.load_image(head / "image.nii.gz")
     mapping, _ = compare.default_mapping(image)
     settings = Settings(400, reference_dofs=REFERENCE_DOFS)
-    modulus = averaged(young_image(image, mapping), compare.reference_shape(image.shape, image.spacing, REFERENCE_DOFS))
+    modulus = averaged(
+        young_image(image, mapping),
+        compare.reference_shape(image.shape, image.spacing, REFERENCE_DOFS),
+    )
     exact = reference(modulus, 0.45)
     labels = nearest(tetopt.load_image(head / "labels.nii.gz"), modulus).data
     for pipeline in report["quadratic"]:
@@ -160,9 +189,14 @@ def test_the_quadratic_mesh_is_a_coarser_one(run, head):
         bottom, top = box_faces(image, mesh)
         young = element_young(refined(modulus, image.shape), mesh, None, "gauss", 2)
         pressed = compression(
-            mesh, young, 0.45, fixed_nodes=top, pushed_nodes=bottom, order=2,
+            mesh,
+            young,
+            0.45,
+            fixed_nodes=top,
+            pushed_nodes=bottom,
+            order=2,
             displacement=push_of(image, settings.percent),
-        )  # fmt: skip
+        )
         errors = reference_errors(exact, mesh, pressed.u, pressed.strain_energy, labels)
         assert median["fem"]["0.45"]["errors"] == pytest.approx(errors._asdict(), rel=1e-6)
 
@@ -186,9 +220,20 @@ def test_when_all_fail_nothing_is_replaced(head, tmp_path, monkeypatch, capsys):
 
 @pytest.mark.deep
 def test_pytetwild_in_the_comparison(head, undrawn, tmp_path):
-    """The conventional pipeline beside one that never varies, repeated: node counts near the wish, the range."""
+    """The conventional pipeline beside one that never varies, repeated: node counts near the
+    wish, the range.
+    """
     pytest.importorskip("pytetwild", reason="the conventional pipeline needs pytetwild")
-    words = [str(head / "image.nii.gz"), "-o", str(tmp_path), *SMALL, "--nodes", "120", "--classes", "3"]
+    words = [
+        str(head / "image.nii.gz"),
+        "-o",
+        str(tmp_path),
+        *SMALL,
+        "--nodes",
+        "120",
+        "--classes",
+        "3",
+    ]
     assert main(["compare", *words, "--pipelines", "bcc,pytetwild"]) == 0
     lattice, theirs = json.loads((tmp_path / "report.json").read_text())["pipelines"]
     assert len(lattice["runs"]) == 1
@@ -201,7 +246,14 @@ def test_pytetwild_in_the_comparison(head, undrawn, tmp_path):
 @pytest.mark.full
 def test_baseline(head, tmp_path, capsys):
     pytest.importorskip("pytetwild", reason="the conventional pipeline needs pytetwild")
-    command = ["baseline", str(head / "image.nii.gz"), "-o", str(tmp_path / "b.vtu"), "--nodes", "150"]
+    command = [
+        "baseline",
+        str(head / "image.nii.gz"),
+        "-o",
+        str(tmp_path / "b.vtu"),
+        "--nodes",
+        "150",
+    ]
     assert main([*command, "--classes", "3", "--json", str(tmp_path / "b.json")]) == 0
     numbers = json.loads((tmp_path / "b.json").read_text())
     mesh = tetopt.load_mesh(tmp_path / "b.vtu").mesh
@@ -213,19 +265,27 @@ def test_baseline(head, tmp_path, capsys):
 
 @pytest.mark.deep
 def test_a_peer_that_crashes(head, undrawn, tmp_path, monkeypatch, capsys):
-    """At first: run again, and said on the page. Twice: it failed, and the line says what to try."""
+    """At first: run again, and said on the page. Twice: it failed, and the line says what to
+    try.
+    """
     monkeypatch.setenv("PIPES_PID", str(tmp_path / "pid"))
     for name, pipe in (("pytetwild", pipes.crash_once), ("bcc", pipes.crash)):
-        monkeypatch.setitem(PIPELINES, name, PIPELINES[name]._replace(function=pipe, is_random=False))
+        monkeypatch.setitem(
+            PIPELINES, name, PIPELINES[name]._replace(function=pipe, is_random=False)
+        )
     crash, image = "crashed: signal 11, SIGSEGV", str(head / "image.nii.gz")
     out = tmp_path / "out"
     words = [image, "-o", str(out), *SMALL, "--pipelines", "pytetwild,bcc"]
     assert main(["compare", *words]) == 0
     said = capsys.readouterr()
-    assert said.err.count(f"{crash}; running it again") == 3  # of the second also with quadratic cells
+    # of the second also with quadratic cells
+    assert said.err.count(f"{crash}; running it again") == 3
     again = f"the first run {crash}; this is the second, with surfaces 2 times as smooth"
     failed = f"twice {crash}; {AFTER_CRASHES}"
-    report, page = json.loads((out / "report.json").read_text()), (out / "report.html").read_text(encoding="utf-8")
+    report, page = (
+        json.loads((out / "report.json").read_text()),
+        (out / "report.html").read_text(encoding="utf-8"),
+    )
     assert f"<li>pytetwild: {again}</li>" in page
     assert f"BCC lattice: {failed}" in said.out
     assert f">{failed}</td>" in page
@@ -238,7 +298,19 @@ def test_a_peer_that_crashes(head, undrawn, tmp_path, monkeypatch, capsys):
 def test_a_missing_peer_is_no_failure_of_it(head, tmp_path, monkeypatch, capsys):
     missing = Outcome(None, {}, 0, [], "thing: not installed")
     monkeypatch.setattr(baseline, "run_in_child", lambda *_, **__: missing)
-    assert main(["baseline", str(head / "image.nii.gz"), "-o", str(tmp_path / "b.vtu"), "--nodes", "150"]) == 2
+    assert (
+        main(
+            [
+                "baseline",
+                str(head / "image.nii.gz"),
+                "-o",
+                str(tmp_path / "b.vtu"),
+                "--nodes",
+                "150",
+            ]
+        )
+        == 2
+    )
     assert "tetopt: pytetwild: thing: not installed" in capsys.readouterr().err
 
 
@@ -257,6 +329,9 @@ def test_a_missing_peer_is_no_failure_of_it(head, tmp_path, monkeypatch, capsys)
     ],
 )
 def test_bad_input(head, tmp_path, options, words, capsys):
-    assert main(["compare", str(head / "image.nii.gz"), "-o", str(tmp_path / "o"), *SMALL, *options]) == 2
+    assert (
+        main(["compare", str(head / "image.nii.gz"), "-o", str(tmp_path / "o"), *SMALL, *options])
+        == 2
+    )
     err = capsys.readouterr().err.strip().splitlines()
     assert words in err[-1]

@@ -10,7 +10,13 @@ import tetopt
 from tetopt.energy.discretization import cell_E_D
 from tetopt.geometry.simplex import volumes
 from tetopt.report.figures import SliceView
-from tetopt.study.compare_figures import cutaways, histograms_figure, labels_figure, slices_figure, timing_figure
+from tetopt.study.compare_figures import (
+    cutaways,
+    histograms_figure,
+    labels_figure,
+    slices_figure,
+    timing_figure,
+)
 
 
 @pytest.fixture(scope="module")
@@ -39,8 +45,11 @@ def test_slices_hold_means_and_losses(small, n_meshes):
         np.testing.assert_array_equal(painted(grid[1, column]).get_array(), mean[cells])
         density = cell_E_D(image, mesh) / volumes(mesh.points, mesh.cells)
         np.testing.assert_array_equal(painted(grid[2, column]).get_array(), density[cells])
-    assert len({painted(grid[2, column]).get_clim() for column in range(1, n_meshes + 1)}) == 1  # one scale for all
-    assert {painted(grid[1, c]).get_clim() for c in range(1, n_meshes + 1)} == {grid[0, 0].images[0].get_clim()}
+    # one scale for all
+    assert len({painted(grid[2, column]).get_clim() for column in range(1, n_meshes + 1)}) == 1
+    assert {painted(grid[1, c]).get_clim() for c in range(1, n_meshes + 1)} == {
+        grid[0, 0].images[0].get_clim()
+    }
 
 
 def test_label_marks_are_those_of_the_report():
@@ -50,15 +59,29 @@ def test_label_marks_are_those_of_the_report():
     for pipeline in done:
         pipeline.median.measurement.labels.reverse()
     dice, distance = labels_figure(report).axes
-    assert [text.get_text() for text in distance.get_xticklabels()] == ["0 (9000)", "1 (2250)", "2 (562)", "3 (140)"]
+    assert [text.get_text() for text in distance.get_xticklabels()] == [
+        "0 (9000)",
+        "1 (2250)",
+        "2 (562)",
+        "3 (140)",
+    ]
     for axes, name, n in ((dice, "dice", 4), (distance, "distance_mean", 3)):
-        marks = {line.get_label(): line.get_xydata() for line in axes.lines if line.get_markerfacecolor() != "none"}
+        marks = {
+            line.get_label(): line.get_xydata()
+            for line in axes.lines
+            if line.get_markerfacecolor() != "none"
+        }
         assert list(marks) == [p.title for p in done]
         for pipeline in done:
             values = {row.label: getattr(row, name) for row in pipeline.median.measurement.labels}
-            np.testing.assert_array_equal(marks[pipeline.title][:n, 1], [values[k] for k in range(n)])
+            np.testing.assert_array_equal(
+                marks[pipeline.title][:n, 1], [values[k] for k in range(n)]
+            )
             np.testing.assert_array_equal(np.rint(marks[pipeline.title][:n, 0]), np.arange(n))
-        is_open = [line.get_markerfacecolor() == "none" and len(line.get_xdata()) > 0 for line in axes.lines]
+        is_open = [
+            line.get_markerfacecolor() == "none" and len(line.get_xdata()) > 0
+            for line in axes.lines
+        ]
         own = axes.lines[is_open.index(True)].get_xydata()
         assert sum(is_open) == 1  # of all meshes but the first
         own_rows = {row.label: getattr(row, name) for row in done[0].median.measurement.own_labels}
@@ -67,7 +90,9 @@ def test_label_marks_are_those_of_the_report():
 
 def test_histograms_are_those_of_the_report():
     report = fake_report()
-    for axes, name in zip(histograms_figure(report).axes, ("rho_histogram", "dihedral_histogram"), strict=True):
+    for axes, name in zip(
+        histograms_figure(report).axes, ("rho_histogram", "dihedral_histogram"), strict=True
+    ):
         outlines = {p.get_label(): p.get_data() for p in axes.patches if p.get_label()}
         assert list(outlines) == [p.title for p in finished(report)]
         for pipeline in finished(report):
@@ -79,7 +104,9 @@ def test_histograms_are_those_of_the_report():
 def test_bars_are_the_steps():
     report = fake_report()
     (axes,) = timing_figure(report).axes
-    assert [tick.get_text() for tick in axes.get_yticklabels()] == [p.title for p in report.pipelines]
+    assert [tick.get_text() for tick in axes.get_yticklabels()] == [
+        p.title for p in report.pipelines
+    ]
     texts = {round(text.get_position()[1]): text.get_text().strip() for text in axes.texts}
     for row, pipeline in enumerate(report.pipelines):
         bars = [b for b in axes.patches if round(b.get_y() + b.get_height() / 2) == row]
@@ -88,7 +115,9 @@ def test_bars_are_the_steps():
             assert texts[row] == "failed"
             continue
         seconds = pipeline.median.seconds
-        assert [b.get_width() for b in bars] == pytest.approx([seconds["lattice"], seconds["optimise"]])
+        assert [b.get_width() for b in bars] == pytest.approx(
+            [seconds["lattice"], seconds["optimise"]]
+        )
         assert texts[row] == f"{pipeline.median.seconds_total:.3g} s"
 
 
@@ -96,10 +125,17 @@ def test_bars_are_the_steps():
 def test_cutaways_are_drawn(small, tmp_path, opengl):
     image, both = small
     meshes = [both[0], both[1], both[0], both[1]]
-    cutaways(meshes, [tetopt.cell_moments(image, mesh).mean for _, mesh in meshes], tmp_path / "a.png")
+    cutaways(
+        meshes, [tetopt.cell_moments(image, mesh).mean for _, mesh in meshes], tmp_path / "a.png"
+    )
     pixels = np.asarray(PIL.Image.open(tmp_path / "a.png").convert("L"))
     assert pixels.shape == (2000, 2200)
-    for part in (pixels[:1000, :1100], pixels[:1000, 1100:], pixels[1000:, :1100], pixels[1000:, 1100:]):
+    for part in (
+        pixels[:1000, :1100],
+        pixels[:1000, 1100:],
+        pixels[1000:, :1100],
+        pixels[1000:, 1100:],
+    ):
         assert part[200:800, 200:900].std() > 15.0
 
 
@@ -109,7 +145,8 @@ def test_colours_do_not_depend_on_what_failed():
     first, *others = report.pipelines
     fewer = report._replace(pipelines=[with_runs(first, []), *others])
     whole, part = (
-        {line.get_label(): line.get_color() for line in labels_figure(each).axes[0].lines} for each in (report, fewer)
+        {line.get_label(): line.get_color() for line in labels_figure(each).axes[0].lines}
+        for each in (report, fewer)
     )
     for each in finished(fewer):
         assert part[each.title] == whole[each.title]

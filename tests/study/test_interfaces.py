@@ -16,35 +16,47 @@ def inner(surfaces: Surfaces):
 
 
 def edge_counts(triangles):
-    edges = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
+    edges = np.sort(
+        np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1
+    )
     return np.unique(edges, axis=0, return_counts=True)
 
 
 @pytest.mark.parametrize("classes", [2, 3, 4])
 def test_thresholds_are_multi_otsu(classes):
-    filters = pytest.importorskip("skimage.filters", reason="scikit-image is the oracle of multi-Otsu")
+    filters = pytest.importorskip(
+        "skimage.filters", reason="scikit-image is the oracle of multi-Otsu"
+    )
     rng = np.random.default_rng(classes)
     values = np.concatenate([rng.normal(40.0 * k, 6.0, 400 * (k + 1)) for k in range(5)])
     # Theirs are the centres of the classes' last bins; a class ends where that bin ends.
     theirs = filters.threshold_multiotsu(values, classes) + 0.5 * np.ptp(values) / 256
-    assert np.array_equal(np.digitize(values, class_thresholds(values, classes)), np.digitize(values, theirs))
+    assert np.array_equal(
+        np.digitize(values, class_thresholds(values, classes)), np.digitize(values, theirs)
+    )
 
 
 @pytest.mark.parametrize(("labels", "tolerance"), [(None, 0.5), (LABELS, 1.0)])
 def test_sphere(labels, tolerance):
-    """Nodes and triangle centres near the true sphere: well under half a voxel, and the chord's depth."""
+    """Nodes and triangle centres near the true sphere: well under half a voxel, and the chord's
+    depth.
+    """
     surfaces = interfaces(IMAGE, 5.0, classes=2, labels=labels)
     centre = IMAGE.to_index(np.zeros(3)) * IMAGE.spacing
     corners = surfaces.points[inner(surfaces)]
     assert np.abs(np.linalg.norm(corners - centre, axis=2) - 20.0).max() < tolerance
-    assert np.abs(np.linalg.norm(corners.mean(axis=1) - centre, axis=1) - 20.0).max() < tolerance + 0.2
+    assert (
+        np.abs(np.linalg.norm(corners.mean(axis=1) - centre, axis=1) - 20.0).max() < tolerance + 0.2
+    )
     _, count = edge_counts(inner(surfaces))
     assert (count == 2).all()  # closed
     assert surfaces.notes == []
 
 
 def test_labels_conform_where_three_meet():
-    """Two halves of the box and a block across them: every edge inside the box is shared, three sheets meet."""
+    """Two halves of the box and a block across them: every edge inside the box is shared, three
+    sheets meet.
+    """
     data = np.zeros((24, 20, 20))
     data[12:] = 1
     data[6:18, 5:15, 5:15] = 2

@@ -13,7 +13,9 @@ from tetopt.study import mmg
 from tetopt.study.mmg import remeshed
 from tetopt.study.pipelines import PIPELINES, PipelineInput
 
-needs_mmgpy = pytest.mark.skipif(PIPELINES["mmg"].missing is not None, reason="mmgpy is not installed")
+needs_mmgpy = pytest.mark.skipif(
+    PIPELINES["mmg"].missing is not None, reason="mmgpy is not installed"
+)
 PHANTOM = tetopt.load_phantom("two_spheres")
 IMAGE, LABELS = PHANTOM.image(voxel_mm=4), PHANTOM.label_image(voxel_mm=4)
 
@@ -21,8 +23,12 @@ IMAGE, LABELS = PHANTOM.image(voxel_mm=4), PHANTOM.label_image(voxel_mm=4)
 @needs_mmgpy
 @pytest.mark.parametrize("labels", [LABELS, None])
 def test_a_box_of_labelled_cells(labels, monkeypatch):
-    """An oblique box is filled to the last digits; labels of the user's stay those, in their places."""
-    turned = np.array([[0.0, -4.0, 0.0, 3.0], [3.2, 0.0, -2.4, 5.0], [2.4, 0.0, 3.2, -7.0], [0.0, 0.0, 0.0, 1.0]])
+    """An oblique box is filled to the last digits; labels of the user's stay those, in their
+    places.
+    """
+    turned = np.array(
+        [[0.0, -4.0, 0.0, 3.0], [3.2, 0.0, -2.4, 5.0], [2.4, 0.0, 3.2, -7.0], [0.0, 0.0, 0.0, 1.0]]
+    )
     image = tetopt.Image(IMAGE.data, turned)
     given = None if labels is None else tetopt.Image(7 * labels.data, turned)
     made = PIPELINES["mmg"].function(PipelineInput(image, given, 1000, classes=3))
@@ -40,7 +46,10 @@ def test_a_box_of_labelled_cells(labels, monkeypatch):
     assert [row.label for row in rows] == [0, 7, 14]
     assert min(row.dice for row in rows) > 0.8
     monkeypatch.setattr(mmg, "MMG_RUNS", 1)
-    first, again = (PIPELINES["mmg"].function(PipelineInput(image, given, 1000, classes=3)).mesh for _ in range(2))
+    first, again = (
+        PIPELINES["mmg"].function(PipelineInput(image, given, 1000, classes=3)).mesh
+        for _ in range(2)
+    )
     assert first.points.tobytes() == again.points.tobytes()
 
 

@@ -1,7 +1,8 @@
-"""One test per figure and table row of the paper; the printed numbers are in `tetopt/study/paper.toml`.
+"""One test per figure and table row of the paper; the printed numbers are in
+`tetopt/study/paper.toml`.
 
-Tolerances are the printed digits where the paper says how the mesh was made (row 3; node and cell counts), and a band
-where it does not; each band is justified in a line.
+Tolerances are the printed digits where the paper says how the mesh was made (row 3; node and cell
+counts), and a band where it does not; each band is justified in a line.
 """
 
 import functools
@@ -23,7 +24,9 @@ def errors(name):
 
 @functools.cache
 def figure_3ef(data_dir):
-    return paper.figure_3ef(tetopt.load_image(data_dir / "mni_icbm152_t1_tal_nlin_sym_09a_converted.nii.gz"))
+    return paper.figure_3ef(
+        tetopt.load_image(data_dir / "mni_icbm152_t1_tal_nlin_sym_09a_converted.nii.gz")
+    )
 
 
 @functools.cache
@@ -39,15 +42,17 @@ def figure_3cd(snr):
 @functools.cache
 def simulated(snr):
     case = figure_3cd(snr)
-    return paper.simulate(case.image, case.initial)[0], paper.simulate(case.image, case.result.mesh)[0]
+    return paper.simulate(case.image, case.initial)[0], paper.simulate(
+        case.image, case.result.mesh
+    )[0]
 
 
 @pytest.mark.full
 def test_row_1_and_2_random_nodes():
     """Fig. 1, 8 seeds. The paper shows one draw, made in a way it does not tell.
 
-    Bands: the printed values of (i), (iii) and (iv) lie within a factor of 1.4 of the medians; (ii), which one almost
-    regular cell pulls to 0, only has to fall as printed.
+    Bands: the printed values of (i), (iii) and (iv) lie within a factor of 1.4 of the medians;
+    (ii), which one almost regular cell pulls to 0, only has to fall as printed.
     """
     spread = paper.figure_1_spread(8)
     for name in ("fig1a", "fig1b"):
@@ -61,9 +66,11 @@ def test_row_1_and_2_random_nodes():
 
 
 def test_column_ii_is_a_geometric_mean():
-    """Row 6 of the table is of two kinds of triangles, 98 each: (i), (iii), (iv) fix the errors a and b.
+    """Row 6 of the table is of two kinds of triangles, 98 each: (i), (iii), (iv) fix the errors a
+    and b.
 
-    Within the printed digits no a and b have the printed harmonic mean, and some have the printed geometric mean.
+    Within the printed digits no a and b have the printed harmonic mean, and some have the printed
+    geometric mean.
     """
     mean, second, squares, worst = errors("fig3c")
     a = worst + np.linspace(-0.5e-4, 0.5e-4, 401)
@@ -99,16 +106,19 @@ def test_row_3_to_the_printed_digits():
     """Fig. 2(a) is fully known: 7 x 7 squares cut into four."""
     case = figure_2(0.05)
     assert [len(case.initial.points), len(case.initial.cells)] == PRINTED["meshes"]["fig2a"]
-    np.testing.assert_allclose(paper.errors_of(case.initial), errors("fig2a"), rtol=0.0, atol=0.5e-4)
+    np.testing.assert_allclose(
+        paper.errors_of(case.initial), errors("fig2a"), rtol=0.0, atol=0.5e-4
+    )
 
 
 @pytest.mark.parametrize(("k_D", "name"), [(0.05, "fig2c"), (0.30, "fig2d")])
 def test_rows_4_and_5(k_D, name):
-    """Fig. 2(c, d) on our own phantom. "All measures, except for the worst element error, were improved".
+    """Fig. 2(c, d) on our own phantom. "All measures, except for the worst element error, were
+    improved".
 
-    Bands: (i) within 20 % of the printed value; it is set by the number of inclusions a mesh has to follow, which is
-    about the same. (iii) and (iv) hang on a few cells at the inclusions' corners: only below the initial (iii), and
-    for k_D = 0.05 below twice the printed (iv).
+    Bands: (i) within 20 % of the printed value; it is set by the number of inclusions a mesh has to
+    follow, which is about the same. (iii) and (iv) hang on a few cells at the inclusions' corners:
+    only below the initial (iii), and for k_D = 0.05 below twice the printed (iv).
     """
     ours, initial = np.array(paper.errors_of(figure_2(k_D).result.mesh)), errors("fig2a")
     assert np.all(ours[:3] < initial[:3])
@@ -119,7 +129,9 @@ def test_rows_4_and_5(k_D, name):
 
 
 def test_more_weight_fits_the_phantom_better():
-    """Fig. 2(c) against (d): E_D falls with k_D, and the mean error (i) rises as it does in the table."""
+    """Fig. 2(c) against (d): E_D falls with k_D, and the mean error (i) rises as it does in the
+    table.
+    """
     low, high = figure_2(0.05), figure_2(0.30)
     assert high.result.history[-1].E_D < 0.5 * low.result.history[-1].E_D
     assert paper.errors_of(high.result.mesh).mean > paper.errors_of(low.result.mesh).mean
@@ -128,7 +140,9 @@ def test_more_weight_fits_the_phantom_better():
 
 @pytest.mark.parametrize("k_D", [0.05, 0.3])
 def test_figure_2b_descent_finds_the_lowest_place(k_D):
-    """The minimum that the descent finds is as low as any on a grid over the landscape, to a hundredth of its depth."""
+    """The minimum that the descent finds is as low as any on a grid over the landscape, to a
+    hundredth of its depth.
+    """
     landscape = paper.figure_2b(k_D, n_places=21)
     assert landscape.E_minimum < landscape.E.min() + 0.01 * np.ptp(landscape.E)
     middle = landscape.E[10, 10]
@@ -137,7 +151,10 @@ def test_figure_2b_descent_finds_the_lowest_place(k_D):
 
 def test_figure_2b_moves_from_the_middle_to_the_edge():
     """The priority passes from shape to image: the further from the middle the larger k_D."""
-    away = [np.linalg.norm(paper.figure_2b(k_D, n_places=3).minimum - 29.5) for k_D in (0.0, 0.05, 0.3, 0.8)]
+    away = [
+        np.linalg.norm(paper.figure_2b(k_D, n_places=3).minimum - 29.5)
+        for k_D in (0.0, 0.05, 0.3, 0.8)
+    ]
     assert away == sorted(away)
     assert away[0] < 1e-3
     assert away[3] > 10.0
@@ -156,9 +173,11 @@ def test_figure_3ab_brain_slice(data_dir):
 
 
 def test_row_6_elastography_mesh():
-    """Fig. 3(c): 113 nodes, 196 triangles. The printed errors are those of a box 2 % longer than wide.
+    """Fig. 3(c): 113 nodes, 196 triangles. The printed errors are those of a box 2 % longer than
+    wide.
 
-    Band: the printed mean, 0.0859, is squares' within 0.0002; the worst, 0.0922, is not, which gives the aspect.
+    Band: the printed mean, 0.0859, is squares' within 0.0002; the worst, 0.0922, is not, which
+    gives the aspect.
     """
     case = figure_3cd(30.0)
     assert [len(case.initial.points), len(case.initial.cells)] == PRINTED["meshes"]["fig3c"]
@@ -170,8 +189,9 @@ def test_row_6_elastography_mesh():
 
 @pytest.mark.parametrize("snr", [None, 30.0, 20.0])
 def test_row_7_elastography_optimised(snr):
-    """Fig. 3(d) on simulated data. Band: (i), (iii) within 20 % of the printed values at every noise level, since the
-    gland and its nodules take up as much of the mesh as the paper's; the worst cell within a factor of 1.6.
+    """Fig. 3(d) on simulated data. Band: (i), (iii) within 20 % of the printed values at every
+    noise level, since the gland and its nodules take up as much of the mesh as the paper's; the
+    worst cell within a factor of 1.6.
     """
     ours = np.array(paper.errors_of(figure_3cd(snr).result.mesh))
     printed = errors("fig3d")
@@ -180,7 +200,9 @@ def test_row_7_elastography_optimised(snr):
 
 
 def test_elastography_recovers_the_stiffness():
-    """1 / strain shows the nodules brighter than the gland, and the gland brighter than its surroundings."""
+    """1 / strain shows the nodules brighter than the gland, and the gland brighter than its
+    surroundings.
+    """
     truth = tetopt.load_phantom("prostate_2d").image().data
     modulus = paper.elastography(30.0).data
     means = [modulus[truth == kPa].mean() for kPa in (10.0, 20.0, 45.0, 60.0)]
@@ -192,8 +214,9 @@ def test_elastography_recovers_the_stiffness():
 def test_conditioning_and_strain_energy(snr):
     """Section 3: +16 % lambda_max, +7 % cond, -5 % strain energy on the paper's prostate.
 
-    Direction and band: both conditioning numbers rise, by less than a factor of 2, "within acceptable range"; the
-    strain energy falls, by less than a tenth. Our phantom has sharper contrasts, so its cells deform more.
+    Direction and band: both conditioning numbers rise, by less than a factor of 2, "within
+    acceptable range"; the strain energy falls, by less than a tenth. Our phantom has sharper
+    contrasts, so its cells deform more.
     """
     before, after = simulated(snr)
     assert 1.0 < after.lambda_max / before.lambda_max < 2.0
@@ -203,7 +226,9 @@ def test_conditioning_and_strain_energy(snr):
 
 @pytest.mark.full
 def test_figure_3e_volume(data_dir):
-    """1078 nodes and 3900 tetrahedra, 13 x 10 x 6 cubes of five; the optimised mesh fits the volume better."""
+    """1078 nodes and 3900 tetrahedra, 13 x 10 x 6 cubes of five; the optimised mesh fits the
+    volume better.
+    """
     case = figure_3ef(data_dir)
     assert [len(case.initial.points), len(case.initial.cells)] == PRINTED["meshes"]["fig3e"]
     assert case.result.history[-1].E_D < 0.7 * case.result.history[0].E_D
@@ -213,13 +238,16 @@ def test_figure_3e_volume(data_dir):
 
 @pytest.mark.full
 def test_figure_3f_ventricles(data_dir):
-    """The largest connected set of tetrahedra under a threshold is the lateral ventricles: on both sides of the middle
-    plane, above the anterior commissure (the MNI origin), where the tissue labels have CSF.
+    """The largest connected set of tetrahedra under a threshold is the lateral ventricles: on both
+    sides of the middle plane, above the anterior commissure (the MNI origin), where the tissue
+    labels have CSF.
     """
     case = figure_3ef(data_dir)
     mesh = case.result.mesh
     bright = np.median(case.image.data[case.image.data > case.image.data.mean()])
-    inside = largest_component(mesh.cells, tetopt.cell_moments(case.image, mesh).mean < 0.6 * bright)
+    inside = largest_component(
+        mesh.cells, tetopt.cell_moments(case.image, mesh).mean < 0.6 * bright
+    )
     centres = mesh.points[mesh.cells[inside]].mean(axis=1)
     v = volumes(mesh.points, mesh.cells)[inside]
     middle = (v[:, None] * centres).sum(axis=0) / v.sum()

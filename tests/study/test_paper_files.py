@@ -17,7 +17,9 @@ from tetopt.study.paper_files import PAPER_PICTURES
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory, opengl):
-    """The whole command, small: few seeds, places and nodes, on the head phantom in the place of a brain volume."""
+    """The whole command, small: few seeds, places and nodes, on the head phantom in the place of
+    a brain volume.
+    """
     folder = tmp_path_factory.mktemp("paper")
     phantom = tetopt.load_phantom("ellipsoids_brain")
     tetopt.save_image(folder / "head.nii.gz", phantom.image(voxel_mm=4.0))
@@ -46,7 +48,9 @@ def test_files(run):
 
 @pytest.mark.full
 def test_page_holds_every_number(run):
-    """Each printed number and each of ours stands in the page as the JSON has it; nothing points outside."""
+    """Each printed number and each of ours stands in the page as the JSON has it; nothing points
+    outside.
+    """
     numbers = json.loads((run / "paper.json").read_text())
     page = (run / "paper.html").read_text(encoding="utf-8")
     rows = [row for section in numbers["sections"] for row in section.get("errors", ())]
@@ -65,7 +69,9 @@ def test_page_holds_every_number(run):
 
 @pytest.mark.full
 def test_every_other_number_is_on_the_page(run):
-    """E_D, minima, Dice and changes of the JSON are in the page; changes are after over before; rows are their own."""
+    """E_D, minima, Dice and changes of the JSON are in the page; changes are after over before;
+    rows are their own.
+    """
     sections = {s["title"]: s for s in json.loads((run / "paper.json").read_text())["sections"]}
     page = (run / "paper.html").read_text(encoding="utf-8")
     printed = paper.printed()["change"]
@@ -82,7 +88,8 @@ def test_every_other_number_is_on_the_page(run):
                 if name in printed:
                     points = f"{100 * (change - printed[name]):+.1f} points"
                     assert (
-                        f"<td>{100 * printed[name]:+.0f} %</td><td>{100 * change:+.1f} %</td><td>{points}</td>" in page
+                        f"<td>{100 * printed[name]:+.0f} %</td><td>{100 * change:+.1f} "
+                        f"%</td><td>{points}</td>" in page
                     )
     (figure_2,) = [s for title, s in sections.items() if title == "Fig. 2: synthetic phantom"]
     for row, k_D in zip(figure_2["errors"][1:], (0.05, 0.3), strict=True):
@@ -91,7 +98,9 @@ def test_every_other_number_is_on_the_page(run):
     (figure_1,) = [s for title, s in sections.items() if title.startswith("Fig. 1")]
     spread = paper.figure_1_spread(2)
     for row in figure_1["errors"]:
-        np.testing.assert_allclose([row["p5"], row["p95"]], np.percentile(spread[row["name"]], [5, 95], axis=0))
+        np.testing.assert_allclose(
+            [row["p5"], row["p95"]], np.percentile(spread[row["name"]], [5, 95], axis=0)
+        )
 
 
 @pytest.mark.full
@@ -104,23 +113,36 @@ def test_counts_and_row_3(run):
 
 @pytest.mark.full
 def test_segmentation_improves_on_the_lattice(run):
-    """Every label's Dice against the truth is in the JSON, and the mean of an optimised mesh beats the lattice's."""
+    """Every label's Dice against the truth is in the JSON, and the mean of an optimised mesh
+    beats the lattice's.
+    """
     sections = json.loads((run / "paper.json").read_text())["sections"]
     (overlaps,) = [s["dice"] for s in sections if s["title"].startswith("Section 5")]
     labels = set(map(str, range(9)))  # of the phantom
     assert all(set(row) == labels for row in overlaps.values())
     mean = {name: np.mean(list(row.values())) for name, row in overlaps.items()}
-    assert mean["4 classes, lattice"] < mean["4 classes, optimised"] <= mean["4 classes, voxels"] + 1e-9
+    assert (
+        mean["4 classes, lattice"]
+        < mean["4 classes, optimised"]
+        <= mean["4 classes, voxels"] + 1e-9
+    )
 
 
 @pytest.mark.full
 def test_page_in_a_browser(run, tmp_path):
-    """Headless Chromium draws the page and reports no script or image error; it is short on a wide screen."""
+    """Headless Chromium draws the page and reports no script or image error; it is short on a
+    wide screen.
+    """
     picture = f"--screenshot={tmp_path / 'page.png'}"
     browser(tmp_path / "profile", "--window-size=1000,3000", picture, (run / "paper.html").as_uri())
     assert np.std(np.asarray(PIL.Image.open(tmp_path / "page.png").convert("L"))) > 20.0
-    height = "<script>onload = ({target: {documentElement: e}}) => { e.dataset.height = e.scrollHeight; }</script>"
-    copy = copied((run / "paper.html").read_text(encoding="utf-8"), tmp_path / "copy.html", last=height)
+    height = (
+        "<script>onload = ({target: {documentElement: e}}) => { e.dataset.height = "
+        "e.scrollHeight; }</script>"
+    )
+    copy = copied(
+        (run / "paper.html").read_text(encoding="utf-8"), tmp_path / "copy.html", last=height
+    )
     head = document(copy, "--window-size=1280,900")[:400]
     assert int(re.search(r'data-height="(\d+)"', head)[1]) <= 5000
 
@@ -152,18 +174,31 @@ def block(tmp_path):
 
 
 def test_fem(tmp_path, block, capsys):
-    """The strain energy scales with the modulus and the square of the compression; the printed is the written."""
+    """The strain energy scales with the modulus and the square of the compression; the printed
+    is the written.
+    """
     energies = {}
-    for name, options in (("one", []), ("twice", ["--young", "0:0,50:100"]), ("deep", ["--compress", "2"])):
-        assert main(["fem", *block, "--nu", "0.3", "--json", str(tmp_path / f"{name}.json"), *options]) == 0
+    for name, options in (
+        ("one", []),
+        ("twice", ["--young", "0:0,50:100"]),
+        ("deep", ["--compress", "2"]),
+    ):
+        assert (
+            main(["fem", *block, "--nu", "0.3", "--json", str(tmp_path / f"{name}.json"), *options])
+            == 0
+        )
         numbers = json.loads((tmp_path / f"{name}.json").read_text())
         energies[name] = numbers["strain_energy"]
         assert f"{numbers['cond']:.6g}" in capsys.readouterr().out
     assert energies["twice"] == pytest.approx(2.0 * energies["one"], rel=1e-9)
     assert energies["deep"] == pytest.approx(4.0 * energies["one"], rel=1e-9)
-    assert main(["fem", *block, "--nu", "0.3", "--json", str(tmp_path / "f.json"), "--young", "2*h"]) == 0
+    assert (
+        main(["fem", *block, "--nu", "0.3", "--json", str(tmp_path / "f.json"), "--young", "2*h"])
+        == 0
+    )
     assert json.loads((tmp_path / "f.json").read_text())["strain_energy"] == energies["twice"]
-    # Between free sides, 1/2 E strain^2 V, and no sideways strain at all, (1 - nu) / ((1 + nu)(1 - 2 nu)) times that.
+    # Between free sides, 1/2 E strain^2 V, and no sideways strain at all, (1 - nu) / ((1 + nu)(1 -
+    # 2 nu)) times that.
     free = 0.5 * 50.0 * 0.01**2 * 512.0
     assert free < energies["one"] < free * 0.7 / (1.3 * 0.4)
 
@@ -176,7 +211,10 @@ def test_fem(tmp_path, block, capsys):
         (["--young", "h - 100"], "such as -50 at intensity 50"),
         (["--young", "0:1,100:1", "--compress", "200"], "--compress: expected a percentage"),
         (["--young", "0:0", "--average", "mean"], "young: expected moduli above 0 kPa"),
-        (["--average", "power:20"], 'power:P with P from -10 to 10, such as power:0.5, got "power:20"'),
+        (
+            ["--average", "power:20"],
+            'power:P with P from -10 to 10, such as power:0.5, got "power:20"',
+        ),
         (["--compress", "0"], "--compress"),
     ],
 )
@@ -202,10 +240,16 @@ def test_fem_bad_meshes(tmp_path, block, capsys):
     half = points[cells].mean(axis=1)[:, 2] < 3.5
     flat, folded = points.copy(), points.copy()
     flat[cells[3, 3]] = flat[cells[3, :3]].mean(axis=0)
-    folded[np.flatnonzero(np.all(np.abs(folded - 3.5) < 3.9, axis=1))[0]] = folded[cells[0]].mean(axis=0)
+    folded[np.flatnonzero(np.all(np.abs(folded - 3.5) < 3.9, axis=1))[0]] = folded[cells[0]].mean(
+        axis=0
+    )
     for changed, joined, words in (
         (points * [1.0, 1.0, 0.5], cells, "no node lies on the image's face"),
-        (np.vstack([points, loose]), np.vstack([cells, n + np.arange(4)]), f"the first has nodes [{n + 1}, "),
+        (
+            np.vstack([points, loose]),
+            np.vstack([cells, n + np.arange(4)]),
+            f"the first has nodes [{n + 1}, ",
+        ),
         (
             np.vstack([points] * 2),
             np.where(half[:, None], cells, cells + n),
@@ -222,7 +266,9 @@ def test_fem_bad_meshes(tmp_path, block, capsys):
 
 @pytest.mark.full
 def test_fem_turns_inverted_cells_and_says_so(tmp_path, block, capsys):
-    """A file of left-handed cells is turned when it is read; the numbers are those of the mesh as it should be."""
+    """A file of left-handed cells is turned when it is read; the numbers are those of the mesh
+    as it should be.
+    """
     mesh = tetopt.load_mesh(block[1]).mesh
     assert main(["fem", *block, "--json", str(tmp_path / "a.json")]) == 0
     capsys.readouterr()
@@ -235,7 +281,9 @@ def test_fem_turns_inverted_cells_and_says_so(tmp_path, block, capsys):
 
 @pytest.mark.full
 def test_fem_of_a_crop_and_its_output(tmp_path, capsys):
-    """A mesh of a crop is pressed with the same --crop; the file written holds the displacements that were solved."""
+    """A mesh of a crop is pressed with the same --crop; the file written holds the displacements
+    that were solved.
+    """
     tetopt.save_image(tmp_path / "a.nii", tetopt.load_phantom("sphere").image(voxel_mm=4.0))
     box = ["--crop", "2:14,2:14,2:14"]
     a, mesh = str(tmp_path / "a.nii"), str(tmp_path / "m.vtu")
@@ -247,7 +295,9 @@ def test_fem_of_a_crop_and_its_output(tmp_path, capsys):
     u, z = grid.point_data["displacement"], grid.points[:, 2]
     np.testing.assert_allclose(u[np.isclose(z, z.max())], 0.0, atol=1e-12)
     bottom = u[np.isclose(z, z.min())]
-    np.testing.assert_allclose(bottom, np.tile([0.0, 0.0, 0.02 * np.ptp(z)], (len(bottom), 1)), atol=1e-12)
+    np.testing.assert_allclose(
+        bottom, np.tile([0.0, 0.0, 0.02 * np.ptp(z)], (len(bottom), 1)), atol=1e-12
+    )
     assert (grid.cell_data["young"][0] > 0).all()
     assert grid.cell_data["strain"][0].shape == (len(grid.cells[0].data), 9)
     assert main(["fem", a, mesh, *box, "-o", mesh, "--force"]) == 2
@@ -265,9 +315,12 @@ def test_simulate_is_the_compression_it_says(turn):
     mesh = tetopt.lattice_mesh(image, nodes=60)
     simulated, pressed = paper.simulate(image, mesh)
     owner = tetopt.cell_of_voxel(image, mesh)
-    means = [image.data[owner == cell].mean() for cell in range(len(mesh.cells)) if (owner == cell).any()]
+    means = [
+        image.data[owner == cell].mean() for cell in range(len(mesh.cells)) if (owner == cell).any()
+    ]
     np.testing.assert_allclose(
-        np.sort(simulated.young[np.bincount(owner.ravel(), minlength=len(mesh.cells)) > 0]), np.sort(means)
+        np.sort(simulated.young[np.bincount(owner.ravel(), minlength=len(mesh.cells)) > 0]),
+        np.sort(means),
     )
     k = image.to_index(mesh.points)[:, 2]
     normal = affine[:3, 2] / 1.5
@@ -284,5 +337,7 @@ def test_turning_the_world_changes_nothing():
         affine = np.eye(4)
         affine[1:3, 1:3] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
         image = tetopt.Image(data, affine)
-        energies.append(paper.simulate(image, tetopt.lattice_mesh(image, blocks=(3, 3, 3)))[0].strain_energy)
+        energies.append(
+            paper.simulate(image, tetopt.lattice_mesh(image, blocks=(3, 3, 3)))[0].strain_energy
+        )
     np.testing.assert_allclose(energies, energies[0], rtol=1e-9)

@@ -18,12 +18,18 @@ EQUAL, AS_LABELS = (
 
 @pytest.mark.parametrize(
     ("image", "labels", "content", "notes"),
-    [(IMAGE, LABELS, BOTH, [EQUAL]), (LABELS, LABELS, ALONE, [AS_LABELS]), (IMAGE, None, IMAGE, [])],
+    [
+        (IMAGE, LABELS, BOTH, [EQUAL]),
+        (LABELS, LABELS, ALONE, [AS_LABELS]),
+        (IMAGE, None, IMAGE, []),
+    ],
 )
 def test_labels_that_are_given_are_meshed(image, labels, content, notes):
     """Besides the image, alone if the image is the labels; without any the image alone."""
     made = PIPELINES["tetopt-uniform"].function(PipelineInput(image, labels, 200, iterations=2))
-    expected = tetopt.optimize(content, tetopt.lattice_mesh(image, nodes=200), k_D=0.2, iterations=2)
+    expected = tetopt.optimize(
+        content, tetopt.lattice_mesh(image, nodes=200), k_D=0.2, iterations=2
+    )
     assert made.mesh.points.tobytes() == expected.mesh.points.tobytes()
     assert made.mesh.cells.tobytes() == expected.mesh.cells.tobytes()
     assert made.notes == [f"ended by: {expected.ended}", *notes]
@@ -38,7 +44,8 @@ def test_the_graded_mesh_is_that_of_mesh_image():
 def test_the_other_pipelines_do_not_see_labels():
     for name in ("tetopt-paper", "bcc"):
         with_labels, without = (
-            PIPELINES[name].function(PipelineInput(IMAGE, labels, 100, iterations=1)) for labels in (LABELS, None)
+            PIPELINES[name].function(PipelineInput(IMAGE, labels, 100, iterations=1))
+            for labels in (LABELS, None)
         )
         assert with_labels.mesh.points.tobytes() == without.mesh.points.tobytes()
 

@@ -1,4 +1,6 @@
-"""A program of the user's own as a pipeline: its files, the number of nodes, the box, and every refusal."""
+"""A program of the user's own as a pipeline: its files, the number of nodes, the box, and every
+refusal.
+"""
 
 import json
 import os
@@ -25,8 +27,12 @@ from tetopt.study.program import boxed, by_program, parse_program, pipelines_wit
 IMAGE = tetopt.load_phantom("sphere").image(voxel_mm=4.0)
 JOB = PipelineInput(IMAGE, None, 1000, classes=3)
 PYTHON = shlex.quote(sys.executable)
-# Each run notes what it is told, keeps what it is to mesh, and gives out the next of the files beside it.
-SCRIPT = 'cd "$(dirname "$0")"; echo "$@" >> log; cp "$1" kept.nii.gz; cp "$(wc -l < log).${2##*.}" "$2"\n'
+# Each run notes what it is told, keeps what it is to mesh, and gives out the next of the files
+# beside it.
+SCRIPT = (
+    'cd "$(dirname "$0")"; echo "$@" >> log; cp "$1" kept.nii.gz; cp "$(wc -l < '
+    'log).${2##*.}" "$2"\n'
+)
 
 
 def mesher(folder, *meshes, words="{labels} {output} {nodes} {size} '$HOME;'", **data):
@@ -48,11 +54,15 @@ def scaled(mesh, voxels):
     """The mesh made wider by so many voxels."""
     middle = (np.array(IMAGE.shape) - 1) / 2
     factor = 1 + voxels / np.array(IMAGE.shape)
-    return tetopt.Mesh(IMAGE.to_world(middle + factor * (IMAGE.to_index(mesh.points) - middle)), mesh.cells)
+    return tetopt.Mesh(
+        IMAGE.to_world(middle + factor * (IMAGE.to_index(mesh.points) - middle)), mesh.cells
+    )
 
 
 def covered(mesh):
-    """The mesh with a node on its lowest side a little further in, and under it cells that fill the dent."""
+    """The mesh with a node on its lowest side a little further in, and under it cells that fill
+    the dent.
+    """
     points = mesh.points.copy()
     low = points[:, 2].min()
     middle = points[:, :2].mean(axis=0)
@@ -64,14 +74,17 @@ def covered(mesh):
     rim = np.unique(around[around != node])
     turns = np.arctan2(*(points[rim, :2] - points[node, :2]).T)
     rim = rim[np.argsort(turns)]
-    fans = [np.roll(rim, -k) for k in range(len(rim))]  # from a corner of the rim two of its triangles have no area
+    # from a corner of the rim two of its triangles have no area
+    fans = [np.roll(rim, -k) for k in range(len(rim))]
     lids = [np.array([[node, fan[0], *pair] for pair in pairwise(fan[1:])]) for fan in fans]
     best = max(lids, key=lambda cells: np.abs(volumes(points, cells)).min())
     return tetopt.Mesh(points, np.vstack([mesh.cells, oriented(points, best)]))
 
 
 def test_number_of_nodes_is_corrected(tmp_path):
-    """Asked again with a corrected number, and a size that shrinks by its cube root; no shell reads the words."""
+    """Asked again with a corrected number, and a size that shrinks by its cube root; no shell
+    reads the words.
+    """
     few, enough = lattice(670), lattice(1000)
     made = by_program(JOB, mesher(tmp_path, few, enough))
     np.testing.assert_array_equal(made.mesh.points, enough.points)
@@ -83,12 +96,19 @@ def test_number_of_nodes_is_corrected(tmp_path):
     assert second == pytest.approx(1000 * 1000 / len(few.points), abs=1)
     assert smaller / size == pytest.approx((first / second) ** (1 / 3), rel=1e-5)
     assert {words[4] for words in said} == {"$HOME;"}
-    np.testing.assert_array_equal(tetopt.load_image(tmp_path / "kept.nii.gz").data, class_labels(IMAGE, 3).data)
+    np.testing.assert_array_equal(
+        tetopt.load_image(tmp_path / "kept.nii.gz").data, class_labels(IMAGE, 3).data
+    )
 
 
 def test_labels_go_to_the_program_and_come_back(tmp_path):
-    """Those of the image, on the cells that are left when flat ones are taken off; not others, nor without labels."""
-    given, mesh = tetopt.Image(7 * class_labels(IMAGE, 2).data, IMAGE.affine), covered(scaled(lattice(300), 1))
+    """Those of the image, on the cells that are left when flat ones are taken off; not others,
+    nor without labels.
+    """
+    given, mesh = (
+        tetopt.Image(7 * class_labels(IMAGE, 2).data, IMAGE.affine),
+        covered(scaled(lattice(300), 1)),
+    )
     number = np.arange(len(mesh.cells))
     labels = np.where(number % 2 == 0, 7 * (number // 2 % 2), 99)
     program = mesher(tmp_path, mesh, mesh, words="{labels} {output}", label=labels)
@@ -97,7 +117,10 @@ def test_labels_go_to_the_program_and_come_back(tmp_path):
     n = len(made.mesh.cells)
     assert n < len(mesh.cells)
     np.testing.assert_array_equal(made.labels, np.where(number % 2 == 0, labels, -1)[:n])
-    assert made.notes[-1] == f'{(number[:n] % 2 == 0).sum()} of {n} cells use the "label" in their file'
+    assert (
+        made.notes[-1]
+        == f'{(number[:n] % 2 == 0).sum()} of {n} cells use the "label" in their file'
+    )
     assert by_program(JOB, program).labels is None
 
 
@@ -122,7 +145,9 @@ def test_a_count_that_cannot_be_met_is_told(tmp_path):
 
 @pytest.mark.parametrize("shape", [lambda mesh: mesh, covered])
 def test_a_boundary_near_the_box_is_put_on_it(shape):
-    """Also one whose nodes lie a little inside, under cells that are all but flat: these are taken off."""
+    """Also one whose nodes lie a little inside, under cells that are all but flat: these are
+    taken off.
+    """
     mesh, kept, notes = boxed(IMAGE, shape(scaled(lattice(300), 1)))
     check_fills_box(IMAGE, mesh)
     assert len(mesh.cells) == len(kept) == len(lattice(300).cells)
@@ -140,7 +165,10 @@ def test_failures(tmp_path):
     for program, words in (
         (mesher(tmp_path, flat), "mine: expected tetrahedra, got triangles"),
         (mesher(tmp_path), "mine ended with exit code 1: cp: "),
-        (parse_program("mine=true {image} {output}"), "mine wrote no mesh, with nothing on its standard error"),
+        (
+            parse_program("mine=true {image} {output}"),
+            "mine wrote no mesh, with nothing on its standard error",
+        ),
     ):
         with pytest.raises(tetopt.InputError, match=f"^{words}"):
             by_program(JOB, program)
@@ -164,13 +192,29 @@ def test_sigterm_ends_the_comparison_and_its_programs(tmp_path):
     script, pid_file, temporary = tmp_path / "slow.sh", tmp_path / "pid", tmp_path / "temporary"
     script.write_text(f"echo $$ > {pid_file}.new; mv {pid_file}.new {pid_file}; exec sleep 600\n")
     temporary.mkdir()
-    words = ["compare", str(tmp_path / "image.nii.gz"), "-o", str(tmp_path / "out"), "--nodes", "150"]
-    words += ["--reference-dofs", "1000", "--pipelines", "bcc", "--pipeline", f"mine=sh {script} {{image}} {{output}}"]
+    words = [
+        "compare",
+        str(tmp_path / "image.nii.gz"),
+        "-o",
+        str(tmp_path / "out"),
+        "--nodes",
+        "150",
+    ]
+    words += [
+        "--reference-dofs",
+        "1000",
+        "--pipelines",
+        "bcc",
+        "--pipeline",
+        f"mine=sh {script} {{image}} {{output}}",
+    ]
     paths = os.pathsep.join([str(Path(tetopt.__file__).parents[1]), *filter(None, sys.path)])
     command = subprocess.Popen(
-        [sys.executable, "-m", "tetopt", *words], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL,
+        [sys.executable, "-m", "tetopt", *words],
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
         env=os.environ | {"PYTHONPATH": paths, "TMPDIR": str(temporary)},
-    )  # fmt: skip
+    )
     try:
         wait_for(pid_file.exists, 300.0)  # kernels may have to be compiled
         command.terminate()
@@ -194,14 +238,29 @@ def test_sigterm_ends_the_comparison_and_its_programs(tmp_path):
         ("a=sh {image}", "expected {output}, and {image}"),
         ("a=sh {image} {output} {seed}", "unknown placeholder {seed}"),
         ("a=sh {image} {output}.stl", "must end in .vtu, .vtk, .msh, .msh2, got {output}.stl"),
-        ("a=tetopt-no-such-program {image} {output}", 'no executable program "tetopt-no-such-program"'),
+        (
+            "a=tetopt-no-such-program {image} {output}",
+            'no executable program "tetopt-no-such-program"',
+        ),
         ("tetopt=sh {image} {output}", 'expected unique names, got "tetopt" again'),
     ],
 )
 def test_bad_commands(text, words, tmp_path, capsys):
     """One line, exit 2, before anything runs."""
     tetopt.save_image(tmp_path / "image.nii.gz", IMAGE)
-    assert main(["compare", str(tmp_path / "image.nii.gz"), "-o", str(tmp_path / "out"), "--pipeline", text]) == 2
+    assert (
+        main(
+            [
+                "compare",
+                str(tmp_path / "image.nii.gz"),
+                "-o",
+                str(tmp_path / "out"),
+                "--pipeline",
+                text,
+            ]
+        )
+        == 2
+    )
     assert words in capsys.readouterr().err.strip().splitlines()[-1]
     assert not (tmp_path / "out").exists()
 
@@ -225,11 +284,18 @@ def test_programs_in_the_comparison(tmp_path, opengl):
     assert main([*words, "--pipeline", fine, "--pipeline", small]) == 0
     report = json.loads((out / "report.json").read_text())
     bcc, mine, other = report["pipelines"]
-    assert [mine["kind"], mine["title"], mine["about"]] == ["peer", "mine", f"a program: {fine.partition('=')[2]}"]
-    assert report["options"]["programs"] == [
-        {"name": name, "command": text.partition("=")[2]} for name, text in (("mine", fine), ("other", small))
+    assert [mine["kind"], mine["title"], mine["about"]] == [
+        "peer",
+        "mine",
+        f"a program: {fine.partition('=')[2]}",
     ]
-    assert [abs(each["median"]["n_nodes"] / 300 - 1) < 0.2 for each in report["quadratic"]] == [True] * 3
+    assert report["options"]["programs"] == [
+        {"name": name, "command": text.partition("=")[2]}
+        for name, text in (("mine", fine), ("other", small))
+    ]
+    assert [abs(each["median"]["n_nodes"] / 300 - 1) < 0.2 for each in report["quadratic"]] == [
+        True
+    ] * 3
     assert set(mine["median"]["fem"]) == set(bcc["median"]["fem"]) == {"0.3", "0.45"}
     assert mine["median"]["E_D_fraction"] == pytest.approx(bcc["median"]["E_D_fraction"], rel=0.1)
     assert other["median"]["fem"] == {}

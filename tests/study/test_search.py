@@ -1,4 +1,6 @@
-"""The search for a number of nodes: secants of log nodes over log factor, brackets, runs without a mesh."""
+"""The search for a number of nodes: secants of log nodes over log factor, brackets, runs without
+a mesh.
+"""
 
 import pytest
 
@@ -9,12 +11,18 @@ from tetopt.study.tetwild import TETWILD_RESPONSE
 @pytest.mark.parametrize(
     ("response", "power", "first"),
     [
-        (TETWILD_RESPONSE, -3.0, 4000), (TETWILD_RESPONSE, -6.0, 300), (TETWILD_RESPONSE, -9.0, 700),
-        (REQUEST_RESPONSE, 1.0, 130), (REQUEST_RESPONSE, 0.7, 4000), (REQUEST_RESPONSE, 2.0, 900),
+        (TETWILD_RESPONSE, -3.0, 4000),
+        (TETWILD_RESPONSE, -6.0, 300),
+        (TETWILD_RESPONSE, -9.0, 700),
+        (REQUEST_RESPONSE, 1.0, 130),
+        (REQUEST_RESPONSE, 0.7, 4000),
+        (REQUEST_RESPONSE, 2.0, 900),
     ],
-)  # fmt: skip
+)
 def test_power_mappings(response, power, first):
-    """On a power law the second step is exact; the requested 1000 are reached in a few steps, the nearest run first."""
+    """On a power law the second step is exact; the requested 1000 are reached in a few steps,
+    the nearest run first.
+    """
     factors = []
 
     def run(factor):
@@ -46,5 +54,7 @@ def test_a_number_that_no_factor_meets():
     """Steps: brackets are kept, the runs are used up, the nearest comes first."""
     done = tries(lambda factor: 400 if factor < 1.3 else 1300, int, 1000, REQUEST_RESPONSE, most=5)
     assert len(done) == 5
-    assert [each.n_nodes for each in done] == sorted((each.n_nodes for each in done), key=lambda n: abs(n - 1200))
+    assert [each.n_nodes for each in done] == sorted(
+        (each.n_nodes for each in done), key=lambda n: abs(n - 1200)
+    )
     assert done[0].n_nodes == 1300

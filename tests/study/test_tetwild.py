@@ -1,4 +1,6 @@
-"""fTetWild's meshes fill the image's box exactly, with the requested number of nodes, in any orientation."""
+"""fTetWild's meshes fill the image's box exactly, with the requested number of nodes, in any
+orientation.
+"""
 
 import re
 import sys
@@ -16,14 +18,17 @@ from tetopt.study.interfaces import interfaces
 from tetopt.study.pipelines import PIPELINES, PipelineInput
 
 needs_pytetwild = pytest.mark.skipif(
-    find_spec("pytetwild") is None, reason="pytetwild is not installed: pip install 'pytetwild>=0.4'"
+    find_spec("pytetwild") is None,
+    reason="pytetwild is not installed: pip install 'pytetwild>=0.4'",
 )
 PHANTOM = tetopt.load_phantom("sphere")
 IMAGE = PHANTOM.image(voxel_mm=4.0)
 
 
 def oblique(data, spacing):
-    """A rotation about no axis in particular, another voxel edge along each axis, mirrored where it is negative."""
+    """A rotation about no axis in particular, another voxel edge along each axis, mirrored where
+    it is negative.
+    """
     q, _ = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))
     affine = np.eye(4)
     affine[:3, :3] = q * np.sign(np.linalg.det(q)) * np.array(spacing)
@@ -37,9 +42,11 @@ def assert_fills(image, mesh):
     assert volumes(mesh.points, mesh.cells).sum() == pytest.approx(image.volume, rel=1e-9)
     assert tetopt.cell_moments(image, mesh).n_voxels.sum() == image.data.size
     off = np.abs(
-        image.to_index(mesh.points)[boundary_facets(mesh.cells)][:, :, None] - [[-0.5] * 3, np.array(image.shape) - 0.5]
+        image.to_index(mesh.points)[boundary_facets(mesh.cells)][:, :, None]
+        - [[-0.5] * 3, np.array(image.shape) - 0.5]
     )
-    assert off.max(axis=1).reshape(-1, 6).min(axis=1).max() < 1e-9  # every boundary facet lies on one face
+    # every boundary facet lies on one face
+    assert off.max(axis=1).reshape(-1, 6).min(axis=1).max() < 1e-9
     assert len(np.unique(mesh.cells)) == len(mesh.points)
 
 
@@ -49,20 +56,25 @@ def assert_fills(image, mesh):
     "image",
     [
         oblique(PHANTOM.image(voxel_mm=[3.0, 4.0, 6.0]).data, (-3.0, 4.0, 6.0)),
-        tetopt.Image(IMAGE.data, np.array([[4.0, 0.8, 0, 1], [0, 4.0, -0.6, 2], [0, 0, 4.0, 3], [0, 0, 0, 1]])),
+        tetopt.Image(
+            IMAGE.data,
+            np.array([[4.0, 0.8, 0, 1], [0, 4.0, -0.6, 2], [0, 0, 4.0, 3], [0, 0, 0, 1]]),
+        ),
     ],
     ids=["flipped, anisotropic and oblique", "sheared"],
 )
 def test_fills_the_box_with_the_wanted_nodes(image, capfd):
     """Within 5 % of the number of nodes, or its note says how many they are: fTetWild is random.
 
-    20 runs of each image gave 286 to 314 nodes, in 1 to 4 runs of fTetWild; an earlier one was 16 off.
+    20 runs of each image gave 286 to 314 nodes, in 1 to 4 runs of fTetWild; an earlier one was 16
+    off.
     """
     produced = PIPELINES["pytetwild"].function(PipelineInput(image, None, 300, classes=2))
     assert_fills(image, produced.mesh)
     n_nodes = len(produced.mesh.points)
     is_noted = any(
-        re.fullmatch(f"{n_nodes} nodes after . runs of fTetWild, 300 were.*", note) for note in produced.notes
+        re.fullmatch(f"{n_nodes} nodes after . runs of fTetWild, 300 were.*", note)
+        for note in produced.notes
     )
     assert (abs(n_nodes - 300) > 15) == is_noted
     assert abs(n_nodes - 300) <= 45  # 15 %: three times the most that was seen
@@ -73,7 +85,9 @@ def test_fills_the_box_with_the_wanted_nodes(image, capfd):
 @pytest.mark.full
 @needs_pytetwild
 def test_facets_follow_the_interface():
-    """A better E_D than the lattice with as many nodes, by far, on a sphere that cells can follow."""
+    """A better E_D than the lattice with as many nodes, by far, on a sphere that cells can
+    follow.
+    """
     labels = PHANTOM.label_image(voxel_mm=4.0)
     mesh = PIPELINES["pytetwild"].function(PipelineInput(IMAGE, labels, 400)).mesh
     assert_fills(IMAGE, mesh)
@@ -82,7 +96,9 @@ def test_facets_follow_the_interface():
 
 @needs_pytetwild
 def test_missed_count_is_told(monkeypatch):
-    """Where no factor changes the number of nodes: all runs are made, the mesh is given, with a note."""
+    """Where no factor changes the number of nodes: all runs are made, the mesh is given, with a
+    note.
+    """
     mesh = tetopt.lattice_mesh(IMAGE, nodes=600)
     points = IMAGE.to_index(mesh.points) * IMAGE.spacing
     monkeypatch.setattr(tetwild, "_run", lambda *_: (points, mesh.cells))
@@ -100,12 +116,16 @@ def test_missing_package(monkeypatch):
     # In this module alone: tetopt's own names are imported lazily, by the same function.
     broken = SimpleNamespace(import_module=lambda name: __import__("tetopt_has_no_such_package"))
     monkeypatch.setattr(endings, "importlib", broken)
-    with pytest.raises(tetopt.InputError, match=r"pytetwild: cannot be imported \(No module .* pip install"):
+    with pytest.raises(
+        tetopt.InputError, match=r"pytetwild: cannot be imported \(No module .* pip install"
+    ):
         PIPELINES["pytetwild"].function(PipelineInput(IMAGE, None, 300, classes=2))
 
 
 def test_shaken_boundary_is_put_back():
-    """A lattice whose boundary nodes were moved off the faces, in and out: the box again, all cells positive."""
+    """A lattice whose boundary nodes were moved off the faces, in and out: the box again, all
+    cells positive.
+    """
     mesh = tetopt.lattice_mesh(IMAGE, nodes=600)
     low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
     rng = np.random.default_rng(0)
@@ -114,7 +134,9 @@ def test_shaken_boundary_is_put_back():
     v = volumes(points, cells)
     assert v.min() > 0.0
     assert v.sum() == pytest.approx(IMAGE.volume, rel=1e-12)
-    np.testing.assert_array_equal(np.unique(mesh.cells[kept], return_inverse=True)[1].reshape(-1, 4), cells)
+    np.testing.assert_array_equal(
+        np.unique(mesh.cells[kept], return_inverse=True)[1].reshape(-1, 4), cells
+    )
     assert np.array_equal(points.min(axis=0), low)
     assert np.array_equal(points.max(axis=0), high)
 
@@ -123,6 +145,8 @@ def test_shaken_boundary_is_put_back():
 def test_hole_is_refused():
     mesh = tetopt.lattice_mesh(IMAGE, nodes=20)
     low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
-    middle = np.linalg.norm(mesh.points[mesh.cells].mean(axis=1) - 0.5 * (low + high), axis=1).argmin()
+    middle = np.linalg.norm(
+        mesh.points[mesh.cells].mean(axis=1) - 0.5 * (low + high), axis=1
+    ).argmin()
     with pytest.raises(tetopt.InputError, match=r"are inverted|fill 0"):
         tetwild.put_on_box(mesh.points, np.delete(mesh.cells, middle, axis=0), low, high)

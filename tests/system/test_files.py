@@ -1,4 +1,6 @@
-"""Outputs: asked for before the work, written whole or not at all, with the permissions of any other file."""
+"""Outputs: asked for before the work, written whole or not at all, with the permissions of any
+other file.
+"""
 
 import errno
 import json
@@ -73,7 +75,9 @@ def test_a_folder_that_is_none_and_a_file_that_is_one_are_refused(tmp_path):
 
 
 def test_a_folder_that_takes_no_file_is_refused(tmp_path, monkeypatch):
-    """Whatever its rights say, a file is made there: root may write everywhere, but not on a full disk."""
+    """Whatever its rights say, a file is made there: root may write everywhere, but not on a
+    full disk.
+    """
 
     def refused(*_, **__):
         raise OSError(errno.EROFS, "Read-only file system")
@@ -99,7 +103,10 @@ def test_what_is_no_file_is_not_replaced(tmp_path):
 def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
     (tmp_path / "file").write_text("x")
     for name in ("a" * 300, "a\0b", "file/b"):
-        with pytest.raises(InputError, match="cannot create the folder for the results"), outputs_of_command():
+        with (
+            pytest.raises(InputError, match="cannot create the folder for the results"),
+            outputs_of_command(),
+        ):
             results_folder(tmp_path / "new" / ".." / name)
     with pytest.raises(InputError, match="found a file"):
         results_folder(tmp_path / "file")
@@ -158,13 +165,18 @@ def test_no_output_is_an_input_or_another_output(tmp_path, monkeypatch):
     Path("l.vtu").symlink_to("a.vtu")
     os.link("a.vtu", "h.vtu")
     for output, named in (
-        ("a.vtu", ["a.vtu", "a.vtu"]), ("a.vtu", ["a.vtu", "./a.vtu"]), ("l.vtu", ["l.vtu", "a.vtu"]),
-        ("h.vtu", ["a.vtu", "h.vtu"]), ("new.vtu", ["new.vtu", tmp_path / "new.vtu"]),
+        ("a.vtu", ["a.vtu", "a.vtu"]),
+        ("a.vtu", ["a.vtu", "./a.vtu"]),
+        ("l.vtu", ["l.vtu", "a.vtu"]),
+        ("h.vtu", ["a.vtu", "h.vtu"]),
+        ("new.vtu", ["new.vtu", tmp_path / "new.vtu"]),
         ("a.vtu", [tmp_path, "a.vtu", tmp_path / "a.vtu"]),
-    ):  # fmt: skip
+    ):
         with outputs_of_command():
             name_files([None, 3, [Path(name) for name in named]])
-            assert_refused(Path(output), "is also an input or another output of this command", force=True)
+            assert_refused(
+                Path(output), "is also an input or another output of this command", force=True
+            )
     with outputs_of_command():
         name_files([Path("a.vtu"), Path("b.vtu")])
         checked_output("a.vtu", VTU, force=True)
@@ -179,7 +191,8 @@ def test_no_output_is_an_input_or_another_output(tmp_path, monkeypatch):
 def test_the_file_appears_only_at_the_end(tmp_path, name):
     path = tmp_path / name
     with written_whole(path) as temporary:
-        assert temporary.parent == tmp_path  # of the same file system, so that the renaming is atomic
+        # of the same file system, so that the renaming is atomic
+        assert temporary.parent == tmp_path
         assert temporary.name.endswith(".nii.gz")  # from which writers tell the format
         temporary.write_text("new")
         assert not path.exists()
@@ -187,7 +200,9 @@ def test_the_file_appears_only_at_the_end(tmp_path, name):
     assert list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.parametrize(("error", "old"), [(OSError, None), (ValueError, "old"), (KeyboardInterrupt, "old")])
+@pytest.mark.parametrize(
+    ("error", "old"), [(OSError, None), (ValueError, "old"), (KeyboardInterrupt, "old")]
+)
 def test_an_ended_block_leaves_what_was_there(tmp_path, error, old):
     path = tmp_path / "mesh.vtu"
     if old is not None:
@@ -216,7 +231,9 @@ def test_a_writer_that_removes_its_file_leaves_the_old_one(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.parametrize("name", ["m" * 250 + ".vtu", "m." + "v" * 244 + ".vtu", "ä" * 120 + ".vtu"])
+@pytest.mark.parametrize(
+    "name", ["m" * 250 + ".vtu", "m." + "v" * 244 + ".vtu", "ä" * 120 + ".vtu"]
+)
 def test_names_as_long_as_they_can_be(tmp_path, name):
     with written_whole(tmp_path / name) as temporary:
         temporary.write_text("new")
@@ -224,7 +241,9 @@ def test_names_as_long_as_they_can_be(tmp_path, name):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no umask")
-@pytest.mark.parametrize(("mask", "mode"), [(0o022, 0o644), (0o077, 0o600), (0o002, 0o664), (0o027, 0o640)])
+@pytest.mark.parametrize(
+    ("mask", "mode"), [(0o022, 0o644), (0o077, 0o600), (0o002, 0o664), (0o027, 0o640)]
+)
 def test_permissions_follow_the_umask(tmp_path, mask, mode):
     before = os.umask(mask)
     try:
@@ -239,7 +258,9 @@ def test_permissions_follow_the_umask(tmp_path, mask, mode):
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no such rights")
 @pytest.mark.parametrize("mode", [0o600, 0o640, 0o444])
 def test_a_replaced_file_keeps_its_rights(tmp_path, mode, monkeypatch):
-    """Patient data that nobody else may read stays so; what nobody may write is replaced by its owner, too."""
+    """Patient data that nobody else may read stays so; what nobody may write is replaced by its
+    owner, too.
+    """
     open_file = os.open
 
     def opened(file, flags, *rest, **options):  # as for anybody but root
@@ -256,7 +277,9 @@ def test_a_replaced_file_keeps_its_rights(tmp_path, mode, monkeypatch):
     assert stat.S_IMODE(path.stat().st_mode) == mode
 
 
-@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root has every group")
+@pytest.mark.skipif(
+    not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root has every group"
+)
 def test_a_replaced_file_keeps_its_group(tmp_path, monkeypatch):
     path = tmp_path / "a.json"
     path.write_text("old")
@@ -268,7 +291,8 @@ def test_a_replaced_file_keeps_its_group(tmp_path, monkeypatch):
     def refused(*_):
         raise PermissionError(errno.EPERM, "Operation not permitted")
 
-    monkeypatch.setattr(os, "chown", refused)  # another group must not get what that one was allowed
+    # another group must not get what that one was allowed
+    monkeypatch.setattr(os, "chown", refused)
     save_bytes(path, b"newer")
     assert path.stat().st_gid != 12345
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
@@ -277,7 +301,9 @@ def test_a_replaced_file_keeps_its_group(tmp_path, monkeypatch):
 def test_a_file_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
     steps = []
     real_sync, real_replace = os.fsync, os.replace
-    monkeypatch.setattr(os, "fsync", lambda handle: steps.append(stat.S_IFMT(os.fstat(handle).st_mode)))
+    monkeypatch.setattr(
+        os, "fsync", lambda handle: steps.append(stat.S_IFMT(os.fstat(handle).st_mode))
+    )
     monkeypatch.setattr(os, "replace", lambda *names: (steps.append("name"), real_replace(*names)))
     save_bytes(tmp_path / "a.json", b"new")
     assert steps == [stat.S_IFREG, "name", *([] if os.name == "nt" else [stat.S_IFDIR])]
@@ -301,7 +327,8 @@ def test_an_error_names_the_file_and_a_full_disk_the_bytes(tmp_path, monkeypatch
 def test_space_is_asked_for(tmp_path):
     check_space(tmp_path / "a.vtu", 1)
     with pytest.raises(
-        InputError, match=r"a.vtu: needs at least 1000000000000000000 bytes, but only \d+ are free; free some space"
+        InputError,
+        match=r"a.vtu: needs at least 1000000000000000000 bytes, but only \d+ are free; free some space",
     ):
         check_space(tmp_path / "a.vtu", 10**18)
 

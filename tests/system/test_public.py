@@ -44,13 +44,26 @@ RIGHT = {
     "mask_fidelity": {"mask": LABELS, "mesh": MESH},
     "merge_labels": {"labels": LABELS, "merge": "a=1; b=*", "names": {1: "c"}},
     "mesh_image": {
-        "image": IMAGE, "nodes": 100, "target_error": None, "nodes_max": None, "start": None, "spacing": None,
-        "sizes": None, "mode": "graded",
+        "image": IMAGE,
+        "nodes": 100,
+        "target_error": None,
+        "nodes_max": None,
+        "start": None,
+        "spacing": None,
+        "sizes": None,
+        "mode": "graded",
     },
     "build_model": {"mesh": MESH, "image": IMAGE, "sets": ["a=x<1"], "bins": 3, "order": 1},
     "octree_mesh": {"image": IMAGE, "nodes": 100, "sizes": None},
     "open_stored": {"path": "a.nii", "volume": 0},
-    "optimize": {"image": IMAGE, "mesh": MESH, "k_D": 0.2, "iterations": 1, "nodes": None, "boundary": "slide"},
+    "optimize": {
+        "image": IMAGE,
+        "mesh": MESH,
+        "k_D": 0.2,
+        "iterations": 1,
+        "nodes": None,
+        "boundary": "slide",
+    },
     "optimize_paper": {"image": IMAGE, "mesh": MESH, "k_D": 0.2, "iterations": 1},
     "plan": {"job": tetopt.Job(images="a.nii", output="a.vtu")},
     "quality": {"points": MESH.points, "cells": MESH.cells},
@@ -65,12 +78,16 @@ RIGHT = {
     "save_model": {"path": "a.inp", "model": MODEL, "space": "ras"},
     "save_surface": {"path": "a.stl", "about": "", "space": "ras"},
     "segment": {"image": IMAGE, "mesh": MESH, "classes": 2},
-    "sizes_by_label": {"sizes": tetopt.Sizes(cells_across=1), "image": tetopt.content(LABELS, LABELS), "nodes": 100},
+    "sizes_by_label": {
+        "sizes": tetopt.Sizes(cells_across=1),
+        "image": tetopt.content(LABELS, LABELS),
+        "nodes": 100,
+    },
     "solution_fields": {"mesh": MESH, "step": 1},
     "solve": {"model": MODEL, "step": 1},
     "tissue_labels": {"tissues": [IMAGE]},
     "extract_surface": {"points": MESH.points, "cells": MESH.cells, "chosen": [True]},
-}  # fmt: skip
+}
 WRONG = {
     "a text": "x.nii.gz",
     "a path": Path("x.nii.gz"),
@@ -97,25 +114,36 @@ def test_every_public_function_is_in_the_table():
         assert set(RIGHT[name]) <= set(inspect.signature(getattr(tetopt, name)).parameters)
 
 
-# Classes in the fields of public records that the package alone looks into: they are handed on as they are.
+# Classes in the fields of public records that the package alone looks into: they are handed on as
+# they are.
 INNER = {"Continuation", "Memberships", "PhantomVoxels", "Region", "System"}
 INNER |= {"JobOptions", "SmoothLabels", "Source", "Spread"}  # of runs and contents
 
 
 def classes():
     """The names of all classes of the package."""
-    texts = [path.read_text(encoding="utf-8") for path in Path(tetopt.__file__).parent.rglob("*.py")]
+    texts = [
+        path.read_text(encoding="utf-8") for path in Path(tetopt.__file__).parent.rglob("*.py")
+    ]
     return {name for text in texts for name in re.findall(r"^class (\w+)", text, re.M)}
 
 
 def annotations_of(thing):
-    """What a function takes and returns; what a class's fields are, and its public methods take and return."""
+    """What a function takes and returns; what a class's fields are, and its public methods take
+    and return.
+    """
     if inspect.isfunction(thing):
         return thing.__annotations__
-    methods = inspect.getmembers(thing, lambda member: inspect.isfunction(member) or isinstance(member, property))
-    functions = [getattr(member, "fget", member) for name, member in methods if not name.startswith("_")]
+    methods = inspect.getmembers(
+        thing, lambda member: inspect.isfunction(member) or isinstance(member, property)
+    )
+    functions = [
+        getattr(member, "fget", member) for name, member in methods if not name.startswith("_")
+    ]
     return getattr(thing, "__annotations__", {}) | {
-        f"{function.__name__}.{key}": value for function in functions for key, value in function.__annotations__.items()
+        f"{function.__name__}.{key}": value
+        for function in functions
+        for key, value in function.__annotations__.items()
     }
 
 
@@ -132,7 +160,9 @@ def test_every_type_of_a_public_name_is_public():
 
 @pytest.mark.parametrize("name", RIGHT)
 def test_right_kinds_are_taken_and_wrong_ones_are_one_line(name):
-    """Each argument is replaced by all that it can hardly be: no error but InputError, on one line that names it."""
+    """Each argument is replaced by all that it can hardly be: no error but InputError, on one
+    line that names it.
+    """
     function = inspect.unwrap(getattr(tetopt, name))
     check_arguments(function, RIGHT[name])
     for argument in RIGHT[name]:
@@ -149,14 +179,20 @@ def test_right_kinds_are_taken_and_wrong_ones_are_one_line(name):
 
 @pytest.mark.parametrize("what", ["a text", "nibabel's", "None"])
 def test_what_is_no_image_is_told_how_to_become_one(what):
-    with pytest.raises(tetopt.InputError, match=r"expected (an )?(Image|Mesh).*, got .*; use tetopt\.(load|Image)"):
+    with pytest.raises(
+        tetopt.InputError, match=r"expected (an )?(Image|Mesh).*, got .*; use tetopt\.(load|Image)"
+    ):
         tetopt.mesh_image(WRONG[what], 500)
 
 
 def test_records_are_looked_into():
-    with pytest.raises(tetopt.InputError, match=r"mesh_image: sizes\.edge_size: expected a number or None, got '5'"):
+    with pytest.raises(
+        tetopt.InputError, match=r"mesh_image: sizes\.edge_size: expected a number or None, got '5'"
+    ):
         tetopt.mesh_image(IMAGE, 100, sizes=tetopt.Sizes(edge_size="5"))
-    with pytest.raises(tetopt.InputError, match=r"sizes\.field: expected Image or None, got 'a\.nii'"):
+    with pytest.raises(
+        tetopt.InputError, match=r"sizes\.field: expected Image or None, got 'a\.nii'"
+    ):
         tetopt.octree_mesh(IMAGE, 100, tetopt.Sizes(field="a.nii"))
     words = r"cell_moments: image: expected Image, got tetopt\.contents\.content\.Content; use .* image of a Content"
     with pytest.raises(tetopt.InputError, match=words):
@@ -164,7 +200,8 @@ def test_records_are_looked_into():
 
 
 @pytest.mark.parametrize(
-    "arrays", [("x", [[0, 1, 2]]), ([[0, 0], [1]], [[0, 1, 2]]), (None, None), ({}, set()), (dict, 1)]
+    "arrays",
+    [("x", [[0, 1, 2]]), ([[0, 0], [1]], [[0, 1, 2]]), (None, None), ({}, set()), (dict, 1)],
 )
 def test_a_mesh_of_anything(arrays):
     with pytest.raises(tetopt.InputError, match="mesh"):
@@ -173,9 +210,14 @@ def test_a_mesh_of_anything(arrays):
 
 def test_tables_are_looked_into_as_records_are():
     """Sizes by label that are no table, and names of labels that are none."""
-    with pytest.raises(tetopt.InputError, match=r"^sizes_by_label: sizes\.by_label: expected dict.* or None, got 5$"):
+    with pytest.raises(
+        tetopt.InputError,
+        match=r"^sizes_by_label: sizes\.by_label: expected dict.* or None, got 5$",
+    ):
         tetopt.sizes_by_label(tetopt.Sizes(by_label=5), tetopt.content(LABELS, LABELS))
-    with pytest.raises(tetopt.InputError, match=r"^merge_labels: names: expected dict.* or None, got 500$"):
+    with pytest.raises(
+        tetopt.InputError, match=r"^merge_labels: names: expected dict.* or None, got 500$"
+    ):
         tetopt.merge_labels(LABELS, "a=foo; b=*", 500)
 
 
@@ -186,20 +228,26 @@ def test_an_image_of_anything():
 
 
 def test_a_decorated_function_is_looked_at():
-    with pytest.raises(tetopt.InputError, match=r"^solve: model: expected Model, got .*; use tetopt\.build_model"):
+    with pytest.raises(
+        tetopt.InputError, match=r"^solve: model: expected Model, got .*; use tetopt\.build_model"
+    ):
         tetopt.solve("x.vtu")
 
 
 def warning_calls(folder):
     """Calls that warn, at several depths within tetopt."""
     tetopt.save_image(folder / "even.nii", tetopt.Image(np.ones((3, 4, 5))))
-    tetopt.save_image(folder / "large.nii", tetopt.Image(IMAGE.data, np.diag([900.0, 900.0, 900.0, 1.0])))
+    tetopt.save_image(
+        folder / "large.nii", tetopt.Image(IMAGE.data, np.diag([900.0, 900.0, 900.0, 1.0]))
+    )
     sets, loads = ["low=plane:0,0,0:0,0,1:0.1"], ["hold:low"]
     tetopt.save_model(folder / "a.vtu", tetopt.build_model(MESH, young=3.0, sets=sets, loads=loads))
     loaded = tetopt.load_mesh(folder / "a.vtu")
     own = loaded._replace(sets=loaded.sets._replace(facets={}))
     return {
-        "save_model": lambda: tetopt.save_model(folder / "a.inp", tetopt.build_model(MESH, young=3.0, nu=0.46)),
+        "save_model": lambda: tetopt.save_model(
+            folder / "a.inp", tetopt.build_model(MESH, young=3.0, nu=0.46)
+        ),
         "save_mesh": lambda: tetopt.save_mesh(folder / "b.vtk", MESH, {"a\nb": np.ones(1)}),
         "load_image": lambda: tetopt.load_image(folder / "even.nii"),
         "load_image, of a large one": lambda: tetopt.load_image(folder / "large.nii"),
@@ -220,15 +268,27 @@ def test_a_warning_names_the_line_of_who_called(tmp_path):
 @pytest.mark.parametrize(
     ("points", "cells", "message"),
     [
-        (np.where(MESH.points == 4.0, np.nan, MESH.points), MESH.cells, "points: expected finite coordinates"),
-        (np.where(MESH.points == 4.0, np.inf, MESH.points), MESH.cells, "points: expected finite coordinates"),
+        (
+            np.where(MESH.points == 4.0, np.nan, MESH.points),
+            MESH.cells,
+            "points: expected finite coordinates",
+        ),
+        (
+            np.where(MESH.points == 4.0, np.inf, MESH.points),
+            MESH.cells,
+            "points: expected finite coordinates",
+        ),
         (MESH.points, MESH.cells + 1, r"cells: expected indices in 0\.\.3, got 1\.\.4"),
         (MESH.points, MESH.cells - 1, r"cells: expected indices in 0\.\.3, got -1\.\.2"),
         (MESH.points, MESH.cells.astype(float), "cells: expected integers, got float64"),
         (MESH.points, MESH.cells == 1, "cells: expected integers, got bool"),
         (MESH.points, MESH.cells[:0], r"cells: expected shape \(M, 4\) with M > 0, got \(0, 4\)"),
         (MESH.points, MESH.cells[:, :3], r"cells: expected shape \(M, 4\)"),
-        (MESH.points[:, :1], MESH.cells, r"points: expected shape \(N, 2\) or \(N, 3\), got \(4, 1\)"),
+        (
+            MESH.points[:, :1],
+            MESH.cells,
+            r"points: expected shape \(N, 2\) or \(N, 3\), got \(4, 1\)",
+        ),
         (MESH.points[:0], MESH.cells, r"cells: expected indices in 0\.\.-1"),
     ],
 )
@@ -240,7 +300,9 @@ def test_points_and_cells_that_do_not_fit_are_refused(points, cells, message):
         assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("kind", [np.int8, np.uint8, np.int16, np.uint64, np.float16, np.float32, np.longdouble])
+@pytest.mark.parametrize(
+    "kind", [np.int8, np.uint8, np.int16, np.uint64, np.float16, np.float32, np.longdouble]
+)
 def test_numbers_of_any_width_are_the_same_number(kind):
     """As 100 * 100 overflows 8 bits."""
     plain = tetopt.lattice_mesh(IMAGE, nodes=100)

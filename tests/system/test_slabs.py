@@ -30,7 +30,10 @@ def noise(shape, seed=0):
 def results(shape, factors):
     """What is computed in slabs, of a mask and labels of this shape, as bytes."""
     field, n = noise(shape), len(shape)
-    inside, labels = field > 0.0, tetopt.Image(np.digitize(field, [-0.02, 0.02]).astype(float), np.eye(n + 1))
+    inside, labels = (
+        field > 0.0,
+        tetopt.Image(np.digitize(field, [-0.02, 0.02]).astype(float), np.eye(n + 1)),
+    )
     off = None if max(factors) == 1 else np.full(shape, 0.5, dtype=np.float32)
     mesh, image = tetopt.lattice_mesh(labels, nodes=200), tetopt.Image(field, labels.affine)
     mask = tetopt.Image((noise(shape, 1) > -0.05).astype(float), labels.affine)
@@ -38,10 +41,15 @@ def results(shape, factors):
     moments, ranges = cell_moments_and_ranges(image, mesh)
     result = tetopt.mesh_image(what, nodes=150, iterations=4)
     arrays = [
-        smoothing.smooth_level(inside, inside, off, factors), what.memberships.levels, cell_of_voxel(image, mesh),
-        moments.mean, *ranges, local_thickness(what.memberships, labels.spacing, 9.0), result.mesh.points,
+        smoothing.smooth_level(inside, inside, off, factors),
+        what.memberships.levels,
+        cell_of_voxel(image, mesh),
+        moments.mean,
+        *ranges,
+        local_thickness(what.memberships, labels.spacing, 9.0),
+        result.mesh.points,
         result.labels,
-    ]  # fmt: skip
+    ]
     return [array.tobytes() for array in arrays]
 
 
@@ -59,8 +67,18 @@ def test_the_number_of_slabs_changes_no_bit(whole, many_slabs, case):
 
 
 def test_slabs_follow_each_other_and_come_back_in_order(many_slabs):
-    assert slabs.over_slabs(lambda first, stop: list(range(first, stop)), 5, 10**9) == [[0], [1], [2], [3], [4]]
-    assert slabs.over_slabs(lambda first, stop: (first, stop), 100, 10**9, 3) == [(0, 33), (33, 66), (66, 100)]
+    assert slabs.over_slabs(lambda first, stop: list(range(first, stop)), 5, 10**9) == [
+        [0],
+        [1],
+        [2],
+        [3],
+        [4],
+    ]
+    assert slabs.over_slabs(lambda first, stop: (first, stop), 100, 10**9, 3) == [
+        (0, 33),
+        (33, 66),
+        (66, 100),
+    ]
 
 
 def test_smoothing_kernels_equal_scipy():
@@ -69,11 +87,15 @@ def test_smoothing_kernels_equal_scipy():
         result = np.empty_like(part)
         smoothing._fill_correlated(result, part, weights, 0, n)
         for axis in range(3 - n, 3):
-            part = correlate1d(part, np.concatenate([weights[:0:-1], weights]), axis, mode="nearest")
+            part = correlate1d(
+                part, np.concatenate([weights[:0:-1], weights]), axis, mode="nearest"
+            )
         assert result.tobytes() == part.tobytes()
     bits = data > 0.02
     for reach in (1, 2, 6):
-        assert np.array_equal(smoothing.largest_around(bits, reach), maximum_filter(bits, 2 * reach + 1))
+        assert np.array_equal(
+            smoothing.largest_around(bits, reach), maximum_filter(bits, 2 * reach + 1)
+        )
 
 
 @pytest.mark.parametrize("n_counts", [1, 20, 10**6])

@@ -1,4 +1,6 @@
-"""Work directories: for the owner alone, of one run at a time, and the user's is not taken for one or removed."""
+"""Work directories: for the owner alone, of one run at a time, and the user's is not taken for
+one or removed.
+"""
 
 import os
 import stat
@@ -44,13 +46,19 @@ def test_what_is_none_is_one_line_and_stays(tmp_path, kind):
     planted(kind, tmp_path / "work", outside(tmp_path))
     before = content(tmp_path)
     for act in (check, create, lambda path: locked(path).__enter__()):
-        with pytest.raises(InputError, match=rf"^{tmp_path}/work: expected [^\n]*; move it away and run this again$"):
+        with pytest.raises(
+            InputError,
+            match=rf"^{tmp_path}/work: expected [^\n]*; move it away and run this again$",
+        ):
             act(tmp_path / "work")
     assert content(tmp_path) == before
 
 
 def test_a_lock_says_whose_it_is_and_ends_with_its_process(work):
-    code = "import sys, time; from pathlib import Path; from tetopt.system.work_directory import locked\n"
+    code = (
+        "import sys, time; from pathlib import Path; from tetopt.system.work_directory "
+        "import locked\n"
+    )
     code += "with locked(Path(sys.argv[1])): print(); sys.stdout.flush(); time.sleep(600)"
     with subprocess.Popen([sys.executable, "-c", code, work], stdout=subprocess.PIPE) as other:
         other.stdout.readline()
@@ -109,7 +117,10 @@ def test_a_lock_that_is_a_link_empties_no_file(work, tmp_path):
     for name, keys in (("tetopt-lock", None), ("a.lock", ["a"])):
         (work / name).unlink(missing_ok=True)
         (work / name).symlink_to(mine)
-        with pytest.raises(InputError, match=f"{name}: expected a regular file, got a link"), locked(work, keys):
+        with (
+            pytest.raises(InputError, match=f"{name}: expected a regular file, got a link"),
+            locked(work, keys),
+        ):
             pass
         assert mine.read_text() == "of the user"
         (work / name).unlink()

@@ -17,14 +17,23 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 import tetopt
-from tetopt.cli.console import open_streams, print_line, say, settle_streams, show_error, show_event, warnings_once
+from tetopt.cli.console import (
+    open_streams,
+    print_line,
+    say,
+    settle_streams,
+    show_error,
+    show_event,
+    warnings_once,
+)
 from tetopt.cli.ending import INTERRUPTED_CODE, signal_code, signals_heard, tell_end
 from tetopt.errors import InputError, error_words
 from tetopt.job.events import listened
 from tetopt.system.files import Outputs, outputs_of_command
 from tetopt.system.interpreter import THREADS_NAME
 
-# Commands in the order of the help, with the modules that define NAME_command; only the running command's is loaded.
+# Commands in the order of the help, with the modules that define NAME_command; only the running
+# command's is loaded.
 COMMANDS = {
     "mesh": "mesh",
     "cohort": "cohort",
@@ -45,17 +54,38 @@ COMMANDS = {
 # The options that the help of a command shows; `--help-all` shows all.
 SHOWN_OPTIONS = {
     "mesh": (
-        "output", "json_path", "figures", "force", "mask", "mask_label", "background", "labels", "merge", "label_names",
-        "nodes", "target_error", "edge_size", "cells_across", "order", "young", "nu", "loads", "max_seconds", "threads",
+        "output",
+        "json_path",
+        "figures",
+        "force",
+        "mask",
+        "mask_label",
+        "background",
+        "labels",
+        "merge",
+        "label_names",
+        "nodes",
+        "target_error",
+        "edge_size",
+        "cells_across",
+        "order",
+        "young",
+        "nu",
+        "loads",
+        "max_seconds",
+        "threads",
     ),
-}  # fmt: skip
+}
 HELP_ALL = "--help-all"
-COLLECTED_AT = 50_000, 20, 20  # new objects, and collections of a generation; Python's own are 700, 10, 10
-LAYER_POOLS = {"omp": "omppool", "tbb": "tbbpool", "workqueue": "workqueue"}  # numba's threading layers, and modules
+# new objects, and collections of a generation; Python's own are 700, 10, 10
+COLLECTED_AT = 50_000, 20, 20
+# numba's threading layers, and modules
+LAYER_POOLS = {"omp": "omppool", "tbb": "tbbpool", "workqueue": "workqueue"}
 LAYER_KINDS = ("default", "safe", "threadsafe", "forksafe")
 MOST_DIGITS = 4  # of a number of threads: no machine has more
 
-# Options by the names that messages of the library begin with, where these differ by more than a hyphen.
+# Options by the names that messages of the library begin with, where these differ by more than a
+# hyphen.
 ARGUMENT_OPTIONS = {"octree": "nodes", "modulus": "young"}
 
 
@@ -97,25 +127,37 @@ class _Group(_Plain, TyperGroup):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command and return the exit code.
 
-    0: done; 1: the mesh violates a requirement; 2: an invalid input, or an output, including standard output, that
-    could not be written; 130, 143 and 129: ended by Ctrl-C, SIGTERM and SIGHUP.
+    0: done; 1: the mesh violates a requirement; 2: an invalid input, or an output, including
+    standard output, that could not be written; 130, 143 and 129: ended by Ctrl-C, SIGTERM and
+    SIGHUP.
     """
-    # Commands load 400,000 objects that stay: fewer collections save 0.1 s, and none at exit 0.25 s.
+    # Commands load 400,000 objects that stay: fewer collections save 0.1 s, and none at exit 0.25
+    # s.
     gc.set_threshold(*COLLECTED_AT)
     atexit.register(gc.freeze)
     open_streams()
-    with warnings.catch_warnings(), outputs_of_command() as outputs, signals_heard(), listened(show_event):
+    with (
+        warnings.catch_warnings(),
+        outputs_of_command() as outputs,
+        signals_heard(),
+        listened(show_event),
+    ):
         warnings.showwarning = warnings_once()
-        logging.getLogger("matplotlib").setLevel(logging.ERROR)  # its font-cache notice does not concern the user
+        # its font-cache notice does not concern the user
+        logging.getLogger("matplotlib").setLevel(logging.ERROR)
         code = _run(list(sys.argv[1:] if argv is None else argv), outputs)
     if reason := settle_streams():
-        show_error(f"standard output cannot be written ({reason}); the printed output is incomplete")
+        show_error(
+            f"standard output cannot be written ({reason}); the printed output is incomplete"
+        )
         code = code or 2
     return code
 
 
 def _run(arguments: list[str], outputs: Outputs) -> int:
-    """Run the command and return the exit code; print errors, and the outputs written in spite of them."""
+    """Run the command and return the exit code; print errors, and the outputs written in spite
+    of them.
+    """
     try:
         code = _app(arguments)(args=arguments, obj=arguments, standalone_mode=False) or 0
         return tell_end() if code in (INTERRUPTED_CODE, signal_code()) else code
@@ -130,7 +172,9 @@ def _run(arguments: list[str], outputs: Outputs) -> int:
     except SystemExit:  # typer and rich exit so if the pipe for their help has closed
         return 0
     except Exception as error:
-        if type(error).__module__.split(".")[0] not in ("click", "typer") or not hasattr(error, "format_message"):
+        if type(error).__module__.split(".")[0] not in ("click", "typer") or not hasattr(
+            error, "format_message"
+        ):
             raise
         if error.format_message():  # empty after the help that a bare `tetopt` prints
             show_error(f"{error.format_message()} (see --help)")
@@ -138,8 +182,9 @@ def _run(arguments: list[str], outputs: Outputs) -> int:
 
 
 def _with_option(message: str, arguments: list[str]) -> str:
-    """Replace the argument's name that begins a message of the library, perhaps after a file's, by the option that the
-    user gave for it."""
+    """Replace the argument's name that begins a message of the library, perhaps after a file's,
+    by the option that the user gave for it.
+    """
     parts = message.split(": ")
     for place, name in enumerate(parts[:2]):
         option = f"--{ARGUMENT_OPTIONS.get(name, name).replace('_', '-')}"
@@ -155,10 +200,13 @@ def _say_written(outputs: Outputs) -> None:
 
 
 def _app(arguments: Sequence[str]) -> typer.Typer:
-    """Build the command line; only the command that the arguments name is loaded, the others are placeholders."""
+    """Build the command line; only the command that the arguments name is loaded, the others are
+    placeholders.
+    """
     app = typer.Typer(
         name="tetopt",
-        help="Turn a medical volume directly into an image-aligned tetrahedral mesh, without a segmentation.",
+        help="Turn a medical volume directly into an image-aligned tetrahedral mesh, without a "
+        "segmentation.",
         no_args_is_help=True,
         add_completion=False,
         pretty_exceptions_enable=False,
@@ -167,7 +215,8 @@ def _app(arguments: Sequence[str]) -> typer.Typer:
         context_settings={"help_option_names": ["-h", "--help"]},
     )
     app.callback()(_common)
-    chosen = next((word for word in arguments if not word.startswith("-")), None)  # no option before it takes a value
+    # no option before it takes a value
+    chosen = next((word for word in arguments if not word.startswith("-")), None)
     for name in COMMANDS:
         if name == chosen:
             about: dict[str, Any] = {}
@@ -181,9 +230,15 @@ def _app(arguments: Sequence[str]) -> typer.Typer:
 
 
 def help_line(name: str) -> str:
-    """Return the first line of a command's docstring, read from its module's source, as importing it takes a second."""
+    """Return the first line of a command's docstring, read from its module's source, as
+    importing it takes a second.
+    """
     source = Path(__file__).with_name(f"{COMMANDS[name]}.py").read_text(encoding="utf-8")
-    return source.partition(f"def {name.replace('-', '_')}_command(")[2].split('"""')[1].splitlines()[0]
+    return (
+        source.partition(f"def {name.replace('-', '_')}_command(")[2]
+        .split('"""')[1]
+        .splitlines()[0]
+    )
 
 
 def loaded_command(name: str) -> Callable[..., Any]:
@@ -197,18 +252,27 @@ def loaded_command(name: str) -> Callable[..., Any]:
     _check_environment()
     from tetopt.cli.options import from_records  # this import loads the modules of its defaults
 
-    return from_records(getattr(import_module(f"tetopt.cli.{COMMANDS[name]}"), f"{name.replace('-', '_')}_command"))
+    return from_records(
+        getattr(import_module(f"tetopt.cli.{COMMANDS[name]}"), f"{name.replace('-', '_')}_command")
+    )
 
 
 def _check_environment() -> None:
-    """Raise InputError for an environment variable with which numba or matplotlib would fail in the middle of a run."""
+    """Raise InputError for an environment variable with which numba or matplotlib would fail in
+    the middle of a run.
+    """
     threads = os.environ.get(THREADS_NAME, "").strip()
     if threads and not (threads.isdecimal() and len(threads) <= MOST_DIGITS and int(threads) >= 1):
         raise InputError(
-            f"{THREADS_NAME}: expected a whole number of threads from 1 to {10**MOST_DIGITS - 1}, got "
+            f"{THREADS_NAME}: expected a whole number of threads from 1 to "
+            f"{10**MOST_DIGITS - 1}, got "
             f"{threads[:20]}; set a valid number, or unset it"
         )
-    names = [name for name in os.environ if name.startswith("NUMBA_") and name not in ("NUMBA_CACHE_DIR", THREADS_NAME)]
+    names = [
+        name
+        for name in os.environ
+        if name.startswith("NUMBA_") and name not in ("NUMBA_CACHE_DIR", THREADS_NAME)
+    ]
     names += ["MPLBACKEND"] if os.environ.get("MPLBACKEND") else []
     try:
         with warnings.catch_warnings():
@@ -223,9 +287,15 @@ def _check_environment() -> None:
     able = [name for name, pool in LAYER_POOLS.items() if _is_importable(f"numba.np.ufunc.{pool}")]
     if config.THREADING_LAYER not in (*able, *LAYER_KINDS):
         expected = ", ".join((*able, *LAYER_KINDS))
-        raise InputError(f"NUMBA_THREADING_LAYER: expected {expected}, got {config.THREADING_LAYER[:20]}; or unset it")
+        raise InputError(
+            f"NUMBA_THREADING_LAYER: expected {expected}, got {config.THREADING_LAYER[:20]}; or "
+            "unset it"
+        )
     if sorted(config.THREADING_LAYER_PRIORITY) != sorted(LAYER_POOLS):
-        raise InputError(f"NUMBA_THREADING_LAYER_PRIORITY: expected {' '.join(LAYER_POOLS)} in any order, or none")
+        raise InputError(
+            f"NUMBA_THREADING_LAYER_PRIORITY: expected {' '.join(LAYER_POOLS)} in any order, or "
+            "none"
+        )
 
 
 def _is_importable(name: str) -> bool:
@@ -244,7 +314,10 @@ def _version(is_requested: bool) -> None:
 
 def _common(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
+        bool,
+        typer.Option(
+            "--version", callback=_version, is_eager=True, help="Print the version and exit."
+        ),
     ] = False,
 ) -> None:
     pass

@@ -1,4 +1,6 @@
-"""``tetopt cohort``: many subjects, each meshed as by `tetopt mesh`, on the workers of a cluster."""
+"""``tetopt cohort``: many subjects, each meshed as by `tetopt mesh`, on the workers of a
+cluster.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,13 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from tetopt.cli.console import in_options, log, print_line, show_error, show_event
-from tetopt.cohort.cohort import NAMED_FAILURES, CohortPlan, CohortProgress, plan_cohort, run_planned
+from tetopt.cohort.cohort import (
+    NAMED_FAILURES,
+    CohortPlan,
+    CohortProgress,
+    plan_cohort,
+    run_planned,
+)
 from tetopt.cohort.estimate import share_for
 from tetopt.cohort.layout import PAGE_NAME, TABLE_NAME
 from tetopt.cohort.numbers import Row
@@ -30,12 +38,19 @@ from tetopt.system.budget import memory_words
 def cohort_command(
     context: typer.Context,
     subjects: Annotated[
-        Path, Option("SUBJECTS", "A .tsv or .csv table (subject, image, ...), or a BIDS folder.", is_argument=True)
+        Path,
+        Option(
+            "SUBJECTS",
+            "A .tsv or .csv table (subject, image, ...), or a BIDS folder.",
+            is_argument=True,
+        ),
     ],
     cohort: CohortOptions,
     options: RunOptions,
 ) -> int:
-    """Mesh many subjects from a table or a BIDS folder, here or on a dask cluster; resume an interrupted run."""
+    """Mesh many subjects from a table or a BIDS folder, here or on a dask cluster; resume an
+    interrupted run.
+    """
     try:
         plan = plan_cohort(subjects, cohort, options)
     except Problems as problems:
@@ -66,7 +81,10 @@ def _say_estimate(plan: CohortPlan) -> None:
     if not to_run:
         print_line("nothing to run")
         return
-    whole = f"{counted(len(to_run), 'subject')}, up to about {memory_words(max(estimate.values(), default=0.0))} each"
+    whole = (
+        f"{counted(len(to_run), 'subject')}, up to about "
+        f"{memory_words(max(estimate.values(), default=0.0))} each"
+    )
     if cohort.scheduler is None:
         n_workers = share_for(len(to_run), estimate, cohort, plan.threads).workers
         whole += f"; {n_workers} at a time on this machine"
@@ -74,9 +92,11 @@ def _say_estimate(plan: CohortPlan) -> None:
 
 
 class _CohortDisplay:
-    """The listener of a cohort: a bar on a terminal, else a line for each subject; a summary at the end.
+    """The listener of a cohort: a bar on a terminal, else a line for each subject; a summary at the
+    end.
 
-    `code` is then the exit code; `arguments`, if any, are shown as the command that resumes the run.
+    `code` is then the exit code; `arguments`, if any, are shown as the command that resumes the
+    run.
     """
 
     def __init__(self, plan: CohortPlan, arguments: Sequence[str]) -> None:
@@ -84,7 +104,11 @@ class _CohortDisplay:
         self._plan, self._arguments = plan, arguments
         self._shown = ExitStack()
         self._bar = Progress(
-            TextColumn("subjects"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[words]}"), console=log
+            TextColumn("subjects"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[words]}"),
+            console=log,
         )
 
     def __call__(self, event: Event) -> None:
@@ -132,4 +156,6 @@ class _CohortDisplay:
         self.code = int(bool(counts["failed"] or counts["missing"]))
         if self.code and self._arguments:
             words_again = " ".join(map(shlex.quote, self._arguments))
-            log.print(escape(f"to run only the missing and failed subjects again: tetopt {words_again}"))
+            log.print(
+                escape(f"to run only the missing and failed subjects again: tetopt {words_again}")
+            )

@@ -1,4 +1,6 @@
-"""``tetopt baseline``, ``compare`` and ``paper``: comparisons with the conventional pipelines and with the paper."""
+"""``tetopt baseline``, ``compare`` and ``paper``: comparisons with the conventional pipelines
+and with the paper.
+"""
 
 from __future__ import annotations
 
@@ -22,12 +24,16 @@ ResultsOption = Annotated[Path, Option("DIR", "Folder for the results.", letter=
 
 def paper_command(
     output: ResultsOption,
-    image: Annotated[Path | None, Option("T1", "Brain MR volume (default: nilearn's MNI152 T1).")] = None,
+    image: Annotated[
+        Path | None, Option("T1", "Brain MR volume (default: nilearn's MNI152 T1).")
+    ] = None,
     labels: Annotated[Path | None, Option("LABELS", "Tissue labels of IMAGE, for Dice.")] = None,
     seeds: Annotated[int, Option("N", "Number of random meshes for Fig. 1.")] = 200,
     force: ForceOption = False,
 ) -> int:
-    """Reproduce the paper's figures and table: paper.json, pictures, and a page that compares the numbers."""
+    """Reproduce the paper's figures and table: paper.json, pictures, and a page that compares
+    the numbers.
+    """
     from tetopt.study.paper_files import reproduce
 
     page, seconds = reproduce(output, image, labels, seeds, force)
@@ -41,7 +47,9 @@ def baseline_command(
     options: BaselineOptions,
     numbers: NumberOptions,
 ) -> int:
-    """Mesh an image the conventional way, for comparison: segment, extract surfaces, tetrahedralise."""
+    """Mesh an image the conventional way, for comparison: segment, extract surfaces,
+    tetrahedralise.
+    """
     from tetopt.study.baseline import baseline
 
     made = baseline(image_path, output, options, numbers.json_path, numbers.force)
@@ -60,7 +68,9 @@ def compare_command(
     options: CompareOptions,
     force: ForceOption = False,
 ) -> int:
-    """Compare tetopt with the conventional pipelines on a volume: fidelity, shape, simulation accuracy, time."""
+    """Compare tetopt with the conventional pipelines on a volume: fidelity, shape, simulation
+    accuracy, time.
+    """
     from tetopt.study.compare_files import compare_image
 
     command = f"tetopt {' '.join(map(shlex.quote, context.obj))}"
@@ -74,5 +84,8 @@ def compare_command(
     for row in rows:
         if row.failure is not None:
             print_line(f"{row.title}: {row.failure}")
-    print_line(f"{output / 'report.html'}: {len(report.options.pipelines)} pipelines, {report.seconds:.0f} s")
+    print_line(
+        f"{output / 'report.html'}: {len(report.options.pipelines)} pipelines, "
+        f"{report.seconds:.0f} s"
+    )
     return 0

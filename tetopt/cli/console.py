@@ -1,4 +1,6 @@
-"""Output of the commands: `log` on standard error, `out`, the result, on standard output. Neither ends a run."""
+"""Output of the commands: `log` on standard error, `out`, the result, on standard output.
+Neither ends a run.
+"""
 
 from __future__ import annotations
 
@@ -22,23 +24,41 @@ if TYPE_CHECKING:
     from tetopt.job.events import Event
 
 LINE_WIDTH = 100  # characters in a line, but for words that are longer
-LONGEST_ERROR = 480  # characters: the remedy stands at the end, the value found may be a line of a million
+# characters: the remedy stands at the end, the value found may be a line of a million
+LONGEST_ERROR = 480
 PARAMETER_OPTIONS = {  # by parameters of the library's functions, the command line's names
     **{
         name: f"--{name.replace('_', '-').lower()}"
         for name in (
-            "k_D", "min_dihedral", "shape_power", "target_error", "label_weight", "smooth_interfaces", "n_t",
-            "retessellate", "gradation", "boundary", "iterations", "nodes", "nodes_max", "weights",
+            "k_D",
+            "min_dihedral",
+            "shape_power",
+            "target_error",
+            "label_weight",
+            "smooth_interfaces",
+            "n_t",
+            "retessellate",
+            "gradation",
+            "boundary",
+            "iterations",
+            "nodes",
+            "nodes_max",
+            "weights",
         )
     },
-    "smallest": "--size-min", "edge_size": "--edge-size", "longest": "--edge-max", "field": "--sizing",
-}  # fmt: skip
+    "smallest": "--size-min",
+    "edge_size": "--edge-size",
+    "longest": "--edge-max",
+    "field": "--sizing",
+}
 PARAMETER_PATTERN = re.compile(rf"^(?:{'|'.join(PARAMETER_OPTIONS)})(?=:)")
 OPTION_NAMES: dict[str, str] = {}  # of the command that runs, by the arguments that messages name
 
 
 class _Stream:
-    """A stream that escapes characters it cannot encode, and discards everything once a write has failed."""
+    """A stream that escapes characters it cannot encode, and discards everything once a write
+    has failed.
+    """
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream
@@ -49,7 +69,9 @@ class _Stream:
     def write(self, text: str) -> int:
         """Write if possible; return the number of characters."""
         encoding = getattr(self._stream, "encoding", None) or "utf-8"
-        self._try(lambda: self._stream.write(text.encode(encoding, "backslashreplace").decode(encoding)))
+        self._try(
+            lambda: self._stream.write(text.encode(encoding, "backslashreplace").decode(encoding))
+        )
         return len(text)
 
     def flush(self) -> None:
@@ -63,7 +85,8 @@ class _Stream:
             if error.errno != errno.EPIPE and self._stream is sys.stdout:
                 _unprinted.append(error.strerror or str(error))
             _silence(self._stream)
-        except (ValueError, RuntimeError):  # closed, or written to by the code that a signal interrupted
+        # closed, or written to by the code that a signal interrupted
+        except (ValueError, RuntimeError):
             pass
 
 
@@ -72,7 +95,8 @@ _unprinted: list[str] = []  # reasons why standard output lost text
 
 def _silence(stream: Any) -> None:
     """Discard a stream's buffer and all that is written to it later."""
-    with suppress(OSError, ValueError, AttributeError):  # the stream was replaced by a program's own
+    # the stream was replaced by a program's own
+    with suppress(OSError, ValueError, AttributeError):
         number = stream.fileno()
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, number)
@@ -80,7 +104,9 @@ def _silence(stream: Any) -> None:
 
 
 class _Console(Console):
-    """A console that shows foreign control characters, and whose stream may be closed, full or gone."""
+    """A console that shows foreign control characters, and whose stream may be closed, full or
+    gone.
+    """
 
     @property
     def file(self) -> IO[str]:
@@ -93,7 +119,9 @@ class _Console(Console):
         self._file = new_file
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """Render a text of a message or a table, with control characters, as of file names, shown."""
+        """Render a text of a message or a table, with control characters, as of file names,
+        shown.
+        """
         return super().render_str(plain(text), **options)
 
 
@@ -110,14 +138,17 @@ def open_streams() -> None:
         try:
             os.fstat(number)
         except OSError:
-            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # the lowest free number is this one
+            # the lowest free number is this one
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115, as long as the process
 
 
 def settle_streams() -> str | None:
-    """Flush the streams, so that Python cannot fail at exit; return the reason why standard output lost text."""
+    """Flush the streams, so that Python cannot fail at exit; return the reason why standard
+    output lost text.
+    """
     for stream in (sys.stdout, sys.stderr):
         if stream is not None:
             _Stream(stream).flush()
@@ -132,9 +163,13 @@ def width_of(console: Console) -> int:
 
 
 def wrapped(text: str, console: Console) -> list[str]:
-    """Break a line between words, where it is wider than allowed; long words, as paths, are kept whole."""
+    """Break a line between words, where it is wider than allowed; long words, as paths, are kept
+    whole.
+    """
     width = width_of(console)
-    return textwrap.wrap(text, width, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False) or [""]
+    return textwrap.wrap(
+        text, width, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False
+    ) or [""]
 
 
 def print_line(text: str) -> None:
@@ -144,7 +179,9 @@ def print_line(text: str) -> None:
 
 
 def show_error(message: object) -> None:
-    """Print an error with the command's names for options: on one line of limited length, which a terminal wraps."""
+    """Print an error with the command's names for options: on one line of limited length, which
+    a terminal wraps.
+    """
     line = plain(in_options(str(message)))
     if len(line) > LONGEST_ERROR:  # it quotes a file
         line = f"{line[: LONGEST_ERROR // 2]} ... {line[-LONGEST_ERROR // 3 :]}"
@@ -163,7 +200,9 @@ def _say(line: str, head: str = "", style: str = "", is_wrapped: bool = True) ->
 
 
 def in_options(message: str) -> str:
-    """Replace a message's names of arguments, at its head and between backticks, by the command's options."""
+    """Replace a message's names of arguments, at its head and between backticks, by the
+    command's options.
+    """
     return PARAMETER_PATTERN.sub(lambda name: PARAMETER_OPTIONS[name[0]], with_hyphens(message))
 
 
@@ -173,7 +212,9 @@ def with_hyphens(message: str) -> str:
         return message
     from tetopt.job.options import JobOptions, kinds_of, option_name
 
-    names = {name: f"--{option_name(name, kind)}" for name, kind in kinds_of(JobOptions).items()} | OPTION_NAMES
+    names = {
+        name: f"--{option_name(name, kind)}" for name, kind in kinds_of(JobOptions).items()
+    } | OPTION_NAMES
     return re.sub(r"`(\w+)`", lambda match: names.get(match[1], match[0]), message)
 
 
@@ -198,7 +239,9 @@ def show_warning(message: str) -> None:
 
 
 def warnings_once() -> Callable[..., None]:
-    """Return a replacement of `warnings.showwarning` that prints each text once: a file may be image and labels."""
+    """Return a replacement of `warnings.showwarning` that prints each text once: a file may be
+    image and labels.
+    """
     shown: set[str] = set()
 
     def show(message: Warning | str, *_: Any, **__: Any) -> None:
@@ -210,9 +253,15 @@ def warnings_once() -> Callable[..., None]:
 
 
 def print_verdict(
-    violated: Iterable[str], words: str, measured: dict[str, Any], mask_word: str, which: str = "all requirements"
+    violated: Iterable[str],
+    words: str,
+    measured: dict[str, Any],
+    mask_word: str,
+    which: str = "all requirements",
 ) -> None:
-    """Print a command's last lines: what requirements allow of mask and labels, whether they are met, the mesh."""
+    """Print a command's last lines: what requirements allow of mask and labels, whether they are
+    met, the mesh.
+    """
     from tetopt.job.advice import beyond_requirements  # imports numba
 
     names = ", ".join(violated)
@@ -223,10 +272,14 @@ def print_verdict(
     print_line(f"requirements not met: {names}; {words}" if names else f"{met}; {words}")
 
 
-def print_fidelity(measured: dict[str, Any], ndim: int, word: str = "mask", every: bool = False) -> None:
-    """Print how well the mesh fits sizes, contrasts, mask and labels, as far as `measured` (`tetopt.measure.measures`).
+def print_fidelity(
+    measured: dict[str, Any], ndim: int, word: str = "mask", every: bool = False
+) -> None:
+    """Print how well the mesh fits sizes, contrasts, mask and labels, as far as `measured`
+    (`tetopt.measure.measures`).
 
-    `ndim` is the mesh's dimension; `word` is the name of the mask; `every` prints all labels and all their measures.
+    `ndim` is the mesh's dimension; `word` is the name of the mask; `every` prints all labels and
+    all their measures.
     """
     # these import numba and more
     from tetopt.report.tables import mask_table, sizes_in_words
@@ -234,8 +287,15 @@ def print_fidelity(measured: dict[str, Any], ndim: int, word: str = "mask", ever
     if "edges_over_target" in measured:
         print_line(sizes_in_words(measured["edges_over_target"]))
     for row in measured.get("contrasts", []):
-        fraction = "constant" if row["E_D_fraction_of_variance"] is None else f"{row['E_D_fraction_of_variance']:.5f}"
-        print_line(f"{row['image']}: weight {row['weight']:g}, unexplained variance of this image {fraction}")
+        fraction = (
+            "constant"
+            if row["E_D_fraction_of_variance"] is None
+            else f"{row['E_D_fraction_of_variance']:.5f}"
+        )
+        print_line(
+            f"{row['image']}: weight {row['weight']:g}, unexplained variance of this image "
+            f"{fraction}"
+        )
     if "mask" in measured:
         print_table(mask_table(measured["mask"], ndim, word))
     if "labels" in measured and "interfaces" in measured:
@@ -250,7 +310,9 @@ def _print_labels(measured: dict[str, Any], ndim: int, every: bool) -> None:
 
     names = measured.get("label_names", {})
     places = worst_labels(measured["labels"], *([None] if every else []))
-    rows, interfaces = ([measured[name][place] for place in places] for name in ("labels", "interfaces"))
+    rows, interfaces = (
+        [measured[name][place] for place in places] for name in ("labels", "interfaces")
+    )
     print_table(label_table(rows, names, ndim))
     if len(places) < len(measured["labels"]):
         n_all = count_of_labels([row.label for row in measured["labels"]], " labels")
@@ -268,8 +330,9 @@ def _print_thin(measured: dict[str, Any], ndim: int) -> None:
 
     names = measured.get("label_names", {})
     tables = (
-        thin_table(measured.get("labels", []), names), contact_table(measured.get("contacts", []), names, ndim)
-    )  # fmt: skip
+        thin_table(measured.get("labels", []), names),
+        contact_table(measured.get("contacts", []), names, ndim),
+    )
     for table in tables:
         if table is not None:
             print_table(table)
@@ -278,5 +341,7 @@ def _print_thin(measured: dict[str, Any], ndim: int) -> None:
 
 
 def print_table(table: Table) -> None:
-    """Print a table in the width of the terminal, or in 100 columns into a pipe, which has no width."""
+    """Print a table in the width of the terminal, or in 100 columns into a pipe, which has no
+    width.
+    """
     _Console(file=out.file, width=width_of(out), highlight=False, emoji=False).print(table)

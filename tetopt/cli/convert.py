@@ -15,7 +15,14 @@ from tetopt.io.images import OUTPUT_SUFFIXES
 from tetopt.job.convert import convert_file
 from tetopt.job.events import Event, listened
 from tetopt.job.on_image import is_image_name, write_on_image
-from tetopt.job.options import LabelChoice, LabelledPart, Option, SolverOptions, VoxelOptions, given_options
+from tetopt.job.options import (
+    LabelChoice,
+    LabelledPart,
+    Option,
+    SolverOptions,
+    VoxelOptions,
+    given_options,
+)
 from tetopt.system.files import checked_output
 
 
@@ -24,17 +31,21 @@ def convert_command(
         list[Path],
         Option(
             "[IMAGE] MESH OUT",
-            f"The mesh, and the file to write: {', '.join(FORMATS)}, or an image: {', '.join(OUTPUT_SUFFIXES)}. An "
+            f"The mesh, and the file to write: {', '.join(FORMATS)}, or an image: "
+            f"{', '.join(OUTPUT_SUFFIXES)}. An "
             "image before them is that of `image`.",
             is_argument=True,
         ),
     ],
     image_path: Annotated[
-        Path | None, Option("IMAGE", "Apply mappings to this image, not to the mesh file's means.", "image")
+        Path | None,
+        Option("IMAGE", "Apply mappings to this image, not to the mesh file's means.", "image"),
     ] = None,
     results_path: Annotated[
         Path | None,
-        Option("JOB.frd", "Add CalculiX's results for this mesh (VTK formats and images).", "results"),
+        Option(
+            "JOB.frd", "Add CalculiX's results for this mesh (VTK formats and images).", "results"
+        ),
     ] = None,
     *,
     part: LabelledPart,
@@ -43,7 +54,9 @@ def convert_command(
     voxels: VoxelOptions,
     numbers: NumberOptions,
 ) -> int:
-    """Write a mesh for a solver, in the format of OUT's suffix, or a field of it on the voxels of an image."""
+    """Write a mesh for a solver, in the format of OUT's suffix, or a field of it on the voxels
+    of an image.
+    """
     if len(paths) < 2:
         raise InputError(f"expected MESH and OUT, the file to write, got only {paths[0]}")
     mesh_path, image_path = mesh_and_image(paths[:-1], image_path)
@@ -57,13 +70,24 @@ def convert_command(
         if is_image:
             numbers.save(
                 write_on_image(
-                    mesh_path, output, voxels, like=image_path, results=results_path, space=solver.space,
+                    mesh_path,
+                    output,
+                    voxels,
+                    like=image_path,
+                    results=results_path,
+                    space=solver.space,
                     is_registered=part.registered,
                 )
-            )  # fmt: skip
+            )
             return 0
         converted = convert_file(
-            mesh_path, output, solver=solver, part=part, choice=choice, image=image_path, results=results_path
+            mesh_path,
+            output,
+            solver=solver,
+            part=part,
+            choice=choice,
+            image=image_path,
+            results=results_path,
         )
     numbers.save(converted.numbers)
     print_model(output, converted.model, converted.options)
@@ -71,9 +95,15 @@ def convert_command(
 
 
 def _check_options(
-    output: Path, voxels: VoxelOptions | None, part: LabelledPart, choice: LabelChoice, solver: SolverOptions
+    output: Path,
+    voxels: VoxelOptions | None,
+    part: LabelledPart,
+    choice: LabelChoice,
+    solver: SolverOptions,
 ) -> None:
-    """Raise InputError for an option of images with a mesh's file, which has `voxels`, or the other way round."""
+    """Raise InputError for an option of images with a mesh's file, which has `voxels`, or the
+    other way round.
+    """
     if voxels is not None:
         wrong, what = given_options(voxels), "a mesh's file; name an image, such as field.nii.gz"
     else:

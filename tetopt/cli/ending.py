@@ -1,4 +1,6 @@
-"""Early ends of a command: Ctrl-C, SIGTERM, which schedulers send, and SIGHUP, which a closing terminal sends."""
+"""Early ends of a command: Ctrl-C, SIGTERM, which schedulers send, and SIGHUP, which a closing
+terminal sends.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +13,17 @@ from typing import Any
 from tetopt.cli.console import log, say
 from tetopt.system.files import present_outputs
 
-SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+SIGNALS = tuple(
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+)
 SIGNAL_CODE = 128  # plus a signal's number: the exit code that shells give to a process it ended
 INTERRUPTED_CODE = SIGNAL_CODE + signal.SIGINT  # commands and typer return it after any of them
 
 
 class _Ending:
-    """The signals received, and whether the next one is deferred: one instance for the whole process."""
+    """The signals received, and whether the next one is deferred: one instance for the whole
+    process.
+    """
 
     def __init__(self) -> None:
         self.numbers: list[int] = []
@@ -28,7 +34,8 @@ class _Ending:
         self.numbers.append(number)
         if self.is_deferred and len(self.numbers) == 1:
             log.print(
-                "interrupted: finishing the current nodes, then writing the mesh (interrupt again to end at once)"
+                "interrupted: finishing the current nodes, then writing the mesh (interrupt "
+                "again to end at once)"
             )
             return
         if self.is_deferred:
@@ -41,7 +48,8 @@ _ending = _Ending()
 
 @contextmanager
 def signals_heard() -> Iterator[None]:
-    """Handle signals: the first raises KeyboardInterrupt, or, within `mesh_kept`, only makes `is_ended` true.
+    """Handle signals: the first raises KeyboardInterrupt, or, within `mesh_kept`, only makes
+    `is_ended` true.
 
     An ignored signal remains ignored, as SIGHUP under nohup and SIGINT in the background.
     """
@@ -63,7 +71,9 @@ def signals_heard() -> Iterator[None]:
 
 @contextmanager
 def mesh_kept() -> Iterator[Callable[[], None]]:
-    """Defer the first signal until the mesh is written, once the function that this yields has been called."""
+    """Defer the first signal until the mesh is written, once the function that this yields has
+    been called.
+    """
 
     def begin() -> None:
         _ending.is_deferred = True
@@ -87,7 +97,10 @@ def tell_end() -> int:
         name = "Ctrl-C" if code == INTERRUPTED_CODE else signal.Signals(code - SIGNAL_CODE).name
         names = "" if outputs is None else ", ".join(map(str, outputs.written)) or "nothing"
         # A command without checked outputs has printed what exists.
-        say(f"ended by {name}" + (f"; written: {names}" if outputs is not None and outputs.places else ""))
+        say(
+            f"ended by {name}"
+            + (f"; written: {names}" if outputs is not None and outputs.places else "")
+        )
     return code
 
 

@@ -23,7 +23,9 @@ from tetopt.system.files import results_folder
 
 
 def mesh_command(job: Job) -> int:
-    """Mesh an image with optimised elements, smaller where it has detail (or uniform), as VTU or for a solver."""
+    """Mesh an image with optimised elements, smaller where it has detail (or uniform), as VTU or
+    for a solver.
+    """
     with mesh_kept() as begin_keeping, closing(Display(begin_keeping)) as display:
         result = run(job, display, display.is_over)
         display.end_stage()
@@ -31,7 +33,9 @@ def mesh_command(job: Job) -> int:
         display.close()  # the mesh's problems, before the last line
         size = f"{nodes_in_words(result.mesh, result.model.order)}, {len(result.mesh.cells)} cells"
         code = tell_end() if is_ended() else int(bool(result.violated))
-        print_verdict(result.violated, f"{job.output}: {size}", result.measured, result.task.source.mask_word)
+        print_verdict(
+            result.violated, f"{job.output}: {size}", result.measured, result.task.source.mask_word
+        )
         return code
 
 
@@ -59,12 +63,20 @@ def _print_comparison(result: Result, n_empty: int) -> None:
     names = ("E_D_fraction_of_variance_initial", "E_D_fraction_of_variance")
     left = [result.numbers["energies"][name] for name in names]
     if first.E_D > 0.0 and None not in left:
-        table.add_row(f"E_D, fraction of {whose_variance(content)}", *(f"{fraction:.5f}" for fraction in left))
+        table.add_row(
+            f"E_D, fraction of {whose_variance(content)}", *(f"{fraction:.5f}" for fraction in left)
+        )
     meshes = (result.meshed.initial, result.mesh)
     in_all = [size_summary(each, order)["n_nodes_in_all"] for each in meshes] if order == 2 else []
     first_shape, last_shape = result.shapes
     if first_shape is not None and last_shape is not None:
-        add_quality(table, first_shape, last_shape, in_all=in_all, is_curved=result.mesh.midpoints is not None)
+        add_quality(
+            table,
+            first_shape,
+            last_shape,
+            in_all=in_all,
+            is_curved=result.mesh.midpoints is not None,
+        )
     if n_empty:
         table.add_row("cells without a voxel centre", "", str(n_empty))
     print_table(table)
@@ -80,7 +92,12 @@ def demo_command(
     folder = results_folder(output)
     return mesh_command(
         Job(
-            images=[mni_path("t1")], output=folder / "mesh.vtu", json_path=folder / "run.json", figures=folder,
-            nodes=nodes, iterations=iterations, force=force,
+            images=[mni_path("t1")],
+            output=folder / "mesh.vtu",
+            json_path=folder / "run.json",
+            figures=folder,
+            nodes=nodes,
+            iterations=iterations,
+            force=force,
         )
-    )  # fmt: skip
+    )

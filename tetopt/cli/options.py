@@ -1,7 +1,7 @@
 """Options of the commands, as records of annotated fields, and their conversion for typer.
 
-A command is a function of records; `from_records` turns it into the function of single options that typer expects,
-with each record's options in a panel of the help.
+A command is a function of records; `from_records` turns it into the function of single options that
+typer expects, with each record's options in a panel of the help.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ FilesArgument = Annotated[
     list[Path],
     Option(
         "[IMAGE] MESH",
-        "VTU, VTK or gmsh MSH file of tetrahedra or triangles; an image before it is that of `image`.",
+        "VTU, VTK or gmsh MSH file of tetrahedra or triangles; an image before it is that of "
+        "`image`.",
         is_argument=True,
     ),
 ]
@@ -69,33 +70,48 @@ class NumberOptions:
 class ShownOptions:
     """View settings of `tetopt view`, and its outputs."""
 
-    html: Annotated[Path | None, Option("OUT.html", "Write the page to this file; open no browser.")] = None
+    html: Annotated[
+        Path | None, Option("OUT.html", "Write the page to this file; open no browser.")
+    ] = None
     field: Annotated[
-        str | None, Option("NAME", "Field to colour by initially: mean, label, von_mises, ... (default: the first).")
+        str | None,
+        Option(
+            "NAME",
+            "Field to colour by initially: mean, label, von_mises, ... (default: the first).",
+        ),
     ] = None
     limits: Annotated[
         str | None,
-        Option("LOW,HIGH", "Range of the field's colours (default: all but 1 % at either end).", "range"),
+        Option(
+            "LOW,HIGH",
+            "Range of the field's colours (default: all but 1 % at either end).",
+            "range",
+        ),
     ] = None
     label_names: LabelNamesOption = None
 
 
 def mesh_and_image(files: list[Path], image: Path | None) -> tuple[Path, Path | None]:
-    """Return the mesh and the image of a command with files "[IMAGE] MESH" and the option `image`."""
+    """Return the mesh and the image of a command with files "[IMAGE] MESH" and the option
+    `image`.
+    """
     *images, mesh = files
     images += [] if image is None else [image]
     if len(images) > 1:
         raise InputError(f"expected MESH and one image (`image`), got {len(images) + 1} files")
     if images and images[0].suffix.lower() in MESH_SUFFIXES:
-        raise InputError(f"{images[0]}: expected an image beside {mesh}, got a mesh; give one mesh at a time")
+        raise InputError(
+            f"{images[0]}: expected an image beside {mesh}, got a mesh; give one mesh at a time"
+        )
     return mesh, images[0] if images else None
 
 
 def from_records(command: Callable[..., int]) -> Callable[..., int]:
-    """Convert a command to a function of single options, for typer: records are replaced by their fields.
+    """Convert a command to a function of single options, for typer: records are replaced by their
+    fields.
 
-    A record is a dataclass; nested records are part of it. Its `panel`, if any, is the title of its options in the
-    help.
+    A record is a dataclass; nested records are part of it. Its `panel`, if any, is the title of its
+    options in the help.
     """
     kinds = get_type_hints(command, include_extras=True)
     defaults = {name: each.default for name, each in inspect.signature(command).parameters.items()}
@@ -105,11 +121,20 @@ def from_records(command: Callable[..., int]) -> Callable[..., int]:
         name_files(values.values())
         return command(**{name: _of_values(kinds[name], name, values) for name in defaults})
 
-    leaves = [each for name, default in defaults.items() for each in _leaves(name, kinds[name], default)]
-    options = {name: f"--{option_name(name, kind)}" for name, kind, *_ in leaves if has_option(kind)}
+    leaves = [
+        each for name, default in defaults.items() for each in _leaves(name, kinds[name], default)
+    ]
+    options = {
+        name: f"--{option_name(name, kind)}" for name, kind, *_ in leaves if has_option(kind)
+    }
     OPTION_NAMES.update({long[2:].replace("-", "_"): long for long in options.values()} | options)
     parameters = [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=_typed(name, kind, panel))
+        inspect.Parameter(
+            name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=default,
+            annotation=_typed(name, kind, panel),
+        )
         for name, kind, default, panel in leaves
     ]
     called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
@@ -117,8 +142,12 @@ def from_records(command: Callable[..., int]) -> Callable[..., int]:
     return called
 
 
-def _leaves(name: str, kind: Any, default: Any, panel: str | None = None) -> Iterator[tuple[str, Any, Any, str | None]]:
-    """Yield the single options of a command's parameter or a record's field: names, kinds, defaults and panels."""
+def _leaves(
+    name: str, kind: Any, default: Any, panel: str | None = None
+) -> Iterator[tuple[str, Any, Any, str | None]]:
+    """Yield the single options of a command's parameter or a record's field: names, kinds,
+    defaults and panels.
+    """
     if not is_dataclass(kind):
         yield name, kind, default, panel
         return
@@ -130,13 +159,21 @@ def _leaves(name: str, kind: Any, default: Any, panel: str | None = None) -> Ite
 
 
 def _panel_of(record: type, name: str) -> str | None:
-    """Return the help panel of a record's field: that of the first class that defines the field and has a panel."""
-    bringing = [each for each in reversed(record.__mro__) if name in getattr(each, "__dataclass_fields__", {})]
+    """Return the help panel of a record's field: that of the first class that defines the field
+    and has a panel.
+    """
+    bringing = [
+        each
+        for each in reversed(record.__mro__)
+        if name in getattr(each, "__dataclass_fields__", {})
+    ]
     return next((each.panel for each in bringing if hasattr(each, "panel")), None)
 
 
 def _typed(name: str, kind: Any, panel: str | None) -> Any:
-    """Return the annotation for typer, with the option's help panel; arguments have a panel of their own."""
+    """Return the annotation for typer, with the option's help panel; arguments have a panel of
+    their own.
+    """
     if not has_option(kind):
         return kind
     own = option_of(kind)
@@ -144,18 +181,30 @@ def _typed(name: str, kind: Any, panel: str | None) -> Any:
     if own.is_argument:
         return Annotated[get_args(kind)[0], typer.Argument(**about)]
     names = [f"-{own.letter}"] * bool(own.letter) + [f"--{option_name(name, kind)}"]
-    if (number := _number_of(kind)) is not None:  # `of_option` has plainer words than typer for what is none
+    # `of_option` has plainer words than typer for what is none
+    if (number := _number_of(kind)) is not None:
         about |= {"parser": str, "callback": _converter(name, kind, number)}
-    return Annotated[get_args(kind)[0], typer.Option(*names, **about, min=own.least, rich_help_panel=panel)]
+    return Annotated[
+        get_args(kind)[0], typer.Option(*names, **about, min=own.least, rich_help_panel=panel)
+    ]
 
 
 def _number_of(kind: Any) -> type[int] | type[float] | None:
     """Return the type of a number's option; None for other options and parameters."""
-    return next((own for own in (int, float) if has_option(kind) and get_args(kind)[0] in (own, own | None)), None)
+    return next(
+        (
+            own
+            for own in (int, float)
+            if has_option(kind) and get_args(kind)[0] in (own, own | None)
+        ),
+        None,
+    )
 
 
 def _converter(name: str, kind: Any, number: Callable[[str], int | float]) -> Callable[[Any], Any]:
-    """Return a function that converts an option's string, or raises InputError for what is no number of its kind."""
+    """Return a function that converts an option's string, or raises InputError for what is no
+    number of its kind.
+    """
 
     def converted(value: Any) -> Any:
         text = value
@@ -172,4 +221,6 @@ def _of_values(kind: Any, name: str, values: dict[str, Any]) -> Any:
     if not is_dataclass(kind):
         return values[name]
     kinds = kinds_of(cast(type, kind))
-    return cast(Callable[..., Any], kind)(**{each: _of_values(own, each, values) for each, own in kinds.items()})
+    return cast(Callable[..., Any], kind)(
+        **{each: _of_values(own, each, values) for each, own in kinds.items()}
+    )

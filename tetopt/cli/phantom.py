@@ -17,27 +17,40 @@ from tetopt.system.files import checked_output
 
 
 def phantom_command(
-    name: Annotated[str, Option("NAME_OR_TOML", "A phantom's name, or your own TOML file.", is_argument=True)],
+    name: Annotated[
+        str, Option("NAME_OR_TOML", "A phantom's name, or your own TOML file.", is_argument=True)
+    ],
     output: Annotated[
-        Path, Option("IMAGE.nii.gz", "The image to write; X.zarr is written in chunks of 16-bit integers.", letter="o")
+        Path,
+        Option(
+            "IMAGE.nii.gz",
+            "The image to write; X.zarr is written in chunks of 16-bit integers.",
+            letter="o",
+        ),
     ],
     voxel_mm: Annotated[float | None, Option("MM", "Voxel size instead of the phantom's.")] = None,
     blur_mm: Annotated[float | None, Option("MM", "Standard deviation of a Gaussian blur.")] = None,
     noise_sd: Annotated[float | None, Option("SD", "Standard deviation of added noise.")] = None,
     seed: Annotated[int | None, Option("N", "Seed of the noise.")] = None,
-    labels: Annotated[Path | None, Option("LABELS.nii.gz", "Also write the label of each voxel's centre.")] = None,
+    labels: Annotated[
+        Path | None, Option("LABELS.nii.gz", "Also write the label of each voxel's centre.")
+    ] = None,
     force: ForceOption = False,
 ) -> int:
     """Write a phantom as an image of known shapes and intensities."""
     if labels is not None:
         labels = checked_output(labels, OUTPUT_SUFFIXES, force)
     is_folder = output.name.lower().endswith(ZARR_SUFFIX)
-    output = checked_output(output, (*OUTPUT_SUFFIXES, ZARR_SUFFIX), force, is_node if is_folder else None)
+    output = checked_output(
+        output, (*OUTPUT_SUFFIXES, ZARR_SUFFIX), force, is_node if is_folder else None
+    )
     phantom = load_phantom(name)
     voxels = phantom.voxels(voxel_mm=voxel_mm, blur_mm=blur_mm, noise_sd=noise_sd, seed=seed)
     if is_folder:
         if phantom.ndim != 3:
-            raise InputError(f"{output}: expected a 3-D phantom, got a 2-D one; write it as .nii.gz")
+            raise InputError(
+                f"{output}: expected a 3-D phantom, got a 2-D one; write it as .nii.gz"
+            )
         low, high = save_zarr(output, Image.stored(voxels, voxels.affine), voxels, np.int16)
     else:
         image = phantom.image(voxel_mm=voxel_mm, blur_mm=blur_mm, noise_sd=noise_sd, seed=seed)

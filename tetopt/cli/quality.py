@@ -20,12 +20,15 @@ from tetopt.report.tables import add_quality, new_table, nodes_in_words
 def quality_command(
     paths: FilesArgument,
     image: Annotated[Path | None, Option("IMAGE", "Also measure E_D against this image.")] = None,
-    labels: Annotated[Path | None, Option("LABELS", "Compare cells with these labels; needs `image`.")] = None,
+    labels: Annotated[
+        Path | None, Option("LABELS", "Compare cells with these labels; needs `image`.")
+    ] = None,
     check: Annotated[
         bool,
         Option(
             None,
-            "Check that the mesh is valid with a manifold boundary and, with the `image` of its run, fills the box "
+            "Check that the mesh is valid with a manifold boundary and, with the `image` of its "
+            "run, fills the box "
             "and meets the run's requirements; exit 1 if not.",
         ),
     ] = False,
@@ -45,7 +48,9 @@ def quality_command(
     in_all = [size["n_nodes_in_all"]] if judgement.loaded.order == 2 else []
     jacobian = judgement.numbers.get("min_scaled_jacobian")
     is_curved = judgement.loaded.mesh.midpoints is not None
-    add_quality(table, judgement.shape, in_all=in_all, jacobian=jacobian, every=every, is_curved=is_curved)
+    add_quality(
+        table, judgement.shape, in_all=in_all, jacobian=jacobian, every=every, is_curved=is_curved
+    )
     if source is not None and judgement.fit is not None:
         _add_fit(table, judgement.fit, source, judgement.left_out, every)
     print_table(table)
@@ -54,9 +59,18 @@ def quality_command(
         print_line(f"checked: conforming, oriented{_checked_words(judgement)}")
     wrong = judgement.tell()
     if check:
-        whole = f"{nodes_in_words(judgement.loaded.mesh, judgement.loaded.order)}, {size['n_cells']} cells"
+        whole = (
+            f"{nodes_in_words(judgement.loaded.mesh, judgement.loaded.order)}, "
+            f"{size['n_cells']} cells"
+        )
         which = "all requirements" if source is not None else "requirements that need no image"
-        print_verdict(judgement.numbers["violated"], f"{mesh}: {whole}", judgement.measured, judgement.mask_word, which)
+        print_verdict(
+            judgement.numbers["violated"],
+            f"{mesh}: {whole}",
+            judgement.measured,
+            judgement.mask_word,
+            which,
+        )
     return int(bool(wrong))
 
 
@@ -64,15 +78,21 @@ def _checked_words(judgement: Judgement) -> str:
     """Describe the other properties for which a valid mesh was checked."""
     if judgement.is_masked:
         return "; meshed within a mask, which may have several components"
-    return ", in one piece" + (", fills the box" if judgement.source is not None and judgement.is_filled else "")
+    return ", in one piece" + (
+        ", fills the box" if judgement.source is not None and judgement.is_filled else ""
+    )
 
 
 def _add_fit(table: Table, fit: ImageFit, source: Source, left_out: list[str], every: bool) -> None:
-    """Add rows on how well cells fit an image, and name the inputs of the mesh's run that are left out."""
+    """Add rows on how well cells fit an image, and name the inputs of the mesh's run that are
+    left out.
+    """
     if every:
         table.add_row("E_D", f"{fit.E_D:.6g}")
     if fit.E_D_fraction_of_variance is not None:
-        whose = whose_variance(source.content) + (f", without its {' and '.join(left_out)}" if left_out else "")
+        whose = whose_variance(source.content) + (
+            f", without its {' and '.join(left_out)}" if left_out else ""
+        )
         table.add_row(f"E_D, fraction of {whose}", f"{fit.E_D_fraction_of_variance:.5f}")
     table.add_row("voxels inside", f"{fit.n_voxels} of {source.contrasts[0].data.size}")
     table.add_row("cells without a voxel centre", str(fit.n_empty_cells))

@@ -22,7 +22,8 @@ LINE_SECONDS = 10.0  # between lines, if there is no terminal for a bar
 
 
 class Display:
-    """The listener of a run: each stage has its bar or status on a terminal, and occasional lines elsewhere.
+    """The listener of a run: each stage has its bar or status on a terminal, and occasional lines
+    elsewhere.
 
     `begin_keeping` is called as soon as there is a mesh worth keeping.
     """
@@ -61,7 +62,9 @@ class Display:
             show_event(event)
 
     def is_over(self) -> bool:
-        """Return whether a signal has requested the end; within an iteration, print its progress from time to time."""
+        """Return whether a signal has requested the end; within an iteration, print its progress
+        from time to time.
+        """
         if self._n_rows:
             self._say(f"  in iteration {self._n_rows}, {_spent(time.perf_counter() - self._begin)}")
         return is_ended()
@@ -93,7 +96,9 @@ class Display:
 
 @contextlib.contextmanager
 def compiling(title: str) -> Iterator[Callable[[str], None]]:
-    """Yield a function that shows the progress of compiling: a terminal's status beginning with `title`, else lines."""
+    """Yield a function that shows the progress of compiling: a terminal's status beginning with
+    `title`, else lines.
+    """
     begin = time.perf_counter()
     with log.status(f"{title} ...") as status:
         say = rare_lines(is_first_said=True)
@@ -128,7 +133,9 @@ def waiting(words: str) -> Iterator[None]:
 
 
 def rare_lines(is_first_said: bool = False) -> Callable[[str], None]:
-    """Return a function that prints lines if there is no terminal, at most one per `LINE_SECONDS`."""
+    """Return a function that prints lines if there is no terminal, at most one per
+    `LINE_SECONDS`.
+    """
     last = -np.inf if is_first_said else time.perf_counter()
 
     def say(words: str) -> None:
@@ -147,8 +154,12 @@ def _spent(seconds: float) -> str:
 
 
 @contextlib.contextmanager
-def _bar(iterations: int, most_seconds: float | None) -> Iterator[Callable[[IterationRecord], None]]:
-    """Yield a function that shows each record, with the time left: a bar on a terminal, else a line."""
+def _bar(
+    iterations: int, most_seconds: float | None
+) -> Iterator[Callable[[IterationRecord], None]]:
+    """Yield a function that shows each record, with the time left: a bar on a terminal, else a
+    line.
+    """
     history: list[IterationRecord] = []
 
     def words(row: IterationRecord) -> str:
@@ -162,11 +173,16 @@ def _bar(iterations: int, most_seconds: float | None) -> Iterator[Callable[[Iter
 
     if log.is_terminal:
         columns = (
-            TextColumn("optimising"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[energies]}"),
-        )  # fmt: skip
+            TextColumn("optimising"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[energies]}"),
+        )
         with Progress(*columns, console=log, transient=True) as bar:
             task = bar.add_task("", total=iterations, energies="")
-            yield lambda row: bar.update(task, completed=row.iteration, energies=words(row) + left())
+            yield lambda row: bar.update(
+                task, completed=row.iteration, energies=words(row) + left()
+            )
     else:
 
         def tell(row: IterationRecord) -> None:
@@ -180,7 +196,9 @@ def _bar(iterations: int, most_seconds: float | None) -> Iterator[Callable[[Iter
 def _tasks_bar(title: str, number: int) -> Iterator[Callable[[Event], None]]:
     """Yield a function that shows how many tasks have ended: a bar on a terminal, else lines."""
     if log.is_terminal:
-        with Progress(TextColumn(title), BarColumn(), MofNCompleteColumn(), console=log, transient=True) as bar:
+        with Progress(
+            TextColumn(title), BarColumn(), MofNCompleteColumn(), console=log, transient=True
+        ) as bar:
             task = bar.add_task("", total=number)
             yield lambda event: bar.update(task, completed=event.data)
     else:

@@ -22,9 +22,12 @@ from tetopt.system.files import checked_output
 def segment_command(
     paths: FilesArgument,
     output: Annotated[
-        Path, Option("LABELS.nii.gz", "The classes to write; voxels outside the mesh get 0.", letter="o")
+        Path,
+        Option("LABELS.nii.gz", "The classes to write; voxels outside the mesh get 0.", letter="o"),
     ],
-    classes: Annotated[int, Option("K", "Number of classes, in order of increasing mean.", least=2)] = 4,
+    classes: Annotated[
+        int, Option("K", "Number of classes, in order of increasing mean.", least=2)
+    ] = 4,
     truth_path: Annotated[
         Path | None, Option("LABELS", "True labels; prints the Dice overlap with them.", "truth")
     ] = None,
@@ -33,7 +36,9 @@ def segment_command(
     part: MaskedPart,
     numbers: NumberOptions,
 ) -> int:
-    """Segment an image by its mesh, quickly and roughly: group cells by mean into K classes and label their voxels."""
+    """Segment an image by its mesh, quickly and roughly: group cells by mean into K classes and
+    label their voxels.
+    """
     from tetopt.measure.segmentation import dice, segment, stands_for, thresholded
 
     output = checked_output(output, (".nii", ".nii.gz"), numbers.force)
@@ -49,13 +54,24 @@ def segment_command(
     labels = segment(what, mesh, classes)
     of_class, h = labels.data[inside].astype(np.int64), image.data[inside]
     fractions = np.bincount(of_class, minlength=classes) / len(of_class)
-    means = [float(h[of_class == number].mean()) if fraction else None for number, fraction in enumerate(fractions)]
+    means = [
+        float(h[of_class == number].mean()) if fraction else None
+        for number, fraction in enumerate(fractions)
+    ]
     report: dict[str, Any] = {
-        "image": image_path.name, "mesh": mesh_path.name, "classes": classes, "fraction_of_voxels": fractions,
+        "image": image_path.name,
+        "mesh": mesh_path.name,
+        "classes": classes,
+        "fraction_of_voxels": fractions,
         "mean_intensity": means,
-    }  # fmt: skip
+    }
     names = {} if truth is None else stands_for(labels, truth)  # labels by class
-    table = new_table("class", "fraction of voxels", "mean intensity", *([] if truth is None else ["matched label"]))
+    table = new_table(
+        "class",
+        "fraction of voxels",
+        "mean intensity",
+        *([] if truth is None else ["matched label"]),
+    )
     for number, (fraction, mean) in enumerate(zip(fractions, means, strict=True)):
         last = [] if truth is None else [str(names.get(number, "none"))]
         table.add_row(str(number), f"{fraction:.4f}", "" if mean is None else f"{mean:.4g}", *last)
@@ -65,7 +81,9 @@ def segment_command(
         overlap = {"mesh": by_mesh, "voxels": by_voxels}
         report |= {"truth": truth_path.name, "stands_for": names, "dice": overlap}
         if lost := [str(label) for label in by_mesh if label not in names.values()]:
-            show_warning(f"no class matches label {', '.join(lost)}: its Dice is 0; try more --classes")
+            show_warning(
+                f"no class matches label {', '.join(lost)}: its Dice is 0; try more --classes"
+            )
         for label in by_mesh:
             overlaps.add_row(str(label), f"{by_mesh[label]:.4f}", f"{by_voxels[label]:.4f}")
     save_image(output, labels)
@@ -84,11 +102,15 @@ def _voxels_in(mesh: Mesh, what: Content, path: Path, image_path: Path) -> NDArr
     """
     image = what.given
     if (overlap := overlap_of(image, mesh)) is not None:
-        raise InputError(f"{path}: {overlap}; remove one cell of each pair, or mesh the image again")
+        raise InputError(
+            f"{path}: {overlap}; remove one cell of each pair, or mesh the image again"
+        )
     inside = tetopt.cell_of_voxel(image, mesh) >= 0
     outside = int((~inside).sum())
     if outside == image.data.size:
-        raise InputError(f"{path}: the mesh contains no voxel of {image_path}; was it built from another image?")
+        raise InputError(
+            f"{path}: the mesh contains no voxel of {image_path}; was it built from another image?"
+        )
     if outside:
         show_warning(f"{outside} of {image.data.size} voxels lie outside the mesh and get class 0")
     if what.continuation is not None:

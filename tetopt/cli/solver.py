@@ -11,7 +11,13 @@ from rich.markup import escape
 from tetopt.cli.console import print_line, print_table
 from tetopt.io.formats import format_of
 from tetopt.io.gmsh import incomplete_groups
-from tetopt.io.tags import group_labels, group_of_zero, label_lines, numbered_parts, renumbered_labels
+from tetopt.io.tags import (
+    group_labels,
+    group_of_zero,
+    label_lines,
+    numbered_parts,
+    renumbered_labels,
+)
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.inputs import listed
 from tetopt.job.options import SolverOptions
@@ -25,18 +31,25 @@ from tetopt.report.tables import new_table, nodes_in_words
 
 MOST_SETS = 32  # printed of facets, of cells, and of materials
 GMSH_SUFFIXES = (".msh", ".msh2")
-CELL_NUMBERS = {".mfem": "attribute", ".mesh": "reference"}  # the formats' word for the number of a cell
+# the formats' word for the number of a cell
+CELL_NUMBERS = {".mfem": "attribute", ".mesh": "reference"}
 MOST_LABEL_LINES = 12  # about labels, of which a file may have hundreds
 
 
 def print_model(output: Path, model: Model, solver: SolverOptions) -> None:
-    """Print the contents of the file: sets, materials and the error of binning, units, coordinates."""
+    """Print the contents of the file: sets, materials and the error of binning, units,
+    coordinates.
+    """
     for line in _lines(output, model, solver):
         print_line(line)
     if format_of(output).is_surface:
         return
     size = "area, mm2" if model.mesh.ndim == 3 else "length, mm"
-    table, cells, sets = new_table("set", "facets", size, "nodes", "cells"), elements(model)[1], model.sets
+    table, cells, sets = (
+        new_table("set", "facets", size, "nodes", "cells"),
+        elements(model)[1],
+        model.sets,
+    )
     standard = standard_names(model.mesh.ndim)  # the user's sets first
     for name, rows in sorted(sets.facets.items(), key=lambda item: item[0] in standard)[:MOST_SETS]:
         area = np.linalg.norm(area_vectors(model.mesh, rows), axis=1).sum()
@@ -50,8 +63,13 @@ def print_model(output: Path, model: Model, solver: SolverOptions) -> None:
 
 
 def _materials_by_name(model: Model, materials: Materials) -> Iterator[str]:
-    """Yield a line for each material with its labels, if labels have names and each has one material."""
-    labels, names = labels_of(model.cell_data, len(model.mesh.cells)), table_of_words(model.about.get(TABLE_TEXT)).names
+    """Yield a line for each material with its labels, if labels have names and each has one
+    material.
+    """
+    labels, names = (
+        labels_of(model.cell_data, len(model.mesh.cells)),
+        table_of_words(model.about.get(TABLE_TEXT)).names,
+    )
     if labels is None or not names:
         return
     pairs = np.unique(np.column_stack([labels, materials.of_cell]), axis=0).tolist()
@@ -66,17 +84,25 @@ def _materials_by_name(model: Model, materials: Materials) -> Iterator[str]:
 
 
 def _gmsh_lines(model: Model, suffix: str) -> Iterator[str]:
-    """Yield lines on what gmsh's formats cannot store: loads, label 0, and, in 2.2, a facet in several groups."""
+    """Yield lines on what gmsh's formats cannot store: loads, label 0, and, in 2.2, a facet in
+    several groups.
+    """
     if model.loads:
         yield f"loads in {suffix} files are not read back; tetopt reads loads from VTK files only"
     labels = group_labels(model)
     if labels is not None and labels.min() == 0:
         yield f"label 0 is physical group {group_of_zero(labels)}, as gmsh has no group 0"
-    if renumbered := [f"{number} is label {label}" for number, label in renumbered_labels(model).items()]:
-        yield f"physical groups number the labels, as large labels do not fit: {listed(renumbered)} (see $Comments)"
+    if renumbered := [
+        f"{number} is label {label}" for number, label in renumbered_labels(model).items()
+    ]:
+        yield (
+            "physical groups number the labels, as large labels do not fit: "
+            f"{listed(renumbered)} (see $Comments)"
+        )
     if suffix == ".msh2" and (short := incomplete_groups(model)):
         yield (
-            f"gmsh 2.2 has one group per facet: facets of smaller sets are missing from {', '.join(short)} (use .msh)"
+            "gmsh 2.2 has one group per facet: facets of smaller sets are missing from "
+            f"{', '.join(short)} (use .msh)"
         )
 
 
@@ -87,12 +113,17 @@ def _lines(output: Path, model: Model, solver: SolverOptions) -> Iterator[str]:
         young, nu = materials.young, materials.nu
         ratios = f"{nu.min():.4g}" if nu.min() == nu.max() else f"{nu.min():.4g} to {nu.max():.4g}"
         count = f"{len(young)} material{'s' * (len(young) > 1)}"
-        moduli = f"{young.min():.4g}" if young.min() == young.max() else f"{young.min():.4g} to {young.max():.4g}"
+        moduli = (
+            f"{young.min():.4g}"
+            if young.min() == young.max()
+            else f"{young.min():.4g} to {young.max():.4g}"
+        )
         yield f"{count}, Young's modulus {moduli} kPa, nu {ratios}"
         yield from _materials_by_name(model, materials)
     if materials is not None and model.gauss_young is not None:
         yield (
-            f"one modulus per cell, its geometric mean, and, for tetopt fem, one per Gauss point ({GAUSS_MODULI})"
+            "one modulus per cell, its geometric mean, and, for tetopt fem, one per Gauss point "
+            f"({GAUSS_MODULI})"
             if output.suffix.lower() in VTK_SUFFIXES
             else "one modulus per cell, its geometric mean; VTK files also have one per Gauss point"
         )

@@ -18,12 +18,16 @@ from tetopt.system.files import checked_output
 
 def surface_command(
     mesh_path: MeshArgument,
-    output: Annotated[Path, Option("OUT.stl", "Surface to write: STL, PLY, VTP or VTK.", letter="o")],
+    output: Annotated[
+        Path, Option("OUT.stl", "Surface to write: STL, PLY, VTP or VTK.", letter="o")
+    ],
     *,
     part: SurfacePart,
     numbers: NumberOptions,
 ) -> int:
-    """Write the boundary of a structure in a mesh, watertight, or interfaces of its labels; print volume and area."""
+    """Write the boundary of a structure in a mesh, watertight, or interfaces of its labels;
+    print volume and area.
+    """
     output = checked_output(output, SURFACE_SUFFIXES, numbers.force)
     numbers.check()
     written = write_surface(mesh_path, output, part)

@@ -37,7 +37,8 @@ def view_command(
 ) -> int:
     """View a mesh or its results in the browser: cut, colour by any field, threshold, deform.
 
-    A mesh with displacements is drawn deformed, scaled by a slider; quadratic cells are drawn by their corners.
+    A mesh with displacements is drawn deformed, scaled by a slider; quadratic cells are drawn by
+    their corners.
     """
     html = None if how.html is None else checked_output(how.html, (".html",), force)
     limits = None if how.limits is None else _limits(how.limits)
@@ -53,10 +54,13 @@ def view_command(
     table, former = label_table(how.label_names, loaded), label_table(None, loaded).names
     sets = sets_beside(mesh, loaded.box, fields, loaded.sets, table.names, former)[0].facets
     triples = {name: facet_triples(mesh.cells, rows) for name, rows in sets.items()}
-    from tetopt.report.exhibit import exhibit, opened_on  # matplotlib and pyvista load slowly and are needed only here
+    # matplotlib and pyvista load slowly and are needed only here
+    from tetopt.report.exhibit import exhibit, opened_on
     from tetopt.report.explore import save_explorer
 
-    shown = exhibit(mesh, fields, image, mesh_path.name, triples, loaded.point_data, _reactions(loaded), table)
+    shown = exhibit(
+        mesh, fields, image, mesh_path.name, triples, loaded.point_data, _reactions(loaded), table
+    )
     page = Path(tempfile.mkdtemp(prefix="tetopt-")) / "view.html" if html is None else html
     save_explorer(page, opened_on(shown, how.field or _only_labels(loaded), limits))
     words = "opened in the browser" if html is None and _is_opened(page) else "open it in a browser"
@@ -65,9 +69,14 @@ def view_command(
 
 
 def _is_opened(page: Path) -> bool:
-    """Open a page in the browser, and return whether it opened; on Linux without a screen none opens, as it would be
-    one in this terminal."""
-    has_screen = not sys.platform.startswith("linux") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    """Open a page in the browser, and return whether it opened; on Linux without a screen none
+    opens, as it would be one in this terminal.
+    """
+    has_screen = (
+        not sys.platform.startswith("linux")
+        or os.environ.get("DISPLAY")
+        or os.environ.get("WAYLAND_DISPLAY")
+    )
     return bool(has_screen) and webbrowser.open(page.as_uri())
 
 
@@ -80,7 +89,8 @@ def _limits(text: str) -> tuple[float, float]:
 
 
 def _only_labels(loaded: MeshFile) -> str | None:
-    """Return the field of labels if the mesh was built from labels alone, as means of label numbers are meaningless.
+    """Return the field of labels if the mesh was built from labels alone, as means of label numbers
+    are meaningless.
 
     A mesh with results on its nodes opens with these.
     """
@@ -98,7 +108,11 @@ def _reactions(loaded: MeshFile) -> dict[int, dict[str, list[float]]]:
             continue
         try:
             by_set = json_of(loaded.text(key) or "{}")
-            forces = {str(name): [float(x) for x in force] for name, force in by_set.items() if len(force) == 3}
+            forces = {
+                str(name): [float(x) for x in force]
+                for name, force in by_set.items()
+                if len(force) == 3
+            }
         except (TypeError, ValueError, AttributeError):  # written by another program
             continue
         if np.isfinite([*forces.values()]).all():

@@ -27,7 +27,9 @@ BALL_NODES = {2: 60, 3: 300}  # by number of axes
 
 
 def warm_up_command() -> int:
-    """Compile all kernels in advance, for example for a container image; later runs load them from the cache."""
+    """Compile all kernels in advance, for example for a container image; later runs load them
+    from the cache.
+    """
     place = place_cache()
     if place.notice is not None:
         raise InputError(f"warm-up cannot store compiled kernels: {place.notice}")

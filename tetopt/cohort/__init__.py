@@ -1,1 +1,3 @@
-"""Cohorts: hundreds of subjects, each meshed by its own process, on a cluster; resumable, with an overview page."""
+"""Cohorts: hundreds of subjects, each meshed by its own process, on a cluster; resumable, with
+an overview page.
+"""

@@ -14,7 +14,14 @@ from tetopt.cohort.layout import WORK_NAME, begin, check_out, clean, failure_pat
 from tetopt.cohort.numbers import Row, collect
 from tetopt.cohort.options import CohortOptions
 from tetopt.cohort.page import STATUS_WORDS, save_cohort_files
-from tetopt.cohort.plan import PlannedSubject, checked_suffix, chosen, entries_of, subjects_of, with_states
+from tetopt.cohort.plan import (
+    PlannedSubject,
+    checked_suffix,
+    chosen,
+    entries_of,
+    subjects_of,
+    with_states,
+)
 from tetopt.cohort.run import Ended, SubjectTask, run_all
 from tetopt.cohort.subjects import TABLE_SUFFIXES, Problems, key, write_table
 from tetopt.errors import InputError
@@ -29,7 +36,8 @@ from tetopt.system.work_directory import locked
 from tetopt.workers import SchedulerLost, check_workers, workers
 
 NAMED_FAILURES = 20  # reasons printed: the table and the page have all
-MOST_BESIDE = 200  # subjects of a run next to others in the folder, with a lock each: a process may open 1024 files
+# subjects of a run next to others in the folder, with a lock each: a process may open 1024 files
+MOST_BESIDE = 200
 PAGE_SECONDS = 60.0  # between updates of the table and page during a run
 PAGE_FRACTION = 0.05  # maximum fraction of the run's time for these updates
 
@@ -65,21 +73,22 @@ def run_cohort(
     Parameters
     ----------
     subjects : str or Path
-        A table, .tsv or .csv, with the columns subject, image, and any option of a `Job`; or a BIDS folder.
+        A table, .tsv or .csv, with the columns subject, image, and any option of a `Job`; or a BIDS
+        folder.
     output : str or Path
         The folder of all outputs; finished subjects of an earlier run are kept.
     on : callable, optional
         Called with each `Event`; without it, warnings are Python's warnings.
     **options
-        For all subjects, those of a `Job` except images, outputs and parts; for the cohort: `suffix`, `participants`,
-        `sessions`, `mesh_format`, `write_table`, `dry_run`, `retry_failed`, `collect`, `workers`,
-        `scheduler`.
+        For all subjects, those of a `Job` except images, outputs and parts; for the cohort:
+        `suffix`, `participants`, `sessions`, `mesh_format`, `write_table`, `dry_run`,
+        `retry_failed`, `collect`, `workers`, `scheduler`.
 
     Returns
     -------
     dict
-        By subject, as "sub-01_ses-a", its status: "done", "violated" (the mesh violates a requirement), "failed" or
-        "missing".
+        By subject, as "sub-01_ses-a", its status: "done", "violated" (the mesh violates a
+        requirement), "failed" or "missing".
 
     Raises
     ------
@@ -92,7 +101,8 @@ def run_cohort(
 
     Notes
     -----
-    Workers are processes that first import your program: call this function under ``if __name__ == "__main__":``.
+    Workers are processes that first import your program: call this function under ``if __name__ ==
+    "__main__":``.
 
     Examples
     --------
@@ -110,7 +120,9 @@ def run_cohort(
     of_cohort = {name: value for name, value in values.items() if name in kinds_of(CohortOptions)}
     of_runs = {name: value for name, value in values.items() if name not in of_cohort}
     with listened(on):
-        plan = plan_cohort(Path(subjects), in_kinds(CohortOptions, of_cohort), in_kinds(RunOptions, of_runs))
+        plan = plan_cohort(
+            Path(subjects), in_kinds(CohortOptions, of_cohort), in_kinds(RunOptions, of_runs)
+        )
         if plan.cohort.write_table is not None or plan.cohort.dry_run:
             return {entry.key: entry.state.status for entry in plan.entries}
         rows = run_planned(plan)
@@ -131,20 +143,27 @@ def plan_cohort(subjects: Path, cohort: CohortOptions, options: RunOptions) -> C
     if options.threads is not None and options.threads < 1:
         raise InputError(f"`threads`: expected 1 or more, got {options.threads}")
     if cohort.collect and (cohort.write_table is not None or cohort.dry_run or cohort.retry_failed):
-        raise InputError("`collect` runs no subjects; omit it, or `write_table`, `dry_run` and `retry_failed`")
+        raise InputError(
+            "`collect` runs no subjects; omit it, or `write_table`, `dry_run` and `retry_failed`"
+        )
     if cohort.write_table is not None:
         checked_output(cohort.write_table, TABLE_SUFFIXES)
     check_out(place)
     if (place / WORK_NAME).is_dir() and cohort.write_table is None and not cohort.dry_run:
-        with locked(place / WORK_NAME, []):  # checked here as well, as planning many subjects takes minutes
+        # checked here as well, as planning many subjects takes minutes
+        with locked(place / WORK_NAME, []):
             pass
     rows = subjects_of(subjects, cohort)
-    plan = CohortPlan(subjects, cohort, options.threads, suffix, [key(row) for row in rows], [], [], {})
+    plan = CohortPlan(
+        subjects, cohort, options.threads, suffix, [key(row) for row in rows], [], [], {}
+    )
     if cohort.collect:
         return plan
     entries = entries_of(rows, options, place, suffix)
     to_run = chosen(entries, cohort.retry_failed)
-    if links := [wrong for entry in to_run if (wrong := linked_place(place, entry.key)) is not None]:
+    if links := [
+        wrong for entry in to_run if (wrong := linked_place(place, entry.key)) is not None
+    ]:
         raise Problems(list(dict.fromkeys(links)))
     plan = plan._replace(entries=entries, to_run=to_run)
     if cohort.write_table is not None:
@@ -157,11 +176,17 @@ def plan_cohort(subjects: Path, cohort: CohortOptions, options: RunOptions) -> C
 def _tell_plan(plan: CohortPlan) -> None:
     """Report the number of subjects of each kind, and why existing ones are run again."""
     counts = Counter[str](entry.state.status for entry in plan.entries)
-    words = {name: STATUS_WORDS.get(name, name) for name in ("done", "violated", "failed", "changed")}
+    words = {
+        name: STATUS_WORDS.get(name, name) for name in ("done", "violated", "failed", "changed")
+    }
     words["missing"] = "not yet run"
     parts = [f"{counts[name]} {text}" for name, text in words.items() if counts[name]]
     note(f"{counted(len(plan.entries), 'subject')}: {', '.join(parts)}; {len(plan.to_run)} to run")
-    reasons = Counter((e.state.status, e.state.why) for e in plan.to_run if e.state.status in ("changed", "failed"))
+    reasons = Counter(
+        (e.state.status, e.state.why)
+        for e in plan.to_run
+        if e.state.status in ("changed", "failed")
+    )
     for (status, why), number in reasons.most_common(NAMED_FAILURES):
         note(f"  {number} {status}: {why}")
     if plan.cohort.retry_failed and counts["changed"]:
@@ -182,7 +207,8 @@ def run_planned(plan: CohortPlan) -> list[Row]:
         # Again, as another run may have ended since.
         to_run = chosen(with_states(plan.to_run, place, plan.suffix), cohort.retry_failed)
         for entry in plan.entries:
-            if entry.state.status in ("done", "violated"):  # later failures had other options or inputs
+            # later failures had other options or inputs
+            if entry.state.status in ("done", "violated"):
                 failure_path(place, entry.key).unlink(missing_ok=True)
         try:
             if to_run:
@@ -198,27 +224,44 @@ def run_planned(plan: CohortPlan) -> list[Row]:
 
 
 def _run(plan: CohortPlan, to_run: Sequence[PlannedSubject]) -> None:
-    """Run the subjects, and report each outcome and the remaining time at the pace of those that ended."""
+    """Run the subjects, and report each outcome and the remaining time at the pace of those that
+    ended.
+    """
     place, cohort, n_tasks, n_failed = plan.cohort.output.absolute(), plan.cohort, len(to_run), 0
     share = share_for(n_tasks, plan.estimate, cohort, plan.threads)
     try:
         with workers(share, cohort.scheduler, plan.threads) as pool:
             note(pool.words())
             tasks = [_task(entry, plan.estimate, place, plan.suffix) for entry in to_run]
-            tasks.sort(key=lambda task: -task.n_bytes)  # so that no large run remains alone at the end
-            started("subjects", f"{counted(n_tasks, 'subject')}, {max(pool.slots(), 1)} at a time", n_tasks)
+            # so that no large run remains alone at the end
+            tasks.sort(key=lambda task: -task.n_bytes)
+            started(
+                "subjects",
+                f"{counted(n_tasks, 'subject')}, {max(pool.slots(), 1)} at a time",
+                n_tasks,
+            )
             start = time.monotonic()
-            for n_done, ended in enumerate(_with_pages(run_all(tasks, pool, place), place), start=1):
+            for n_done, ended in enumerate(
+                _with_pages(run_all(tasks, pool, place), place), start=1
+            ):
                 n_failed += ended.status == "failed"
-                left = (time.monotonic() - start) * (n_tasks / n_done - 1.0) if n_done < n_tasks else None
-                progress(_outcome_words(ended), CohortProgress(ended, n_done, n_tasks, n_failed, left))
+                left = (
+                    (time.monotonic() - start) * (n_tasks / n_done - 1.0)
+                    if n_done < n_tasks
+                    else None
+                )
+                progress(
+                    _outcome_words(ended), CohortProgress(ended, n_done, n_tasks, n_failed, left)
+                )
     except SchedulerLost as lost:
         violated(f"{lost}; finished subjects are kept")
 
 
 def _outcome_words(ended: Ended) -> str:
     """Describe the outcome of a run in one line."""
-    what = {"done": "done", "violated": f"requirement violated: {ended.reason}"}.get(ended.status, ended.reason)
+    what = {"done": "done", "violated": f"requirement violated: {ended.reason}"}.get(
+        ended.status, ended.reason
+    )
     memory = f", {memory_words(ended.peak_bytes)}" if ended.peak_bytes else ""
     return f"{ended.key}: {what} ({ended.seconds:.0f} s{memory})"
 

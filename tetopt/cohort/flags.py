@@ -11,12 +11,15 @@ import numpy as np
 from tetopt.cohort.numbers import Row, Value, present
 from tetopt.model.labels import label_words
 
-# A normal number exceeds this distance from the median in 1 case of 1.7 million; cohorts have longer tails.
+# A normal number exceeds this distance from the median in 1 case of 1.7 million; cohorts have
+# longer tails.
 FAR_DEVIATIONS = 5.0
 # The MAD of n numbers is itself uncertain: the limit is (1 + 8 / n) times as far. In simulations
-# (`tests/cohort/test_flags.py`), normal numbers are flagged in at most 1 case of 1000 for every n from 8 on.
+# (`tests/cohort/test_flags.py`), normal numbers are flagged in at most 1 case of 1000 for every n
+# from 8 on.
 FEW_SUBJECTS = 8  # with fewer, numbers are not judged; also the 8 above
-MAD_OF_NORMAL = 1.482602218505602  # standard deviations of normal numbers to one MAD: 1 / Phi^-1(3/4)
+# standard deviations of normal numbers to one MAD: 1 / Phi^-1(3/4)
+MAD_OF_NORMAL = 1.482602218505602
 MAJORITY_FRACTION = 2 / 3  # of subjects that agree: with fewer there is no common value
 COMMON_FRACTION = 0.9  # of subjects that have what others lack: with fewer it is a choice
 SHORT_RATIO = 20.0  # of two numbers in one unit: beyond, the smaller one has too many leading zeros
@@ -44,9 +47,17 @@ class Quantity(NamedTuple):
     least: float  # of the scale: lower limit of a robust deviation, of the logarithm if `is_log`
 
 
-# The least scales are differences too small to inspect an image: 5 % of a volume, 1 degree, 0.002 of rho.
+# The least scales are differences too small to inspect an image: 5 % of a volume, 1 degree, 0.002
+# of rho.
 QUANTITIES = (
-    Quantity("energies.E_D_fraction_of_variance", "E_D's fraction of the variance", "", "both", True, 0.05),
+    Quantity(
+        "energies.E_D_fraction_of_variance",
+        "E_D's fraction of the variance",
+        "",
+        "both",
+        True,
+        0.05,
+    ),
     Quantity("quality.mean_rho", "mean rho", "", "both", False, 0.002),
     Quantity("quality.min_dihedral", "smallest angle", "degrees", "below", False, 1.0),
     Quantity("grid.volume_mm", "volume of the image", "mm", "both", True, 0.05),
@@ -58,9 +69,11 @@ QUANTITIES = (
     Quantity("memory.peak_bytes", "memory", "bytes", "above", True, 0.1),
 )
 GRID_COLUMNS = {
-    "grid.orientation": "orientation", "grid.spacing_mm": "voxels in mm", "grid.shape": "voxels along the axes",
+    "grid.orientation": "orientation",
+    "grid.spacing_mm": "voxels in mm",
+    "grid.shape": "voxels along the axes",
     "versions.tetopt": "version of tetopt",
-}  # fmt: skip
+}
 
 
 def label_quantities(number: int, names: dict[int, str]) -> tuple[Quantity, Quantity]:
@@ -82,9 +95,10 @@ def flags_of(rows: Sequence[Row]) -> list[list[Flag]]:
     Returns
     -------
     list of list of Flag
-        For each row: violated requirements; labels without a cell, and labels that 9 of 10 others have and its image
-        lacks, or vice versa; another orientation, spacing or shape than two thirds have; with 8 or more subjects,
-        numbers more than `limit` robust deviations from the median. 2-D and 3-D meshes are compared separately.
+        For each row: violated requirements; labels without a cell, and labels that 9 of 10 others
+        have and its image lacks, or vice versa; another orientation, spacing or shape than two
+        thirds have; with 8 or more subjects, numbers more than `limit` robust deviations from the
+        median. 2-D and 3-D meshes are compared separately.
     """
     flags: list[list[Flag]] = [[] for _ in rows]
     for ndim, places in _groups(rows).items():
@@ -100,7 +114,8 @@ def flags_of(rows: Sequence[Row]) -> list[list[Flag]]:
 
 
 def unjudged(rows: Sequence[Row]) -> list[str]:
-    """Return, a sentence each, comparisons that are not made: too few rows, or values too mixed to have outliers.
+    """Return, a sentence each, comparisons that are not made: too few rows, or values too mixed to
+    have outliers.
 
     Parameters
     ----------
@@ -115,11 +130,14 @@ def unjudged(rows: Sequence[Row]) -> list[str]:
     for ndim, places in _groups(rows).items():
         own, kind = [rows[place] for place in places], f"{'2-D' if ndim == 2 else '3-D'} meshes"
         if len(own) < FEW_SUBJECTS:
-            sentences.append(f"{len(own)} {kind} are too few to compare their numbers ({FEW_SUBJECTS} needed).")
+            sentences.append(
+                f"{len(own)} {kind} are too few to compare their numbers ({FEW_SUBJECTS} needed)."
+            )
         mixed = [words for column, words in GRID_COLUMNS.items() if _is_mixed(_known(own, column))]
         if mixed:
             sentences.append(
-                f"The {len(own)} {kind} are too mixed to judge by {', '.join(mixed)}: no value is common to "
+                f"The {len(own)} {kind} are too mixed to judge by {', '.join(mixed)}: no value "
+                "is common to "
                 "two thirds of them."
             )
     return sentences
@@ -139,7 +157,9 @@ def _known(rows: Sequence[Row], column: str) -> list[Value]:
 
 
 def _is_mixed(texts: Sequence[Value]) -> bool:
-    """Return whether there are several values without a majority; two different values are mixed."""
+    """Return whether there are several values without a majority; two different values are
+    mixed.
+    """
     if len(set(texts)) < 2:
         return False
     count = Counter(texts).most_common(1)[0][1]
@@ -169,7 +189,10 @@ def _absent(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
             for place in labelled:
                 if number not in rows[place].volumes:
                     yield place, Flag("label", f"no label {words} in its image: {beside}", np.inf)
-        elif len(labelled) >= FEW_SUBJECTS and count <= (1.0 - COMMON_FRACTION) * len(labelled) + FLOAT_ROUNDING:
+        elif (
+            len(labelled) >= FEW_SUBJECTS
+            and count <= (1.0 - COMMON_FRACTION) * len(labelled) + FLOAT_ROUNDING
+        ):
             for place in labelled:
                 if number in rows[place].volumes:
                     yield place, Flag("label", f"label {words} in its image: {beside}", np.inf)
@@ -184,7 +207,10 @@ def _grids(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
         usual, count = Counter(known).most_common(1)[0]
         for place, text in enumerate(texts):
             if text is not None and text != usual:
-                yield place, Flag(column, f"{words} {text}: {count} of {len(known)} have {usual}", np.inf)
+                yield (
+                    place,
+                    Flag(column, f"{words} {text}: {count} of {len(known)} have {usual}", np.inf),
+                )
 
 
 def _far(rows: Sequence[Row], names: dict[int, str], ndim: int) -> Flagged:
@@ -205,13 +231,22 @@ def _far_in(quantity: Quantity, values: Sequence[Value], ndim: int) -> Flagged:
     far = limit(len(known))
     written = units(quantity.unit, ndim)
     places = [place for place, value in enumerate(values) if present([value])]
-    for k, (place, value, score) in enumerate(zip(places, known.tolist(), scores.tolist(), strict=True)):
+    for k, (place, value, score) in enumerate(
+        zip(places, known.tolist(), scores.tolist(), strict=True)
+    ):
         side = "above" if score > 0.0 else "below"
         if abs(score) > far and quantity.side in ("both", side):
             usual = float(np.median(np.delete(known, k)))
             measure = f" ({abs(score):.0f} robust deviations)" if np.isfinite(score) else ""
             beside = f"far {side} the others' median {written(usual, value)}{measure}"
-            yield place, Flag(quantity.column, f"{quantity.words} is {written(value, usual)}, {beside}", abs(score))
+            yield (
+                place,
+                Flag(
+                    quantity.column,
+                    f"{quantity.words} is {written(value, usual)}, {beside}",
+                    abs(score),
+                ),
+            )
 
 
 def deviations(values: np.ndarray, is_log: bool, least: float) -> np.ndarray:
@@ -229,15 +264,16 @@ def deviations(values: np.ndarray, is_log: bool, least: float) -> np.ndarray:
     Returns
     -------
     (K,) float
-        (x - median) / max(1.4826 MAD, least), with MAD the median of |x - median| (Rousseeuw and Croux, Alternatives to
-        the Median Absolute Deviation, J. Am. Stat. Assoc. 88, 1993).
+        (x - median) / max(1.4826 MAD, least), with MAD the median of |x - median| (Rousseeuw and
+        Croux, Alternatives to the Median Absolute Deviation, J. Am. Stat. Assoc. 88, 1993).
 
     Examples
     --------
     >>> deviations(np.array([1.0, 1.0, 1.0, 2.0]), False, 0.1).tolist()
     [0.0, 0.0, 0.0, 10.0]
     """
-    with np.errstate(divide="ignore", invalid="ignore"):  # if most are at -inf: nan, which is not far
+    # if most are at -inf: nan, which is not far
+    with np.errstate(divide="ignore", invalid="ignore"):
         x = np.log(np.maximum(values, 0.0)) if is_log else values
         distance = x - np.median(x[np.isfinite(x)])
         return distance / max(MAD_OF_NORMAL * float(np.median(np.abs(distance))), least)
@@ -255,10 +291,11 @@ def limit(n: int) -> float:
 
 
 def units(unit: str, ndim: int) -> Callable[..., str]:
-    """Return a formatter for numbers of a unit: volumes in mm^n as ml or l, bytes as MB or GB, seconds as min or h.
+    """Return a formatter for numbers of a unit: volumes in mm^n as ml or l, bytes as MB or GB,
+    seconds as min or h.
 
-    It takes the number and, optionally, a number shown with it: if neither is `SHORT_RATIO` times the other, both are
-    written in the larger one's unit.
+    It takes the number and, optionally, a number shown with it: if neither is `SHORT_RATIO` times
+    the other, both are written in the larger one's unit.
 
     Examples
     --------
@@ -268,7 +305,9 @@ def units(unit: str, ndim: int) -> Callable[..., str]:
     ('0.4 l', '1.43 l', '3 ml')
     """
     steps = {
-        "mm": [(1e6, "l"), (1e3, "ml"), (1.0, "mm^3")] if ndim == 3 else [(1e2, "cm^2"), (1.0, "mm^2")],
+        "mm": [(1e6, "l"), (1e3, "ml"), (1.0, "mm^3")]
+        if ndim == 3
+        else [(1e2, "cm^2"), (1.0, "mm^2")],
         "bytes": [(1e9, "GB"), (1e6, "MB"), (1.0, "bytes")],
         "s": [(3600.0, "h"), (60.0, "min"), (1.0, "s")],
     }.get(unit, [(1.0, unit)])
@@ -277,6 +316,8 @@ def units(unit: str, ndim: int) -> Callable[..., str]:
         size = max(abs(value), abs(beside) if abs(beside) < SHORT_RATIO * abs(value) else 0.0)
         factor, word = next((step for step in steps if size >= step[0]), steps[-1])
         number = value / factor
-        return f"{number:.3g} {word}".strip() if abs(number) < 1e3 else f"{number:,.0f} {word}".strip()
+        return (
+            f"{number:.3g} {word}".strip() if abs(number) < 1e3 else f"{number:,.0f} {word}".strip()
+        )
 
     return written

@@ -1,10 +1,9 @@
 """Layout of a cohort's files, with names of BIDS derivatives.
 
-OUT/dataset_description.json                   identifies the folder as a cohort's
-OUT/cohort.tsv, cohort.html                    all subjects
-OUT/sub-X[/ses-Y]/KEY_desc-tetopt_mesh.vtu     with the run's numbers in a JSON file of the same name
-OUT/sub-X[/ses-Y]/figures/                     its pictures
-OUT/logs/KEY.log, KEY.failed.json              events of the last run, and why it failed
+OUT/dataset_description.json                   identifies the folder as a cohort's OUT/cohort.tsv,
+cohort.html                    all subjects OUT/sub-X[/ses-Y]/KEY_desc-tetopt_mesh.vtu     with the
+run's numbers in a JSON file of the same name OUT/sub-X[/ses-Y]/figures/                     its
+pictures OUT/logs/KEY.log, KEY.failed.json              events of the last run, and why it failed
 OUT/.work/                                     unfinished outputs (`tetopt.system.work_directory`)
 """
 
@@ -26,7 +25,8 @@ from tetopt.system.incoming import json_of, text_of
 DESCRIPTION_NAME = "dataset_description.json"
 WORK_NAME, LOGS_NAME, FIGURES_NAME = ".work", "logs", "figures"
 TABLE_NAME, PAGE_NAME = "cohort.tsv", "cohort.html"
-OWN_NAMES = (DESCRIPTION_NAME, ".bidsignore", TABLE_NAME, "cohort.json", PAGE_NAME)  # files that runs write to OUT
+# files that runs write to OUT
+OWN_NAMES = (DESCRIPTION_NAME, ".bidsignore", TABLE_NAME, "cohort.json", PAGE_NAME)
 BIDS_VERSION = "1.10.0"  # of the specification that names follow
 KEY_PATTERN = re.compile(r"(sub-[A-Za-z0-9]+)(?:_(ses-[A-Za-z0-9]+))?")
 
@@ -63,7 +63,9 @@ def thumbnail_path(out: Path, key: str) -> Path:
 
 
 def check_out(out: Path) -> None:
-    """Raise InputError for a folder with anything but a cohort of tetopt's, or with links where runs write."""
+    """Raise InputError for a folder with anything but a cohort of tetopt's, or with links where
+    runs write.
+    """
     if not os.path.lexists(out):
         if not out.absolute().parent.is_dir():
             raise InputError(f"{out}: its parent folder does not exist; create it first")
@@ -71,21 +73,28 @@ def check_out(out: Path) -> None:
     if not out.is_dir():
         raise InputError(f"{out}: expected a folder for the cohort, got a file")
     if any(out.iterdir()) and not is_cohort(out):
-        raise InputError(f"{out} is not a cohort folder; choose an empty folder, or that of a cohort")
+        raise InputError(
+            f"{out} is not a cohort folder; choose an empty folder, or that of a cohort"
+        )
     for path in (*(out / name for name in (*OWN_NAMES, LOGS_NAME)), *(out / LOGS_NAME).glob("*")):
         if path.is_symlink():
-            raise InputError(f"{path}: expected no link; replace it with what it leads to, or remove it")
+            raise InputError(
+                f"{path}: expected no link; replace it with what it leads to, or remove it"
+            )
     if os.path.lexists(out / WORK_NAME):
         work_directory.check(out / WORK_NAME)
 
 
 def linked_place(out: Path, key: str) -> str | None:
-    """Return the problem of a subject's folder that is a link, as a run would write to another place."""
+    """Return the problem of a subject's folder that is a link, as a run would write to another
+    place.
+    """
     place = subject_folder(out, key)
     for each in (place / FIGURES_NAME, place, place.parent):
         if each != out and each.is_symlink():
             return (
-                f"{each}: expected the subject's folder, got a link to {os.readlink(each)}; a run would write "
+                f"{each}: expected the subject's folder, got a link to {os.readlink(each)}; a "
+                "run would write "
                 "there: move that folder back, or remove the link"
             )
     return None
@@ -94,30 +103,40 @@ def linked_place(out: Path, key: str) -> str | None:
 def is_cohort(out: Path) -> bool:
     """Return whether `begin` made a folder."""
     makers = (table_in(out / DESCRIPTION_NAME) or {}).get("GeneratedBy")
-    return isinstance(makers, list) and any(isinstance(each, dict) and each.get("Name") == "tetopt" for each in makers)
+    return isinstance(makers, list) and any(
+        isinstance(each, dict) and each.get("Name") == "tetopt" for each in makers
+    )
 
 
 def begin(out: Path, sources: Sequence[str] = ()) -> None:
-    """Make the folder if it is new, and describe its origin and data as a derivative of BIDS 1.10."""
+    """Make the folder if it is new, and describe its origin and data as a derivative of BIDS
+    1.10.
+    """
     out.mkdir(exist_ok=True)
     (out / LOGS_NAME).mkdir(exist_ok=True)
     work_directory.create(out / WORK_NAME)
     if (out / DESCRIPTION_NAME).exists():
         return
     description = {
-        "Name": "Tetrahedral meshes by tetopt", "BIDSVersion": BIDS_VERSION, "DatasetType": "derivative",
+        "Name": "Tetrahedral meshes by tetopt",
+        "BIDSVersion": BIDS_VERSION,
+        "DatasetType": "derivative",
         "GeneratedBy": [{"Name": "tetopt", "Version": tetopt.__version__}],
         "SourceDatasets": [{"URL": source} for source in sources],
-    }  # fmt: skip
+    }
     save_json(out / DESCRIPTION_NAME, description)
     # BIDS does not yet name meshes of volumes, pages and logs; its patterns of folders have no "/".
-    (out / ".bidsignore").write_text("*_mesh.*\n*.html\ncohort.*\nlogs/\nfigures\n", encoding="utf-8")
+    (out / ".bidsignore").write_text(
+        "*_mesh.*\n*.html\ncohort.*\nlogs/\nfigures\n", encoding="utf-8"
+    )
 
 
 def publish(work: Path, out: Path, key: str) -> None:
-    """Replace a subject's outputs by those in `work`; the user's own files, such as notes or results, are kept.
+    """Replace a subject's outputs by those in `work`; the user's own files, such as notes or
+    results, are kept.
 
-    Its numbers are removed first and come last: a subject without them is missing, and is run again.
+    Its numbers are removed first and come last: a subject without them is missing, and is run
+    again.
     """
     if (wrong := linked_place(out, key)) is not None:
         raise InputError(wrong)
@@ -135,9 +154,15 @@ def publish(work: Path, out: Path, key: str) -> None:
 
 
 def clean(out: Path, keys: list[str] | None = None) -> None:
-    """Remove unfinished outputs of these subjects, or, without `keys`, of all: runs that go on elsewhere then end."""
+    """Remove unfinished outputs of these subjects, or, without `keys`, of all: runs that go on
+    elsewhere then end.
+    """
     for path in (out / WORK_NAME).glob("sub-*.run-*"):
-        if (keys is None or path.name.partition(".")[0] in keys) and path.is_dir() and not path.is_symlink():
+        if (
+            (keys is None or path.name.partition(".")[0] in keys)
+            and path.is_dir()
+            and not path.is_symlink()
+        ):
             shutil.rmtree(path, ignore_errors=True)
 
 

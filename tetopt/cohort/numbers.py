@@ -1,4 +1,6 @@
-"""Every number of every subject, read from the outputs of their runs, and as one table for other programs."""
+"""Every number of every subject, read from the outputs of their runs, and as one table for other
+programs.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tetopt.cohort.layout import KEY_PATTERN, LOGS_NAME, failure_path, log_path, numbers_path, table_in, thumbnail_path
+from tetopt.cohort.layout import (
+    KEY_PATTERN,
+    LOGS_NAME,
+    failure_path,
+    log_path,
+    numbers_path,
+    table_in,
+    thumbnail_path,
+)
 from tetopt.cohort.state import Status, mesh_of, state_of
 from tetopt.geometry.box import world_axes
 from tetopt.io.text import plain
@@ -21,20 +31,37 @@ from tetopt.system.files import save_json, written_whole
 from tetopt.system.incoming import toml_of
 
 Value = float | int | str | bool | None
-# Parts of run.json that are not in the table: rows by iteration; sizes of sets, as `labels` has those of labels; pairs
-# of labels, as there are sums; names and loads as texts; values with columns of other names; the sentences in
-# `reason`.
+# Parts of run.json that are not in the table: rows by iteration; sizes of sets, as `labels` has
+# those of labels; pairs of labels, as there are sums; names and loads as texts; values with columns
+# of other names; the sentences in `reason`.
 UNLISTED_NUMBERS = (
-    "history", "sets", "label_names", "loads", "box", "image_properties.affine", "inputs.sha256", "violated",
-    "interfaces", "labels", "contacts", "thickness", "request",
-)  # fmt: skip
-SHORT_LIST = 4  # numbers of a list with a column each, as spacings and sides; longer lists are hundreds of moduli
+    "history",
+    "sets",
+    "label_names",
+    "loads",
+    "box",
+    "image_properties.affine",
+    "inputs.sha256",
+    "violated",
+    "interfaces",
+    "labels",
+    "contacts",
+    "thickness",
+    "request",
+)
+# numbers of a list with a column each, as spacings and sides; longer lists are hundreds of moduli
+SHORT_LIST = 4
 OF_LABEL = re.compile(r"(labels|interfaces)\.(\d+)\..*")  # columns of a label
 NOT_AVAILABLE = "n/a"  # BIDS' text for a missing value
 # First letters of texts that spreadsheets read as formulas (OWASP, "CSV Injection"), in all widths.
 FORMULA_LETTERS = ("=", "+", "-", "@", "\uff1d", "\uff0b", "\uff0d", "\uff20")
 OBLIQUE_DIGITS = 1  # of degrees: the precision of an affine's float32 numbers
-COLUMN_GROUPS = {"options": "Option ", "request": "Option ", "versions": "Version of ", "machine": "Of the machine: "}
+COLUMN_GROUPS = {
+    "options": "Option ",
+    "request": "Option ",
+    "versions": "Version of ",
+    "machine": "Of the machine: ",
+}
 
 
 class Row(NamedTuple):
@@ -44,7 +71,8 @@ class Row(NamedTuple):
     status: Status  # never "changed"
     reason: str  # failure or violated requirements, on one line; "" for a subject that is done
     violated: tuple[str, ...]  # the names of these requirements
-    files: dict[str, str]  # "mesh", "numbers", "log", "thumbnail", "figures": existing paths, relative to OUT
+    # "mesh", "numbers", "log", "thumbnail", "figures": existing paths, relative to OUT
+    files: dict[str, str]
     numbers: dict[str, Value]  # by column
     label_names: dict[int, str]  # of its labels with a name
     volumes: dict[int, float]  # of its labels' voxels, mm^n
@@ -52,7 +80,8 @@ class Row(NamedTuple):
 
 
 def collect(out: Path, expected: Sequence[str] = ()) -> list[Row]:
-    """Collect the rows of all subjects in a cohort's folder, and of expected ones, in the order of their names.
+    """Collect the rows of all subjects in a cohort's folder, and of expected ones, in the order of
+    their names.
 
     Parameters
     ----------
@@ -64,10 +93,15 @@ def collect(out: Path, expected: Sequence[str] = ()) -> list[Row]:
     Returns
     -------
     list of Row
-        A subject with unreadable files counts as failed. If a run failed, the numbers of an older mesh are left out.
+        A subject with unreadable files counts as failed. If a run failed, the numbers of an older
+        mesh are left out.
     """
     keys = set(expected)
-    for path_of, folder in ((numbers_path, "sub-*"), (numbers_path, "sub-*/ses-*"), (failure_path, LOGS_NAME)):
+    for path_of, folder in (
+        (numbers_path, "sub-*"),
+        (numbers_path, "sub-*/ses-*"),
+        (failure_path, LOGS_NAME),
+    ):
         ending = path_of(out, "").name
         for path in out.glob(f"{folder}/sub-*{ending}"):
             key = path.name.removesuffix(ending)
@@ -78,7 +112,9 @@ def collect(out: Path, expected: Sequence[str] = ()) -> list[Row]:
 
 def natural_order(text: str) -> list[tuple[int, str]]:
     """Return a sort key of names, so that "sub-2" comes before "sub-10"."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", text)]
+    return [
+        (int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", text)
+    ]
 
 
 def row_of(out: Path, key: str) -> Row:
@@ -88,10 +124,16 @@ def row_of(out: Path, key: str) -> Row:
     row = Row(key, status, reason, (), {}, {}, {}, {}, {})
     if status in ("done", "violated"):
         numbers = numbers_path(out, key)
-        places |= {"mesh": mesh_of(out, key) or numbers, "numbers": numbers, "thumbnail": thumbnail_path(out, key)}
+        places |= {
+            "mesh": mesh_of(out, key) or numbers,
+            "numbers": numbers,
+            "thumbnail": thumbnail_path(out, key),
+        }
         places["figures"] = places["thumbnail"].parent
         row = with_numbers(row, table_in(numbers) or {})
-    files = {name: path.relative_to(out).as_posix() for name, path in places.items() if path.exists()}
+    files = {
+        name: path.relative_to(out).as_posix() for name, path in places.items() if path.exists()
+    }
     return row._replace(files=files)
 
 
@@ -110,11 +152,12 @@ def with_numbers(row: Row, run: dict[str, Any]) -> Row:
 def flattened(run: dict[str, Any]) -> dict[str, Value]:
     """Return the numbers and texts of run.json by column, in its order.
 
-    Names of nested objects are joined by dots. Labels have a column per number, `labels.17.dice` and
-    `interfaces.17.area`; contrasts have `contrasts.1.weight` and so on; short lists of numbers have one column each
-    (`spacing_mm.1`), and lists of texts are joined. Given options that are not among `options` are in
-    `request.options`. Orientation and sides of the image come from its affine. Lost components are counted.
-    `UNLISTED_NUMBERS` and lists of more than four numbers are left out.
+    Names of nested objects are joined by dots. Labels have a column per number, `labels.17.dice`
+    and `interfaces.17.area`; contrasts have `contrasts.1.weight` and so on; short lists of numbers
+    have one column each (`spacing_mm.1`), and lists of texts are joined. Given options that are not
+    among `options` are in `request.options`. Orientation and sides of the image come from its
+    affine. Lost components are counted. `UNLISTED_NUMBERS` and lists of more than four numbers are
+    left out.
     """
     columns = _grid(run["box"]) if run.get("box") else {}
     for name, value in run.items():
@@ -127,7 +170,11 @@ def flattened(run: dict[str, Any]) -> dict[str, Value]:
             _put(columns, f"request.options.{name}", value)
     for name in ("labels", "interfaces"):
         for each in run.get(name) or ():
-            _put(columns, f"{name}.{each['label']}", {key: value for key, value in each.items() if key != "label"})
+            _put(
+                columns,
+                f"{name}.{each['label']}",
+                {key: value for key, value in each.items() if key != "label"},
+            )
     return columns
 
 
@@ -171,8 +218,12 @@ def orientation_code(affine: np.ndarray) -> str:
     >>> orientation_code(np.diag([-1.0, -1.0, 2.0, 1.0])), orientation_code(np.eye(3))
     ('LPS', '+x+y')
     """
-    letters = (("L", "R"), ("P", "A"), ("I", "S")) if len(affine) == 4 else (("-x", "+x"), ("-y", "+y"))
-    return "".join(letters[world][int(affine[world, a] > 0.0)] for a, world in enumerate(world_axes(affine)))
+    letters = (
+        (("L", "R"), ("P", "A"), ("I", "S")) if len(affine) == 4 else (("-x", "+x"), ("-y", "+y"))
+    )
+    return "".join(
+        letters[world][int(affine[world, a] > 0.0)] for a, world in enumerate(world_axes(affine))
+    )
 
 
 def oblique_degrees(affine: np.ndarray) -> float:
@@ -189,32 +240,43 @@ def oblique_degrees(affine: np.ndarray) -> float:
 
 
 def column_names(rows: Sequence[Row]) -> list[str]:
-    """Return the columns of all rows, in the order of run.json, with those of labels last and by number."""
+    """Return the columns of all rows, in the order of run.json, with those of labels last and by
+    number.
+    """
     names = dict.fromkeys(name for row in rows for name in row.numbers)
     matches = {name: match for name in names if (match := OF_LABEL.fullmatch(name)) is not None}
-    of_labels = sorted(matches, key=lambda name: (matches[name][1] == "interfaces", int(matches[name][2])))
+    of_labels = sorted(
+        matches, key=lambda name: (matches[name][1] == "interfaces", int(matches[name][2]))
+    )
     return [*(name for name in names if name not in matches), *of_labels]
 
 
 def save_table(path: Path, rows: Sequence[Row], flags: Sequence[Sequence[str]]) -> None:
-    """Write every number of every subject as tab-separated text, whole or not at all, and a description.
+    """Write every number of every subject as tab-separated text, whole or not at all, and a
+    description.
 
     Parameters
     ----------
     path : Path
-        Path of the table, `.tsv`; as in BIDS, a `.json` file of the same name describes its columns.
+        Path of the table, `.tsv`; as in BIDS, a `.json` file of the same name describes its
+        columns.
     rows : sequence of Row
     flags : sequence of sequence of str
         Flags of each row.
     """
     names = column_names(rows)
     heads = ["participant_id", "session_id", "status", "reason", "flags"]
-    with written_whole(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as stream:
+    with (
+        written_whole(path) as temporary,
+        temporary.open("w", encoding="utf-8", newline="\n") as stream,
+    ):
         stream.write("\t".join(map(field_text, [*heads, *names])) + "\n")
         for row, reasons in zip(rows, flags, strict=True):
             subject, _, session = row.key.partition("_")
             fixed = [subject, session, row.status, row.reason, "; ".join(reasons)]
-            stream.write("\t".join(map(field_text, chain(fixed, map(row.numbers.get, names)))) + "\n")
+            stream.write(
+                "\t".join(map(field_text, chain(fixed, map(row.numbers.get, names)))) + "\n"
+            )
     labels = {number: name for row in reversed(rows) for number, name in row.label_names.items()}
     dimensions = {row.numbers.get("quality.ndim") for row in rows} - {None}
     ndim = dimensions.pop() if len(dimensions) == 1 else "n"
@@ -228,8 +290,8 @@ def save_table(path: Path, rows: Sequence[Row], flags: Sequence[Sequence[str]]) 
 def field_text(value: Value) -> str:
     r"""Format a value as a field of a table that pandas, R and spreadsheets read equally.
 
-    Texts are on one line and without tabs (`tetopt.io.text.plain`); texts with quotes are quoted, as in CSV; texts that
-    a spreadsheet would read as a formula begin with an apostrophe.
+    Texts are on one line and without tabs (`tetopt.io.text.plain`); texts with quotes are quoted,
+    as in CSV; texts that a spreadsheet would read as a formula begin with an apostrophe.
 
     Examples
     --------
@@ -255,7 +317,8 @@ def _descriptions() -> dict[str, list[str]]:
 def description(column: str, label_names: dict[int, str] | None = None) -> dict[str, str]:
     """Describe a column of the table and its unit, as in BIDS' sidecars: "Description", "Units".
 
-    Descriptions of labels include their `label_names`. An unknown column is described by its name alone.
+    Descriptions of labels include their `label_names`. An unknown column is described by its name
+    alone.
     """
     known, general = _descriptions(), re.sub(r"\.\d+(?=\.|$)", ".N", column)
     first, _, rest = general.partition(".")
@@ -264,7 +327,10 @@ def description(column: str, label_names: dict[int, str] | None = None) -> dict[
         words = f"Initial mesh: {words}"
     else:
         beginning = COLUMN_GROUPS.get(first)
-        words, unit = known.get(general) or [f"{column} of run.json" if beginning is None else beginning + rest, ""]
+        words, unit = known.get(general) or [
+            f"{column} of run.json" if beginning is None else beginning + rest,
+            "",
+        ]
     if (match := OF_LABEL.fullmatch(column)) is not None:
         name = (label_names or {}).get(int(match[2]), "")
         words = f"Label {match[2]}{f' ({name})' if name else ''}: {words}"
@@ -273,4 +339,8 @@ def description(column: str, label_names: dict[int, str] | None = None) -> dict[
 
 def present(values: Iterable[Value]) -> list[float]:
     """Return the numbers among some values."""
-    return [float(each) for each in values if isinstance(each, int | float) and not isinstance(each, bool)]
+    return [
+        float(each)
+        for each in values
+        if isinstance(each, int | float) and not isinstance(each, bool)
+    ]

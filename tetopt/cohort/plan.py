@@ -45,7 +45,11 @@ class PlannedSubject(NamedTuple):
 
     def row(self) -> Subject:
         """Return the subject with the files that patterns match."""
-        files = {name: str(path) for name in FILE_OPTIONS if (path := getattr(self.plan.bare, name)) is not None}
+        files = {
+            name: str(path)
+            for name in FILE_OPTIONS
+            if (path := getattr(self.plan.bare, name)) is not None
+        }
         return self.subject._replace(options=self.subject.options | files)
 
     def words(self) -> tuple[str, ...]:
@@ -84,7 +88,9 @@ def checked_suffix(text: str) -> str:
     return suffix
 
 
-def entries_of(subjects: Sequence[Subject], options: RunOptions, out: Path, suffix: str) -> list[PlannedSubject]:
+def entries_of(
+    subjects: Sequence[Subject], options: RunOptions, out: Path, suffix: str
+) -> list[PlannedSubject]:
     """Return the subjects with their options and states.
 
     Raises
@@ -94,7 +100,8 @@ def entries_of(subjects: Sequence[Subject], options: RunOptions, out: Path, suff
     """
     problems = [("", line) for line in doubled(subjects)]
     texts = {name: text for name in FILES_IN_TEXTS if (text := getattr(options, name)) is not None}
-    placed: dict[str, Any] = dict(with_files(texts, os.path.abspath))  # a worker may have another current folder
+    # a worker may have another current folder
+    placed: dict[str, Any] = dict(with_files(texts, os.path.abspath))
     options, entries = replace(options, **placed), []
     for subject in subjects:
         try:
@@ -112,7 +119,9 @@ def entries_of(subjects: Sequence[Subject], options: RunOptions, out: Path, suff
 
 
 def _lines(problems: Iterable[tuple[str, str]]) -> Iterator[str]:
-    """Yield a line for each problem (place, words); problems with the same words share a line with the first place."""
+    """Yield a line for each problem (place, words); problems with the same words share a line
+    with the first place.
+    """
     places: dict[str, list[str]] = {}
     for place, words in problems:
         places.setdefault(words, []).append(place)
@@ -123,10 +132,14 @@ def _lines(problems: Iterable[tuple[str, str]]) -> Iterator[str]:
 
 def _planned(subject: Subject, options: RunOptions, output: Path) -> Plan:
     """Plan a subject with its files and options; raise InputError for invalid options."""
-    patterns = {name: str(path) for name in FILE_OPTIONS if (path := getattr(options, name)) is not None}
+    patterns = {
+        name: str(path) for name in FILE_OPTIONS if (path := getattr(options, name)) is not None
+    }
     texts = with_files(patterns, partial(matching, subject=subject)) | subject.options
     if "threads" in subject.options:
-        raise InputError("threads: all subjects use the same number, set by `threads`; remove the column")
+        raise InputError(
+            "threads: all subjects use the same number, set by `threads`; remove the column"
+        )
     own = with_options(options, {name.replace("_", "-"): text for name, text in texts.items()})
     return resolved(JobOptions(**vars(own), images=list(subject.images), output=output))
 
@@ -134,7 +147,11 @@ def _planned(subject: Subject, options: RunOptions, output: Path) -> Plan:
 def _missing(job: JobOptions) -> Iterator[str]:
     """Yield the problems of a subject's files: missing, broken links, or empty."""
     named = [("image", path) for path in job.images]
-    whole = {name: path for name in FILE_OPTIONS if (path := getattr(job, name)) is not None and name != "tissues"}
+    whole = {
+        name: path
+        for name in FILE_OPTIONS
+        if (path := getattr(job, name)) is not None and name != "tissues"
+    }
     named += [*whole.items(), *(("tissues", path) for path in tissue_files(job.tissues))]
     for number, (name, path) in enumerate(named):
         file = path if number == 0 else file_and_volume(path)[0]  # --volume applies to the first
@@ -150,7 +167,9 @@ def _missing(job: JobOptions) -> Iterator[str]:
 
 
 def with_states(entries: list[PlannedSubject], out: Path, suffix: str) -> list[PlannedSubject]:
-    """Return the subjects with their states; checksums are computed only if there is a mesh to compare with."""
+    """Return the subjects with their states; checksums are computed only if there is a mesh to
+    compare with.
+    """
 
     def state(entry: PlannedSubject) -> PlannedSubject:
         request = None

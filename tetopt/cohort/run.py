@@ -1,4 +1,5 @@
-"""One subject: a `Job` run by a worker, whose outputs are published together, or whose error is returned as data.
+"""One subject: a `Job` run by a worker, whose outputs are published together, or whose error is
+returned as data.
 
 The processes are dask's: it replaces a worker that ends, and runs its subject once more.
 """
@@ -49,7 +50,9 @@ class Ended(NamedTuple):
 
 
 def run_all(tasks: Sequence[SubjectTask], pool: Workers, out: Path) -> Iterator[Ended]:
-    """Run subjects on workers, which all find the folder `out`; record failures, and yield outcomes as they come."""
+    """Run subjects on workers, which all find the folder `out`; record failures, and yield
+    outcomes as they come.
+    """
     for task, ended, error in run_tasks(pool, run_subject, tasks, str(out)):
         if error is not None:
             ended = Ended(task.key, "failed", _reason(error), 0.0, 0)
@@ -62,13 +65,16 @@ def run_all(tasks: Sequence[SubjectTask], pool: Workers, out: Path) -> Iterator[
 
 
 def run_subject(task: SubjectTask) -> Ended:
-    """Mesh a subject and publish its outputs, or return its error; write the events of the run as its log."""
+    """Mesh a subject and publish its outputs, or return its error; write the events of the run
+    as its log.
+    """
     begin, lines = time.monotonic(), list[str]()
     forget_peak()
     try:
         if task.n_bytes > (limit := memory_limit()):
             raise InputError(
-                f"needs {memory_words(task.n_bytes)} of memory, but a worker has {memory_words(limit)}; reduce the "
+                f"needs {memory_words(task.n_bytes)} of memory, but a worker has "
+                f"{memory_words(limit)}; reduce the "
                 "number of nodes, or use larger workers"
             )
         result = _meshed(task, lines)
@@ -84,7 +90,9 @@ def run_subject(task: SubjectTask) -> Ended:
 
 
 def _meshed(task: SubjectTask, lines: list[str]) -> Result:
-    """Run a subject's job in a folder of its own and publish what it writes; add the texts of its events to `lines`."""
+    """Run a subject's job in a folder of its own and publish what it writes; add the texts of
+    its events to `lines`.
+    """
     work = Path(tempfile.mkdtemp("", f"{task.key}.run-{os.getpid()}-", task.out / WORK_NAME))
 
     def hear(event: Event) -> None:
@@ -97,7 +105,11 @@ def _meshed(task: SubjectTask, lines: list[str]) -> Result:
 
     try:
         mesh = work / mesh_name(task.key, task.suffix)
-        outputs = {"output": mesh, "json_path": mesh.with_suffix(".json"), "figures": work / FIGURES_NAME}
+        outputs = {
+            "output": mesh,
+            "json_path": mesh.with_suffix(".json"),
+            "figures": work / FIGURES_NAME,
+        }
         with warnings.catch_warnings():
             warnings.showwarning = lambda message, *_, **__: lines.append(str(message))
             result = run(Job(**vars(task.job) | outputs), hear, is_stopped)
@@ -110,7 +122,9 @@ def _meshed(task: SubjectTask, lines: list[str]) -> Result:
 def _reason(error: BaseException) -> str:
     """Return an error as one line, with its kind if no user can be expected to know it."""
     words = error_words(error) if isinstance(error, Exception) else str(error)
-    return plain(("" if _is_users(error) else f"{type(error).__name__}: ") + " ".join(words.split()))
+    return plain(
+        ("" if _is_users(error) else f"{type(error).__name__}: ") + " ".join(words.split())
+    )
 
 
 def _is_users(error: BaseException) -> bool:

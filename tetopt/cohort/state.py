@@ -9,7 +9,8 @@ from tetopt.cohort.layout import failure_path, numbers_path, table_in
 from tetopt.cohort.subjects import IMAGE_PATTERN
 from tetopt.io.text import plain
 
-Status = Literal["done", "violated", "failed", "changed", "missing"]  # "violated": the mesh violates a requirement
+# "violated": the mesh violates a requirement
+Status = Literal["done", "violated", "failed", "changed", "missing"]
 WORDS_LISTED = 4  # changes that fit on a line
 
 
@@ -28,8 +29,8 @@ def state_of(out: Path, key: str, request: dict[str, Any] | None = None) -> Subj
     out : Path
     key : str
     request : dict, optional
-        The current request, from `tetopt.job.request.requested`. Outputs of the same request count, whatever failed
-        since; without it, outputs are not compared.
+        The current request, from `tetopt.job.request.requested`. Outputs of the same request count,
+        whatever failed since; without it, outputs are not compared.
     """
     path, failure = numbers_path(out, key), failure_path(out, key)
     numbers = table_in(path)
@@ -42,7 +43,11 @@ def state_of(out: Path, key: str, request: dict[str, Any] | None = None) -> Subj
     if not path.exists():
         return SubjectState("missing", "not run yet")
     if numbers is None or not is_whole:
-        wrong = "its numbers cannot be read" if numbers is None else "its numbers exist, but its mesh is missing"
+        wrong = (
+            "its numbers cannot be read"
+            if numbers is None
+            else "its numbers exist, but its mesh is missing"
+        )
         return SubjectState("failed", f"{wrong}; run it again")
     if request is not None and not is_same:
         return SubjectState("changed", differences(before, request))
@@ -53,14 +58,20 @@ def state_of(out: Path, key: str, request: dict[str, Any] | None = None) -> Subj
 def mesh_of(out: Path, key: str) -> Path | None:
     """Return the path of a subject's mesh, in any format; None without one."""
     path = numbers_path(out, key)
-    files = (each for each in path.parent.glob(f"{path.stem}.*") if each.suffix != ".json" and each.stat().st_size > 0)
+    files = (
+        each
+        for each in path.parent.glob(f"{path.stem}.*")
+        if each.suffix != ".json" and each.stat().st_size > 0
+    )
     return min(files, default=None)
 
 
 def _request_of(numbers: dict[str, Any]) -> dict[str, Any]:
     """Return the request of a run; empty if its numbers do not state one in tetopt's form."""
     request = numbers.get("request")
-    if isinstance(request, dict) and all(isinstance(request.get(name), dict) for name in ("options", "files")):
+    if isinstance(request, dict) and all(
+        isinstance(request.get(name), dict) for name in ("options", "files")
+    ):
         return request
     return {"options": {}, "files": {}}
 
@@ -73,7 +84,9 @@ def differences(before: dict[str, Any], now: dict[str, Any]) -> str:
         words += [f"{name} was {pair[0]}, now {pair[1]}"] if pair[0] != pair[1] else []
     for name in sorted({*before["files"], *now["files"]}):
         if before["files"].get(name) != now["files"].get(name):
-            words.append(f"another {'image' if IMAGE_PATTERN.match(name) or name == 'images' else name}")
+            words.append(
+                f"another {'image' if IMAGE_PATTERN.match(name) or name == 'images' else name}"
+            )
     if before.get("tetopt") != now["tetopt"]:
         words.append(f"tetopt was {before.get('tetopt', 'none')}, now {now['tetopt']}")
     more = f" and {len(words) - WORDS_LISTED} more" if len(words) > WORDS_LISTED else ""

@@ -19,11 +19,13 @@ from tetopt.system.incoming import text_of
 TABLE_SUFFIXES = (".tsv", ".csv")
 SUBJECT_COLUMNS = ("subject", "participant_id")  # the second is from BIDS
 SESSION_COLUMNS = ("session", "session_id")
-FILE_OPTIONS = ("mask", "labels", "tissues", "sizing", "start", "label_names")  # of `tetopt mesh`, with files
+# of `tetopt mesh`, with files
+FILE_OPTIONS = ("mask", "labels", "tissues", "sizing", "start", "label_names")
 NO_VALUES = ("", "n/a")  # of an empty cell; the second is from BIDS
 LEFT_OUT = "#"  # prefix of columns that are the user's notes
 IMAGE_PATTERN = re.compile(r"image(?:_([1-9][0-9]{0,2}))?$")
-KEY_LETTERS = 200  # of a subject's key: file systems allow names of 255 bytes, and the longest adds 40
+# of a subject's key: file systems allow names of 255 bytes, and the longest adds 40
+KEY_LETTERS = 200
 GLOB_LETTERS = "*?["
 
 
@@ -48,7 +50,8 @@ class Problems(InputError):
 def label_of(name: str) -> str:
     """Convert a name to a BIDS label, which has only letters and digits.
 
-    BIDS 1.10, Common principles, https://bids-specification.readthedocs.io: entities' labels are alphanumeric.
+    BIDS 1.10, Common principles, https://bids-specification.readthedocs.io: entities' labels are
+    alphanumeric.
     """
     return re.sub("[^0-9A-Za-z]", "", name)
 
@@ -62,9 +65,9 @@ def key(subject: Subject) -> str:
 def read_table(path: Path) -> list[Subject]:
     """Read the subjects of a table, a line each; its first line has the columns' names.
 
-    `subject` (or `participant_id`), `session`, `image`, `image_2` and so on, `mask`, `labels`, and any other option of
-    `tetopt mesh` for the subject alone. Paths are relative to the table. Empty cells and "n/a" are ignored, as are
-    columns whose names begin with #.
+    `subject` (or `participant_id`), `session`, `image`, `image_2` and so on, `mask`, `labels`, and
+    any other option of `tetopt mesh` for the subject alone. Paths are relative to the table. Empty
+    cells and "n/a" are ignored, as are columns whose names begin with #.
 
     Raises
     ------
@@ -79,30 +82,46 @@ def read_table(path: Path) -> list[Subject]:
     for number, line in lines:
         place = f"{path}, line {number}"
         if len(line) != len(columns):
-            problems.append(f"{place}: expected {len(columns)} cells as in the first line, got {len(line)}")
+            problems.append(
+                f"{place}: expected {len(columns)} cells as in the first line, got {len(line)}"
+            )
             continue
-        cells = {name: cell for name, cell in zip(columns, line, strict=True) if name and cell not in NO_VALUES}
+        cells = {
+            name: cell
+            for name, cell in zip(columns, line, strict=True)
+            if name and cell not in NO_VALUES
+        }
         images = sorted(filter(IMAGE_PATTERN.match, cells), key=lambda name: (len(name), name))
         if missing := [name for name in ("subject", "image") if name not in cells]:
             problems.append(f"{place}: missing {' and '.join(missing)}")
             continue
-        options = {name: cell for name, cell in cells.items() if name not in ("subject", "session", *images)}
+        options = {
+            name: cell
+            for name, cell in cells.items()
+            if name not in ("subject", "session", *images)
+        }
         subjects.append(
             Subject(
-                cells["subject"].removeprefix("sub-"), cells.get("session", "").removeprefix("ses-"),
+                cells["subject"].removeprefix("sub-"),
+                cells.get("session", "").removeprefix("ses-"),
                 tuple(_absolute(folder, cells[name]) for name in images),
-                with_files(options, partial(_absolute, folder)), place,
+                with_files(options, partial(_absolute, folder)),
+                place,
             )
-        )  # fmt: skip
+        )
     if problems:
         raise Problems(problems)
     if not subjects:
-        raise InputError(f"{path}: expected a line for each subject below the column names, got none")
+        raise InputError(
+            f"{path}: expected a line for each subject below the column names, got none"
+        )
     return subjects
 
 
 def doubled(subjects: Iterable[Subject]) -> Iterator[str]:
-    """Yield the problems of the subjects' names: empty, too long, repeated, with and without a session."""
+    """Yield the problems of the subjects' names: empty, too long, repeated, with and without a
+    session.
+    """
     places: dict[str, str] = {}
     for each in subjects:
         if not label_of(each.subject) or (each.session and not label_of(each.session)):
@@ -114,12 +133,18 @@ def doubled(subjects: Iterable[Subject]) -> Iterator[str]:
             yield f"{each.place}: {words}; expected at most {KEY_LETTERS}"
             continue
         if name in places:
-            yield f"{each.place}: {name} is also used by {places[name]}; make subject or session unique"
+            yield (
+                f"{each.place}: {name} is also used by {places[name]}; make subject or "
+                "session unique"
+            )
         places.setdefault(name, each.place)
     for name, place in places.items():
         if "_ses-" in name and name.partition("_")[0] in places:
             bare = name.partition("_")[0]
-            yield f"{place}: {name} has a session, but {bare} ({places[bare]}) has none; give both a session"
+            yield (
+                f"{place}: {name} has a session, but {bare} ({places[bare]}) has none; give "
+                "both a session"
+            )
 
 
 def write_table(path: Path, subjects: Sequence[Subject]) -> None:
@@ -128,18 +153,26 @@ def write_table(path: Path, subjects: Sequence[Subject]) -> None:
     n_images = max((len(each.images) for each in subjects), default=1)
     images = ["image", *(f"image_{number}" for number in range(2, n_images + 1))]
     options = sorted(
-        {name for each in subjects for name in each.options}, key=lambda name: (name not in FILE_OPTIONS, name)
+        {name for each in subjects for name in each.options},
+        key=lambda name: (name not in FILE_OPTIONS, name),
     )
     session = ["session"] if any(each.session for each in subjects) else []
     columns = ["subject", *session, *images, *options]
     stream = StringIO()
     writer = csv.DictWriter(
-        stream, columns, restval="n/a", lineterminator="\n", delimiter="\t" if path.suffix.lower() == ".tsv" else ","
+        stream,
+        columns,
+        restval="n/a",
+        lineterminator="\n",
+        delimiter="\t" if path.suffix.lower() == ".tsv" else ",",
     )
     writer.writeheader()
     for each in subjects:
         row = {"subject": each.subject, **({"session": each.session} if each.session else {})}
-        row |= {name: os.path.relpath(image, folder) for name, image in zip(images, each.images, strict=False)}
+        row |= {
+            name: os.path.relpath(image, folder)
+            for name, image in zip(images, each.images, strict=False)
+        }
         writer.writerow(row | with_files(each.options, partial(os.path.relpath, start=folder)))
     save_text(path, stream.getvalue())
 
@@ -159,8 +192,8 @@ def with_files(options: dict[str, str], function: Callable[[str], Path | str]) -
 def matching(pattern: str, subject: Subject) -> Path:
     """Return the one file of this subject that a pattern matches.
 
-    {subject} and {session} are its names as in `key`; without a session, "ses-{session}" is removed with the "_" or "/"
-    before or after it. *, ? and [...] are as in a shell.
+    {subject} and {session} are its names as in `key`; without a session, "ses-{session}" is removed
+    with the "_" or "/" before or after it. *, ? and [...] are as in a shell.
 
     Raises
     ------
@@ -168,11 +201,19 @@ def matching(pattern: str, subject: Subject) -> Path:
         No file matches, or several do.
     """
     words = pattern
-    if unknown := [name for name in re.findall(r"\{[a-z_]+\}", pattern) if name not in ("{subject}", "{session}")]:
-        raise InputError(f"{pattern}: unknown placeholder {unknown[0]}; use {{subject}} and {{session}}")
+    if unknown := [
+        name
+        for name in re.findall(r"\{[a-z_]+\}", pattern)
+        if name not in ("{subject}", "{session}")
+    ]:
+        raise InputError(
+            f"{pattern}: unknown placeholder {unknown[0]}; use {{subject}} and {{session}}"
+        )
     if not subject.session:
         words = re.sub(r"_ses-\{session\}|ses-\{session\}[_/]?", "", words)
-    words = words.replace("{subject}", label_of(subject.subject)).replace("{session}", label_of(subject.session))
+    words = words.replace("{subject}", label_of(subject.subject)).replace(
+        "{session}", label_of(subject.session)
+    )
     path = Path(words).absolute()
     if path.exists() or not any(letter in words for letter in GLOB_LETTERS):
         return path
@@ -180,21 +221,33 @@ def matching(pattern: str, subject: Subject) -> Path:
     if len(matches) == 1:
         return matches[0]
     named = ", ".join(match.name for match in matches[:3])
-    raise InputError(f"{path}: expected one file, " + (f"got {len(matches)}: {named}" if matches else "got none"))
+    raise InputError(
+        f"{path}: expected one file, " + (f"got {len(matches)}: {named}" if matches else "got none")
+    )
 
 
 def _cells(path: Path) -> list[tuple[int, list[str]]]:
     """Return the non-empty lines of a table with their numbers, as cells."""
     text = text_of(path, "table of subjects")
     first = text.partition("\n")[0]
-    separator = "\t" if path.suffix.lower() == ".tsv" else ";" if ";" in first and "," not in first else ","
+    separator = (
+        "\t" if path.suffix.lower() == ".tsv" else ";" if ";" in first and "," not in first else ","
+    )
     reader = csv.reader(StringIO(text, newline=""), delimiter=separator, strict=True)
     try:
-        lines = [(reader.line_num, [cell.strip() for cell in line]) for line in reader if any(map(str.strip, line))]
+        lines = [
+            (reader.line_num, [cell.strip() for cell in line])
+            for line in reader
+            if any(map(str.strip, line))
+        ]
     except csv.Error as error:
-        raise InputError(f"{path}, line {reader.line_num}: expected a table, got {error}; correct that line") from error
+        raise InputError(
+            f"{path}, line {reader.line_num}: expected a table, got {error}; correct that line"
+        ) from error
     if not lines:
-        raise InputError(f"{path}: expected a line of column names, such as subject and image, got an empty file")
+        raise InputError(
+            f"{path}: expected a line of column names, such as subject and image, got an empty file"
+        )
     return lines
 
 
@@ -203,15 +256,20 @@ def _columns(path: Path, first: tuple[int, list[str]]) -> list[str]:
     columns = []
     for cell in first[1]:
         name = cell.lower().replace("-", "_")
-        name = "subject" if name in SUBJECT_COLUMNS else "session" if name in SESSION_COLUMNS else name
+        name = (
+            "subject" if name in SUBJECT_COLUMNS else "session" if name in SESSION_COLUMNS else name
+        )
         columns.append("" if name.startswith(LEFT_OUT) else name)
     named = [name for name in columns if name]
     if twice := sorted({name for name in named if named.count(name) > 1}):
-        raise InputError(f"{path}: the column {twice[0]} occurs {named.count(twice[0])} times; keep one")
+        raise InputError(
+            f"{path}: the column {twice[0]} occurs {named.count(twice[0])} times; keep one"
+        )
     if missing := [name for name in ("subject", "image") if name not in named]:
         separator = "tabs" if path.suffix.lower() == ".tsv" else "commas"
         raise InputError(
-            f"{path}: expected columns subject and image, separated by {separator}, got {', '.join(named) or 'none'}; "
+            f"{path}: expected columns subject and image, separated by {separator}, got "
+            f"{', '.join(named) or 'none'}; "
             f"missing {' and '.join(missing)}"
         )
     return columns

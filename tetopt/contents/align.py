@@ -1,7 +1,9 @@
-"""Resample masks, labels and further contrasts to an image's voxels, and separate foreground from background.
+"""Resample masks, labels and further contrasts to an image's voxels, and separate foreground from
+background.
 
-Two files of one patient need not share their voxels, only the world: they are matched by their affines, never by
-their shapes. The domain of a grid is the box of its voxels, from index -0.5 to shape - 0.5.
+Two files of one patient need not share their voxels, only the world: they are matched by their
+affines, never by their shapes. The domain of a grid is the box of its voxels, from index -0.5 to
+shape - 0.5.
 """
 
 from __future__ import annotations
@@ -22,29 +24,35 @@ from tetopt.errors import InputError, warn
 from tetopt.geometry.box import box_sides
 from tetopt.image import Image, transformed
 
-SAME_GRID_VOXELS = 1e-4  # two grids whose corners differ by no more are the same: headers hold single precision
+# two grids whose corners differ by no more are the same: headers hold single precision
+SAME_GRID_VOXELS = 1e-4
 SAME_BOX_VOXELS = 1.01  # the same of boxes: resampling rounds a box to whole voxels
 LEAST_COVERED_FRACTION = 0.5  # of the image's voxel centres, which a further contrast must cover
-BACKGROUND_SIGMAS = 4.0  # of the background's noise above its median, up to which voxels count as background
+# of the background's noise above its median, up to which voxels count as background
+BACKGROUND_SIGMAS = 4.0
 MAD_TO_SIGMA = 1.4826  # sigma of a normal distribution over its median absolute deviation
 COARSER_STEP = 1e-3  # of a voxel by which one may exceed another's size and count as equal
 LOST_FRACTION = 0.1  # of a label's volume, whose loss in resampling is reported
-PIECES_FACTOR = 2  # times its connected components, above which a label's pieces after resampling are reported
+# times its connected components, above which a label's pieces after resampling are reported
+PIECES_FACTOR = 2
 REPORTED_LABELS = 5  # with the largest losses
 SMALL_COMPONENT_FRACTION = 0.01  # of the largest component's voxels: smaller components are ignored
 SUSPECT_VOXELS = 200  # of a bright piece: a larger one is hardly noise
 KEEP_PIECES = "`labels` keep what they number; a `mask` replaces the rule"
-LEAST_CLASS_FRACTION = 0.001  # of the voxels: a background or foreground found without a level must have more
+# of the voxels: a background or foreground found without a level must have more
+LEAST_CLASS_FRACTION = 0.001
 
 
 def resample_mask(mask: Image, image: Image, name: str = "mask") -> Image:
-    """Resample a mask to the image's voxels: nearest neighbour by the affines if the grids differ, 0 outside its box.
+    """Resample a mask to the image's voxels: nearest neighbour by the affines if the grids differ,
+    0 outside its box.
 
     Parameters
     ----------
     mask : Image
-        Either two values, 0 and another above 0 (bool, 0 and 255), or fractions in [0, 1], a probability map
-        whose border is the level 0.5. A single value above 0 is a mask, too: the whole box.
+        Either two values, 0 and another above 0 (bool, 0 and 255), or fractions in [0, 1], a
+        probability map whose border is the level 0.5. A single value above 0 is a mask, too: the
+        whole box.
     image : Image
         Image with the target voxels.
     name : str, optional
@@ -53,12 +61,14 @@ def resample_mask(mask: Image, image: Image, name: str = "mask") -> Image:
     Returns
     -------
     Image
-        float32; 0 and 1 for a mask of two values, fractions for a probability map. The image's shape and affine.
+        float32; 0 and 1 for a mask of two values, fractions for a probability map. The image's
+        shape and affine.
 
     Raises
     ------
     InputError
-        A number of axes different from the image's, other values, an empty mask, or a mask outside the image's box.
+        A number of axes different from the image's, other values, an empty mask, or a mask outside
+        the image's box.
 
     Examples
     --------
@@ -73,22 +83,32 @@ def resample_mask(mask: Image, image: Image, name: str = "mask") -> Image:
     moved = _moved(Image(inside, mask.affine), image)
     if not (moved >= INSIDE_FRACTION).any():
         if (in_box(image, mask).astype(bool) & (inside >= INSIDE_FRACTION)).any():
-            raise InputError(f"{name}: the mask is lost between the centres of the image's larger voxels")
-        raise InputError(f"{name}: the mask lies outside the image's box; {_both_boxes(mask, image)}")
+            raise InputError(
+                f"{name}: the mask is lost between the centres of the image's larger voxels"
+            )
+        raise InputError(
+            f"{name}: the mask lies outside the image's box; {_both_boxes(mask, image)}"
+        )
     _warn_of_loss(
-        name, "the mask", Image(inside >= INSIDE_FRACTION, mask.affine), Image(moved >= INSIDE_FRACTION, image.affine)
+        name,
+        "the mask",
+        Image(inside >= INSIDE_FRACTION, mask.affine),
+        Image(moved >= INSIDE_FRACTION, image.affine),
     )
     return Image(moved, image.affine)
 
 
-def resample_labels(labels: Image, image: Image, name: str = "labels", *, may_miss: bool = False) -> Image:
-    """Resample labels to the image's voxels: nearest neighbour by the affines if the grids differ, 0 outside their box.
+def resample_labels(
+    labels: Image, image: Image, name: str = "labels", *, may_miss: bool = False
+) -> Image:
+    """Resample labels to the image's voxels: nearest neighbour by the affines if the grids differ,
+    0 outside their box.
 
     Parameters
     ----------
     labels : Image
-        Whole numbers from 0 to `tetopt.contents.labels.LARGEST_LABEL`, 0 the background; values within 1e-3 of these
-        are rounded, with a warning.
+        Whole numbers from 0 to `tetopt.contents.labels.LARGEST_LABEL`, 0 the background; values
+        within 1e-3 of these are rounded, with a warning.
     image : Image
         Image with the target voxels.
     name : str, optional
@@ -104,13 +124,14 @@ def resample_labels(labels: Image, image: Image, name: str = "labels", *, may_mi
     Raises
     ------
     InputError
-        A number of axes different from the image's, invalid labels, or no label above 0 in the image's box.
+        A number of axes different from the image's, invalid labels, or no label above 0 in the
+        image's box.
 
     Warns
     -----
     UserWarning
-        Values were rounded; labels have no voxel in the image's box; labels lose a tenth of their volume or fall into
-        pieces, as the image's voxels are larger.
+        Values were rounded; labels have no voxel in the image's box; labels lose a tenth of their
+        volume or fall into pieces, as the image's voxels are larger.
 
     Examples
     --------
@@ -123,11 +144,17 @@ def resample_labels(labels: Image, image: Image, name: str = "labels", *, may_mi
     labels = checked_labels(name, labels, is_map=True)
     moved = _moved(labels, image)
     if labels.data.max() == 0:
-        raise InputError(f"{name}: expected labels above 0, got 0 in every voxel; is it the right file?")
+        raise InputError(
+            f"{name}: expected labels above 0, got 0 in every voxel; is it the right file?"
+        )
     if moved.max() == 0:
         if (labels.data * in_box(image, labels)).any():
-            raise InputError(f"{name}: the labels are lost between the centres of the image's larger voxels")
-        raise InputError(f"{name}: no label above 0 lies in the image's box; {_both_boxes(labels, image)}")
+            raise InputError(
+                f"{name}: the labels are lost between the centres of the image's larger voxels"
+            )
+        raise InputError(
+            f"{name}: no label above 0 lies in the image's box; {_both_boxes(labels, image)}"
+        )
     if not (may_miss or is_same_grid(labels, image)):
         warn_of_absent(f"{name}: ", labels, in_box(image, labels).astype(bool), "image")
     _warn_of_loss(name, "label", labels, Image(moved, image.affine))
@@ -135,9 +162,11 @@ def resample_labels(labels: Image, image: Image, name: str = "labels", *, may_mi
 
 
 def divisions(image: Image, others: Iterable[Image]) -> tuple[int, ...]:
-    """Return into how many parts along each axis to divide an image's voxels so that none is larger than the others'.
+    """Return into how many parts along each axis to divide an image's voxels so that none is larger
+    than the others'.
 
-    An image's step along an axis is compared with the others' voxels that it passes, whatever their directions.
+    An image's step along an axis is compared with the others' voxels that it passes, whatever their
+    directions.
     """
     steps = [np.ones(image.ndim)]
     for other in others:
@@ -147,7 +176,9 @@ def divisions(image: Image, others: Iterable[Image]) -> tuple[int, ...]:
 
 
 def divided(image: Image, factors: Sequence[int]) -> Image:
-    """Return the image on voxels divided by `factors` along the axes, each part with its voxel's value."""
+    """Return the image on voxels divided by `factors` along the axes, each part with its voxel's
+    value.
+    """
     data = image.data
     for axis, factor in enumerate(factors):
         data = np.repeat(data, factor, axis)
@@ -155,19 +186,30 @@ def divided(image: Image, factors: Sequence[int]) -> Image:
 
 
 def _warn_of_loss(name: str, word: str, labels: Image, moved: Image) -> None:
-    """Warn of labels that vanish on the voxels of `moved`; on larger ones, also of lost volume and of pieces."""
+    """Warn of labels that vanish on the voxels of `moved`; on larger ones, also of lost volume
+    and of pieces.
+    """
     if is_same_grid(labels, moved) or is_same_grid(labels, moved, is_cropped=True):
         return
     inside = np.where(in_box(moved, labels), labels.data, 0.0)
     values, counts = np.unique(inside, return_counts=True)
     left, counts_left = np.unique(moved.data, return_counts=True)
     of_left = dict(zip(left.tolist(), (counts_left * moved.voxel_volume).tolist(), strict=True))
-    lost, pieces, is_coarser = list[tuple[float, str]](), list[str](), max(divisions(moved, [labels])) > 1
+    lost, pieces, is_coarser = (
+        list[tuple[float, str]](),
+        list[str](),
+        max(divisions(moved, [labels])) > 1,
+    )
     for value, volume in zip(values.tolist(), (counts * labels.voxel_volume).tolist(), strict=True):
         which = word if word == "the mask" else f"{word} {value:.10g}"
         fraction = 1.0 - of_left.get(value, 0.0) / volume
         if value > 0.0 and (fraction > LOST_FRACTION if is_coarser else value not in of_left):
-            lost.append((fraction, f"{which} loses {fraction:.0%} of its volume ({volume:.3g} mm{labels.ndim})"))
+            lost.append(
+                (
+                    fraction,
+                    f"{which} loses {fraction:.0%} of its volume ({volume:.3g} mm{labels.ndim})",
+                )
+            )
         elif value > 0.0 and is_coarser:
             n_before, n_after = (_n_pieces(each == value) for each in (inside, moved.data))
             if n_after > PIECES_FACTOR * n_before:
@@ -177,7 +219,8 @@ def _warn_of_loss(name: str, word: str, labels: Image, moved: Image) -> None:
         more = f"; and {len(every) - REPORTED_LABELS} more" * (len(every) > REPORTED_LABELS)
         sizes = [" x ".join(f"{edge:.3g}" for edge in each.spacing) for each in (labels, moved)]
         warn(
-            f"{name}: resampled from voxels of {sizes[0]} mm to {sizes[1]} mm; {'; '.join(every[:REPORTED_LABELS])}"
+            f"{name}: resampled from voxels of {sizes[0]} mm to {sizes[1]} mm; "
+            f"{'; '.join(every[:REPORTED_LABELS])}"
             f"{more}; resample the image to the finer voxels to keep them"
         )
 
@@ -210,7 +253,8 @@ def resample_contrast(other: Image, image: Image, name: str = "contrast") -> Ima
     Raises
     ------
     InputError
-        A number of axes different from the image's, or a box with fewer than half of the image's voxel centres.
+        A number of axes different from the image's, or a box with fewer than half of the image's
+        voxel centres.
 
     See Also
     --------
@@ -229,7 +273,8 @@ def resample_contrast(other: Image, image: Image, name: str = "contrast") -> Ima
     fraction = float(in_box(other, image).mean())
     if fraction < LEAST_COVERED_FRACTION:
         raise InputError(
-            f"{name}: expected it to cover at least half of the image's voxels, got {100 * fraction:.1f} %; "
+            f"{name}: expected it to cover at least half of the image's voxels, got "
+            f"{100 * fraction:.1f} %; "
             f"{_both_boxes(other, image)}"
         )
     return Image(_resampled(other.data, other, image, 1, "nearest"), image.affine)
@@ -245,10 +290,14 @@ class Foreground(NamedTuple):
     @property
     def words(self) -> str:
         """Describe the small pieces by number and volume; empty if there are none."""
-        parts = (("bright ones are removed", self.dropped), ("dark ones at the box's sides stay", self.kept))
+        parts = (
+            ("bright ones are removed", self.dropped),
+            ("dark ones at the box's sides stay", self.kept),
+        )
         size, unit = self.mask.voxel_volume, f"mm{self.mask.ndim}"
         words = [
-            f"{what}: {len(voxels)}, {voxels.sum() * size:.3g} {unit} in all, the largest {voxels[0] * size:.3g} {unit}"
+            f"{what}: {len(voxels)}, {voxels.sum() * size:.3g} {unit} in all, the largest "
+            f"{voxels[0] * size:.3g} {unit}"
             for what, voxels in parts
             if len(voxels)
         ]
@@ -263,10 +312,11 @@ class Foreground(NamedTuple):
 def foreground_mask(image: Image, level: float | None = None, labels: Image | None = None) -> Image:
     """Mask of the foreground, 0 and 1.
 
-    Voxels at or below the level that are connected by faces to the box's sides are removed, so dark cavities inside
-    remain. Voxels with a label above 0 always stay. Pieces with less than 1/100 of the largest one's voxels are treated
-    as noise: bright ones without a label are removed, too, and without labels, dark ones at the box's sides stay, such
-    as vessels, bone and gas cut by a face of the box. Pass a label image as `labels`, too, as ``labels=image``.
+    Voxels at or below the level that are connected by faces to the box's sides are removed, so dark
+    cavities inside remain. Voxels with a label above 0 always stay. Pieces with less than 1/100 of
+    the largest one's voxels are treated as noise: bright ones without a label are removed, too, and
+    without labels, dark ones at the box's sides stay, such as vessels, bone and gas cut by a face
+    of the box. Pass a label image as `labels`, too, as ``labels=image``.
 
     Parameters
     ----------
@@ -303,7 +353,10 @@ def foreground_mask(image: Image, level: float | None = None, labels: Image | No
     {}
     """
     if labels is not None and labels.shape != image.shape:
-        raise InputError(f"labels: expected the image's shape {image.shape}, got {labels.shape}; resample them first")
+        raise InputError(
+            f"labels: expected the image's shape {image.shape}, got {labels.shape}; resample "
+            "them first"
+        )
     front = foreground(image, level, labels)
     if front.is_suspect:
         warn(f"{front.words} ({KEEP_PIECES})")
@@ -325,17 +378,27 @@ def foreground(image: Image, level: float | None = None, labels: Image | None = 
     is_kept[bright[is_labelled]] = True
     dropped = sizes[~is_kept]
     is_inside = is_kept[bright]
-    fraction, least = float(is_inside.mean()), LEAST_CLASS_FRACTION if level is None and labels is None else 0.0
+    fraction, least = (
+        float(is_inside.mean()),
+        LEAST_CLASS_FRACTION if level is None and labels is None else 0.0,
+    )
     if least < fraction < 1.0 - least:
         mask = Image(is_inside, image.affine)
         return Foreground(mask, *(np.sort(voxels[voxels > 0])[::-1] for voxels in (dropped, kept)))
     if level is None:
-        raise _no_background(f"{100 * fraction:.4g} % of the voxels would be foreground at level {limit:.4g}")
+        raise _no_background(
+            f"{100 * fraction:.4g} % of the voxels would be foreground at level {limit:.4g}"
+        )
     low, high = image.range
-    instead = "; or give the labels' file as `mask`, with `mask_label`" if 0.0 < is_labelled.mean() < 1.0 else ""
+    instead = (
+        "; or give the labels' file as `mask`, with `mask_label`"
+        if 0.0 < is_labelled.mean() < 1.0
+        else ""
+    )
     outcome = "every voxel is foreground" if fraction > 0.5 else "no voxel is foreground"
     raise InputError(
-        f"`background` {limit:g}: {outcome}; choose a level between the background's and the tissue's values (the "
+        f"`background` {limit:g}: {outcome}; choose a level between the background's and the "
+        "tissue's values (the "
         f"image ranges from {low:g} to {high:g}){instead}"
     )
 
@@ -349,7 +412,9 @@ class FilledHoles(NamedTuple):
 
 
 def filled_holes(labels: Image, label: int) -> FilledHoles:
-    """Give a label to the voxels of label 0 that no path through faces of such voxels connects to the box's sides."""
+    """Give a label to the voxels of label 0 that no path through faces of such voxels connects
+    to the box's sides.
+    """
     data = labels.data
     empty, sizes = _pieces(data == BACKGROUND_LABEL)
     sizes[_on_faces(empty)] = 0
@@ -368,15 +433,17 @@ def filled_holes(labels: Image, label: int) -> FilledHoles:
 def background_level(image: Image) -> float:
     """The highest intensity of the background, estimated on the faces of the box.
 
-    Voxels on the faces that are darker than Otsu's threshold of the whole image are mostly background, although a face
-    may cut the body. The level is their median plus 4 sigma, with sigma from the median absolute deviation, which is
-    robust against body on the faces (Hampel, The influence curve and its role in robust estimation, JASA 69, 1974).
-    The level of a constant background, as around an extracted brain, is its value.
+    Voxels on the faces that are darker than Otsu's threshold of the whole image are mostly
+    background, although a face may cut the body. The level is their median plus 4 sigma, with sigma
+    from the median absolute deviation, which is robust against body on the faces (Hampel, The
+    influence curve and its role in robust estimation, JASA 69, 1974). The level of a constant
+    background, as around an extracted brain, is its value.
 
     Raises
     ------
     InputError
-        The faces have no dark voxels, or these are not distinct: the level is not below Otsu's threshold.
+        The faces have no dark voxels, or these are not distinct: the level is not below Otsu's
+        threshold.
     """
     data = image.data
     if data.min() == data.max():
@@ -393,20 +460,24 @@ def background_level(image: Image) -> float:
     level = float(middle + BACKGROUND_SIGMAS * MAD_TO_SIGMA * np.median(np.abs(dark - middle)))
     if level >= threshold:
         raise _no_background(
-            f"the dark voxels on the faces of the box range up to {level:.4g}, which is not below the threshold "
+            f"the dark voxels on the faces of the box range up to {level:.4g}, which is not "
+            "below the threshold "
             f"between dark and bright, {threshold:.4g}"
         )
     return level
 
 
 def _no_background(reason: str) -> InputError:
-    return InputError(f"`background` auto: no background found, as {reason}; give a value or omit `background`")
+    return InputError(
+        f"`background` auto: no background found, as {reason}; give a value or omit `background`"
+    )
 
 
 def _check_axes(name: str, other: Image, image: Image) -> None:
     if other.ndim != image.ndim:
         raise InputError(
-            f"{name}: expected {image.ndim} axes like the image's {image.shape}, got shape {other.shape}; select one "
+            f"{name}: expected {image.ndim} axes like the image's {image.shape}, got shape "
+            f"{other.shape}; select one "
             "volume or slice"
         )
 
@@ -419,24 +490,39 @@ def _mask_values(name: str, data: NDArray[np.floating]) -> NDArray[np.float32]:
         return is_top.astype(np.float32)
     if data.min() < 0 or top > 1:
         values = np.unique(data)
-        some = ", ".join(f"{value:g}" for value in values[:5]) + (", ..." if len(values) > 5 else "")
+        some = ", ".join(f"{value:g}" for value in values[:5]) + (
+            ", ..." if len(values) > 5 else ""
+        )
         raise InputError(
-            f"{name}: expected a mask (0 and one other value, or fractions from 0 to 1), got {len(values)} values from "
-            f"{values[0]:g} to {values[-1]:g} ({some}); choose labels with `mask_label`, or convert it to 0 and 1"
+            f"{name}: expected a mask (0 and one other value, or fractions from 0 to 1), got "
+            f"{len(values)} values from "
+            f"{values[0]:g} to {values[-1]:g} ({some}); choose labels with `mask_label`, or "
+            "convert it to 0 and 1"
         )
     if top < INSIDE_FRACTION:
         largest = "0 in every voxel" if top == 0 else f"fractions up to {top:g}"
-        raise InputError(f"{name}: the mask is empty: expected voxels of {INSIDE_FRACTION} or more, got {largest}")
+        raise InputError(
+            f"{name}: the mask is empty: expected voxels of {INSIDE_FRACTION} or more, got "
+            f"{largest}"
+        )
     return data.astype(np.float32)
 
 
 def _moved(other: Image, image: Image) -> NDArray[np.floating]:
-    """Values of `other` at the image's voxel centres: those of the voxels that contain them, 0 outside."""
-    return other.data if is_same_grid(other, image) else _resampled(other.data, other, image, 0, "grid-constant")
+    """Values of `other` at the image's voxel centres: those of the voxels that contain them, 0
+    outside.
+    """
+    return (
+        other.data
+        if is_same_grid(other, image)
+        else _resampled(other.data, other, image, 0, "grid-constant")
+    )
 
 
 def is_same_grid(other: Image, image: Image, *, is_cropped: bool = False) -> bool:
-    """True if two images have the same voxels, to 1e-4 voxel; a cropped image has a part of the other's."""
+    """True if two images have the same voxels, to 1e-4 voxel; a cropped image has a part of the
+    other's.
+    """
     corners = _corners(image)
     offset = other.to_index(image.to_world(corners)) - corners
     start = np.rint(offset[0]) if is_cropped else np.zeros(image.ndim)
@@ -447,12 +533,14 @@ def is_same_grid(other: Image, image: Image, *, is_cropped: bool = False) -> boo
 
 
 def other_box(grid: Any, image: Image, tolerance: float = SAME_BOX_VOXELS) -> str:
-    """Return "A mm, got B mm", the extents of a grid's box and an image's, if these are different boxes, else "".
+    """Return "A mm, got B mm", the extents of a grid's box and an image's, if these are different
+    boxes, else "".
 
-    The grid is an image, or a `Box`. Corners of the same box agree to `tolerance` voxels of the coarser one, in any
-    order of the axes.
+    The grid is an image, or a `Box`. Corners of the same box agree to `tolerance` voxels of the
+    coarser one, in any order of the axes.
     """
-    steps = np.abs(np.linalg.inv(image.affine[:-1, :-1]) @ grid.affine[:-1, :-1]).max(axis=1)  # the grid's, voxels
+    # the grid's, voxels
+    steps = np.abs(np.linalg.inv(image.affine[:-1, :-1]) @ grid.affine[:-1, :-1]).max(axis=1)
     off = np.abs(image.to_index(_world_corners(grid))[..., None] - box_sides(image.shape))
     is_near = off <= tolerance * np.maximum(steps, 1.0)[:, None]
     return "" if is_near.any(axis=-1).all() else f"{_extent(grid)} mm, got {_extent(image)} mm"
@@ -466,14 +554,18 @@ def in_box(other: Image, image: Image) -> NDArray[np.uint8]:
 def _resampled(data: NDArray, other: Image, image: Image, order: int, mode: str) -> NDArray:
     """`data`, on the grid of `other`, at the image's voxel centres.
 
-    scipy's mode `grid-constant` fills a grid's outer half voxels from their own voxels; `constant` leaves them out.
+    scipy's mode `grid-constant` fills a grid's outer half voxels from their own voxels; `constant`
+    leaves them out.
     """
     n = image.ndim
     corner = other.to_index(image.to_world(np.vstack([np.zeros(n), np.eye(n)])))
     matrix, offset = (corner[1:] - corner[0]).T, corner[0]
-    if order == 0:  # on a grid shifted by half a voxel, all centres halfway between two voxels go to the upper one
+    # on a grid shifted by half a voxel, all centres halfway between two voxels go to the upper one
+    if order == 0:
         offset = offset + SAME_GRID_VOXELS
-    return scipy.ndimage.affine_transform(data, matrix, offset, image.shape, data.dtype, order=order, mode=mode)
+    return scipy.ndimage.affine_transform(
+        data, matrix, offset, image.shape, data.dtype, order=order, mode=mode
+    )
 
 
 def _corners(grid: Any) -> NDArray[np.float64]:
@@ -482,7 +574,10 @@ def _corners(grid: Any) -> NDArray[np.float64]:
 
 
 def _both_boxes(other: Image, image: Image) -> str:
-    return f"it spans {_extent(other)} mm, the image {_extent(image)} mm: do both use the same world coordinates?"
+    return (
+        f"it spans {_extent(other)} mm, the image {_extent(image)} mm: do both use the same "
+        "world coordinates?"
+    )
 
 
 def _world_corners(grid: Any) -> NDArray[np.float64]:
@@ -498,11 +593,15 @@ def _extent(grid: Any) -> str:
 
 def _on_faces(data: NDArray) -> NDArray:
     """The values of the voxels on all faces of the box, one face after the other."""
-    return np.concatenate([data.take(end, axis).ravel() for axis in range(data.ndim) for end in (0, -1)])
+    return np.concatenate(
+        [data.take(end, axis).ravel() for axis in range(data.ndim) for end in (0, -1)]
+    )
 
 
 def _pieces(is_in: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Face-connected components, numbered from 1, and the number of voxels of each; 0 of the rest."""
+    """Face-connected components, numbered from 1, and the number of voxels of each; 0 of the
+    rest.
+    """
     pieces, _ = scipy.ndimage.label(is_in)
     sizes = np.bincount(pieces.ravel())
     sizes[0] = 0

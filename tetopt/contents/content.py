@@ -1,8 +1,9 @@
 """The content of a mesh: one or several contrasts, labels and a mask on the voxels of one image.
 
-E_D of Eq. (3) is summed over channels: the intensities of each contrast, and for each label a channel that is 1 within
-it (one-hot), so that a cell with one value in all channels is one tissue. Weights scale the channels: with weight 1, a
-channel's variance over the domain counts as much as the first image's.
+E_D of Eq. (3) is summed over channels: the intensities of each contrast, and for each label a
+channel that is 1 within it (one-hot), so that a cell with one value in all channels is one tissue.
+Weights scale the channels: with weight 1, a channel's variance over the domain counts as much as
+the first image's.
 """
 
 from __future__ import annotations
@@ -17,7 +18,14 @@ from numpy.typing import NDArray
 
 from tetopt.contents.domain import INSIDE_FRACTION, Region, region_of
 from tetopt.contents.labels import BACKGROUND_LABEL, checked_labels, label_channels, warn_of_absent
-from tetopt.contents.memberships import Memberships, finer, memberships, memberships_of, numbered, supersampling
+from tetopt.contents.memberships import (
+    Memberships,
+    finer,
+    memberships,
+    memberships_of,
+    numbered,
+    supersampling,
+)
 from tetopt.contents.noise import noise_level
 from tetopt.contents.statistics import Statistics
 from tetopt.errors import InputError
@@ -29,9 +37,12 @@ STEPS_PER_SIGMA = 256.0  # least number of integer steps in a contrast's standar
 WEIGHT_RANGE = 1e-3, 1e3  # the least and largest weight other than 0
 MOST_TENSION = 10.0  # voxels; details of twice this radius would vanish
 SMOOTH_INTERFACES = 0.3  # voxels, the default tension: details up to twice this radius vanish
-MARGIN_VOXELS = 4  # margin around a mask: the reach of surface smoothing and of cells on the surface
-WRONG_SIDE_VARIANCES = 4.0  # weight of a voxel on the wrong side of the region's surface, in variances
-ROW_SUM_LIMIT = 2.0**31  # sums of squares along a row stay below this limit, so that 32 bits hold them exactly
+# margin around a mask: the reach of surface smoothing and of cells on the surface
+MARGIN_VOXELS = 4
+# weight of a voxel on the wrong side of the region's surface, in variances
+WRONG_SIDE_VARIANCES = 4.0
+# sums of squares along a row stay below this limit, so that 32 bits hold them exactly
+ROW_SUM_LIMIT = 2.0**31
 
 
 class Continuation(NamedTuple):
@@ -39,7 +50,8 @@ class Continuation(NamedTuple):
 
     part: tuple[slice, ...]  # the voxels around the mask
     inside: NDArray[np.bool_]  # those that lie in it
-    nearest: NDArray[np.integer]  # (K,) flat index of the nearest voxel inside, for each one outside in C order
+    # (K,) flat index of the nearest voxel inside, for each one outside in C order
+    nearest: NDArray[np.integer]
 
 
 class Spread(NamedTuple):
@@ -67,10 +79,11 @@ class Content(NamedTuple):
     Parameters
     ----------
     image : Image
-        The voxels and the first contrast, restricted to the surroundings of the mask and divided if slices are thick.
+        The voxels and the first contrast, restricted to the surroundings of the mask and divided if
+        slices are thick.
     contrasts : (I, s_0, ..., s_{n-1}) array, optional
-        Values that should be constant in a cell, in one unit, as whole numbers: a channel for each contrast. By default
-        the image's intensities, which then are the only channel.
+        Values that should be constant in a cell, in one unit, as whole numbers: a channel for each
+        contrast. By default the image's intensities, which then are the only channel.
     rows : (s_0, ..., s_{n-1}) int, optional
         Number of each voxel's label.
     codes : (L, K) int32, optional
@@ -88,14 +101,16 @@ class Content(NamedTuple):
     statistics : Statistics, optional
         Statistics of the image, if a pass over its voxels has computed them.
     whole : Image, optional
-        The first contrast as given, if `image` is another: a part of it, with other values beyond the mask, or divided.
+        The first contrast as given, if `image` is another: a part of it, with other values beyond
+        the mask, or divided.
     repeats : tuple of int
         Number of voxels along each axis that repeat one of the image's file; empty if none does.
     is_flat : bool
-        Facets stay flat, so that nodes on a surface lie off it by what facets cut off. False for order 2: curved facets
-        cut nothing off, and their corners lie on the surface.
+        Facets stay flat, so that nodes on a surface lie off it by what facets cut off. False for
+        order 2: curved facets cut nothing off, and their corners lie on the surface.
     squared_spread : float, optional
-        The variance of several channels, or within a region, once it is known: a pass over all voxels of each channel.
+        The variance of several channels, or within a region, once it is known: a pass over all
+        voxels of each channel.
 
     Examples
     --------
@@ -128,13 +143,17 @@ class Content(NamedTuple):
 
     @property
     def own(self) -> Image:
-        """The first contrast on its own voxels, continued beyond the mask, around which alone voxels are kept."""
+        """The first contrast on its own voxels, continued beyond the mask, around which alone
+        voxels are kept.
+        """
         return continued(self.given, None if self.whole is None else self.continuation)
 
     @property
     def own_mask(self) -> Image | None:
         """The mask on the voxels of `own`, 0 and 1; None for the image's box."""
-        return None if self.continuation is None else Image(self.continuation.inside, self.own.affine)
+        return (
+            None if self.continuation is None else Image(self.continuation.inside, self.own.affine)
+        )
 
     @property
     def memberships(self) -> Memberships | None:
@@ -157,7 +176,8 @@ class Content(NamedTuple):
         return self.n_contrasts + (0 if self.codes is None else len(self.codes))
 
     def channel(self, number: int, part: tuple[slice, ...] = ()) -> NDArray:
-        """One channel, or a part of it; those of labels are computed, as each would take four bytes a voxel.
+        """One channel, or a part of it; those of labels are computed, as each would take four bytes
+        a voxel.
 
         Parameters
         ----------
@@ -201,14 +221,18 @@ class Content(NamedTuple):
 
     @property
     def variance(self) -> float:
-        """Variance of all channels over the voxels to cover, intensity^2; times `volume` it is E_D of a single cell."""
+        """Variance of all channels over the voxels to cover, intensity^2; times `volume` it is
+        E_D of a single cell.
+        """
         if self.statistics is not None and self.is_plain and self.region is None:
             return self.statistics.variance
         if self.is_plain and self.region is None:
             return self.image.variance
         if self.squared_spread is not None:
             return self.squared_spread
-        return self.unit * sum(_variance(self.channel(number), self.region) for number in range(self.n_channels))
+        return self.unit * sum(
+            _variance(self.channel(number), self.region) for number in range(self.n_channels)
+        )
 
     @property
     def spread(self) -> Spread:
@@ -219,11 +243,15 @@ class Content(NamedTuple):
             return Spread(self.given.mean, *self.given.range, self.given.variance)
         around = () if self.whole is None else self.continuation.part
         h = self.given.data[around][self.continuation.inside]
-        return Spread(float(h.mean(dtype=np.float64)), float(h.min()), float(h.max()), _variance(h, None))
+        return Spread(
+            float(h.mean(dtype=np.float64)), float(h.min()), float(h.max()), _variance(h, None)
+        )
 
     @property
     def wrong_side(self) -> float:
-        """Penalty of a voxel on the wrong side of the region's surface, in squared units of the channels."""
+        """Penalty of a voxel on the wrong side of the region's surface, in squared units of the
+        channels.
+        """
         return WRONG_SIDE_VARIANCES * (self.variance / self.unit or 1.0)
 
     @property
@@ -235,10 +263,16 @@ class Content(NamedTuple):
 
 
 def content(
-    images: Image | Sequence[Image], labels: Image | None = None, mask: Image | None = None, *,
-    weights: Sequence[float] | None = None, label_weight: float = 1.0, smooth_interfaces: float = SMOOTH_INTERFACES,
-    keep_components: bool = False, keep_volumes: bool = True,
-) -> Content:  # fmt: skip
+    images: Image | Sequence[Image],
+    labels: Image | None = None,
+    mask: Image | None = None,
+    *,
+    weights: Sequence[float] | None = None,
+    label_weight: float = 1.0,
+    smooth_interfaces: float = SMOOTH_INTERFACES,
+    keep_components: bool = False,
+    keep_volumes: bool = True,
+) -> Content:
     """Combine contrasts, labels and a mask for `mesh_image`, `octree_mesh` or `optimize`.
 
     Parameters
@@ -248,24 +282,26 @@ def content(
     labels : Image, optional
         Whole numbers from 0, on the same voxels.
     mask : Image, optional
-        0 to 1 on the same voxels: the mesh covers the region of values of 0.5 or more, and its boundary follows that
-        region's surface (`tetopt.contents.domain`). Outside, images and labels continue with the nearest value inside,
-        so that values beyond the surface are ignored.
+        0 to 1 on the same voxels: the mesh covers the region of values of 0.5 or more, and its
+        boundary follows that region's surface (`tetopt.contents.domain`). Outside, images and
+        labels continue with the nearest value inside, so that values beyond the surface are
+        ignored.
     weights : sequence of float, optional
-        Weight of each image, 0.001 to 1000, 1 by default; 0 ignores an image. With weight 1 its variance counts as
-        much as the first image's, whatever its scale.
+        Weight of each image, 0.001 to 1000, 1 by default; 0 ignores an image. With weight 1 its
+        variance counts as much as the first image's, whatever its scale.
     label_weight : float
         Weight of all labels together. Voxels of rare labels count more.
     smooth_interfaces : float
-        Surface tension of interfaces: the distance, in voxels, that an interface would move to reduce its area. Labels
-        are smooth between voxels (`tetopt.contents.memberships`), which are divided if slices are thick, and nodes
-        between labels lie on their interfaces. With 0 labels keep their stairs, and each cell gets the label of most
-        of its voxels.
+        Surface tension of interfaces: the distance, in voxels, that an interface would move to
+        reduce its area. Labels are smooth between voxels (`tetopt.contents.memberships`), which are
+        divided if slices are thick, and nodes between labels lie on their interfaces. With 0 labels
+        keep their stairs, and each cell gets the label of most of its voxels.
     keep_components : bool
-        Keep connected components of the mesh that the mask does not have. By default small ones are dropped.
+        Keep connected components of the mesh that the mask does not have. By default small ones are
+        dropped.
     keep_volumes : bool
-        Preserve the volume of labels that are thinner than cells by giving them cells that other labels fill more. If
-        False, they lose volume.
+        Preserve the volume of labels that are thinner than cells by giving them cells that other
+        labels fill more. If False, they lose volume.
 
     Returns
     -------
@@ -275,8 +311,8 @@ def content(
     Raises
     ------
     InputError
-        Images of different shapes, invalid weights, labels that are not whole numbers from 0, or only
-        images and labels of weight 0.
+        Images of different shapes, invalid weights, labels that are not whole numbers from 0, or
+        only images and labels of weight 0.
 
     See Also
     --------
@@ -307,9 +343,17 @@ def content(
             labels = images[0] if labels is whole else continued(labels, beyond)
     if labels is not None and labels.data.max() == BACKGROUND_LABEL:
         where = "" if mask is None else " in the meshed region"
-        raise InputError(f"labels: expected labels above 0{where}, got 0 in every voxel; is it the right file?")
+        raise InputError(
+            f"labels: expected labels above 0{where}, got 0 in every voxel; is it the right file?"
+        )
     if len(images) == 1 and labels is None and weights[0] > 0.0:
-        result = Content(images[0], region=region, continuation=beyond, keeps_components=keep_components, whole=whole)
+        result = Content(
+            images[0],
+            region=region,
+            continuation=beyond,
+            keeps_components=keep_components,
+            whole=whole,
+        )
         return result if region is None else result._replace(squared_spread=result.variance)
     members, n_rows = None, 0
     rows: NDArray[np.integer] = np.empty(0, dtype=np.int16)
@@ -328,39 +372,57 @@ def content(
         rows, codes = _one_hot(rows, n_rows, region)
         codes = np.sqrt(label_weight) * codes
     if len(contrasts) + len(codes) == 0:
-        raise InputError("weights: every image or label that varies has weight 0; give at least one a weight above 0")
+        raise InputError(
+            "weights: every image or label that varies has weight 0; give at least one a weight "
+            "above 0"
+        )
     values, whole_codes, scale = _whole_numbers(contrasts, images[0].shape, codes)
     unit = _variance(images[0].data, region) or 1.0
     result = Content(
-        images[0], values, rows if n_rows > 0 else None, whole_codes, unit / scale**2, region, beyond,
-        keeps_components=keep_components, whole=whole,
-    )  # fmt: skip
+        images[0],
+        values,
+        rows if n_rows > 0 else None,
+        whole_codes,
+        unit / scale**2,
+        region,
+        beyond,
+        keeps_components=keep_components,
+        whole=whole,
+    )
     result = result._replace(squared_spread=result.variance)
     if members is None:
         return result
     channel, value = len(contrasts) + codes.argmax(axis=0), whole_codes.max(axis=0)
     return result._replace(
-        smooth=SmoothLabels(members, smooth_interfaces, channel.astype(np.int64), value, keep_volumes)
+        smooth=SmoothLabels(
+            members, smooth_interfaces, channel.astype(np.int64), value, keep_volumes
+        )
     )
 
 
 def _finer_region(region: Region, factors: Sequence[int]) -> Region:
     """The region on divided voxels, with its surface interpolated between slices like labels."""
     if region.inside.all():
-        inside = np.ones([n * factor for n, factor in zip(region.inside.shape, factors, strict=True)], dtype=bool)
+        inside = np.ones(
+            [n * factor for n, factor in zip(region.inside.shape, factors, strict=True)], dtype=bool
+        )
         return Region(inside, np.full(inside.shape, region.level.min(), dtype=np.float32))
     sides = memberships(Image(region.inside), factors)
     outside, within = sides.levels[sides.channel]
     return Region(sides.partition == 1, (0.5 * (within - outside)).astype(np.float32))
 
 
-def _scaled(images: list[Image], weights: list[float], region: Region | None) -> list[NDArray[np.float32]]:
+def _scaled(
+    images: list[Image], weights: list[float], region: Region | None
+) -> list[NDArray[np.float32]]:
     """The contrasts of weight above 0, minus their means and scaled to variance `weight`."""
     scaled = []
     for image, weight in zip(images, weights, strict=True):
         if weight == 0.0:
             continue
-        data = image.data - np.mean(image.data if region is None else image.data[region.inside], dtype=np.float64)
+        data = image.data - np.mean(
+            image.data if region is None else image.data[region.inside], dtype=np.float64
+        )
         spread = _variance(data, region)
         if spread > 0.0:
             scaled.append((np.sqrt(weight / spread) * data).astype(np.float32))
@@ -370,15 +432,22 @@ def _scaled(images: list[Image], weights: list[float], region: Region | None) ->
 def _whole_numbers(
     contrasts: list[NDArray[np.float32]], shape: tuple[int, ...], codes: NDArray[np.float64]
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], float]:
-    """The contrasts, (I, *shape), and the values of labels, (L, K), as whole numbers, and their scale.
+    """The contrasts, (I, *shape), and the values of labels, (L, K), as whole numbers, and their
+    scale.
 
     If possible, their sums of squares along a row fit into 32 bits.
     """
-    square = sum(float(np.abs(data).max()) ** 2 for data in contrasts) + float((codes**2).max(initial=0.0))
-    fitting = float(np.sqrt(0.9 * ROW_SUM_LIMIT / (shape[-1] * (square or 1.0))))  # 0: a single label, alone
-    # If one voxel or a rare label is much larger than the rest, sums take 64 bits, to keep enough levels.
+    square = sum(float(np.abs(data).max()) ** 2 for data in contrasts) + float(
+        (codes**2).max(initial=0.0)
+    )
+    # 0: a single label, alone
+    fitting = float(np.sqrt(0.9 * ROW_SUM_LIMIT / (shape[-1] * (square or 1.0))))
+    # If one voxel or a rare label is much larger than the rest, sums take 64 bits, to keep enough
+    # levels.
     steps = [STEPS_PER_SIGMA / float(np.std(data, dtype=np.float64)) for data in contrasts]
-    largest = max([float(np.abs(data).max()) for data in contrasts] + [float(codes.max(initial=0.0))])
+    largest = max(
+        [float(np.abs(data).max()) for data in contrasts] + [float(codes.max(initial=0.0))]
+    )
     scale = min(max([fitting, *steps]), 2.0**30 / (largest or 1.0))
     values = np.empty((len(contrasts), *shape), dtype=np.int32)
     for row, data in zip(values, contrasts, strict=True):
@@ -397,7 +466,9 @@ def plain(image: Image | Content) -> Content:
 
 
 def own_image(image: Image | Content) -> Image:
-    """Return the first contrast of a content on its own voxels, see `Content.own`; an image is returned unchanged."""
+    """Return the first contrast of a content on its own voxels, see `Content.own`; an image is
+    returned unchanged.
+    """
     return image.own if isinstance(image, Content) else image
 
 
@@ -407,7 +478,8 @@ def _variance(values: NDArray, region: Region | None) -> float:
 
 
 def continuation(mask: Image, spacing: NDArray[np.float64]) -> Continuation:
-    """The voxels around a mask, with a margin, and their nearest voxels inside, for voxel edges (n,) in mm.
+    """The voxels around a mask, with a margin, and their nearest voxels inside, for voxel edges
+    (n,) in mm.
 
     Voxels farther away would only take time. Images on the same voxels share one continuation.
 
@@ -421,17 +493,22 @@ def continuation(mask: Image, spacing: NDArray[np.float64]) -> Continuation:
         raise InputError("mask: expected voxels of 0.5 or more, got none")
     box = scipy.ndimage.find_objects(inside.astype(np.int8))[0]
     ends = ((max(s.start - MARGIN_VOXELS, 0), s.stop + MARGIN_VOXELS) for s in box)
-    part = tuple(slice(first, min(stop, n)) for (first, stop), n in zip(ends, mask.shape, strict=True))
+    part = tuple(
+        slice(first, min(stop, n)) for (first, stop), n in zip(ends, mask.shape, strict=True)
+    )
     inside = inside[part]
     if inside.all():
         return Continuation(part, inside, np.empty(0, dtype=np.int64))
-    nearest = scipy.ndimage.distance_transform_edt(~inside, spacing, return_distances=False, return_indices=True)
+    nearest = scipy.ndimage.distance_transform_edt(
+        ~inside, spacing, return_distances=False, return_indices=True
+    )
     flat = np.ravel_multi_index(tuple(nearest[:, ~inside]), inside.shape)
     return Continuation(part, inside, flat.astype(np.int32 if inside.size < 2**31 else np.int64))
 
 
 def continued(image: Image, mask: Image | Continuation | None) -> Image:
-    """Continue an image beyond a mask with the nearest value inside, as cells at the boundary represent the inside.
+    """Continue an image beyond a mask with the nearest value inside, as cells at the boundary
+    represent the inside.
 
     Only the voxels around the mask are kept. Without a mask the image is returned unchanged.
     """
@@ -449,16 +526,22 @@ def _part(image: Image, part: tuple[slice, ...]) -> Image:
     return image.box([s.start for s in part], [s.stop for s in part])
 
 
-def check_weights(n_images: int, weights: list[float], label_weight: float, smooth_interfaces: float) -> None:
-    """Raise InputError for invalid weights of images and labels, or an invalid tension of interfaces."""
+def check_weights(
+    n_images: int, weights: list[float], label_weight: float, smooth_interfaces: float
+) -> None:
+    """Raise InputError for invalid weights of images and labels, or an invalid tension of
+    interfaces.
+    """
     low, high = WEIGHT_RANGE
     if len(weights) != n_images or not all(w == 0.0 or low <= w <= high for w in weights):
         raise InputError(
-            f"weights: expected one for each of {n_images} images, 0 or {low:g} to {high:g}, got {weights}"
+            f"weights: expected one for each of {n_images} images, 0 or {low:g} to {high:g}, got "
+            f"{weights}"
         )
     if not 0.0 <= smooth_interfaces <= MOST_TENSION:
         raise InputError(
-            f"smooth_interfaces: expected 0 to {MOST_TENSION:g} voxels, got {smooth_interfaces:g}; 0.3 is usual"
+            f"smooth_interfaces: expected 0 to {MOST_TENSION:g} voxels, got "
+            f"{smooth_interfaces:g}; 0.3 is usual"
         )
     if not (label_weight == 0.0 or low <= label_weight <= high):
         raise InputError(f"label_weight: expected 0 or {low:g} to {high:g}, got {label_weight}")
@@ -474,33 +557,50 @@ def _check(
     if not images:
         raise InputError("images: expected one or more, got none")
     first = images[0]
-    named = [*(("images", image) for image in images), *((name, image) for name, image in others.items() if image)]
+    named = [
+        *(("images", image) for image in images),
+        *((name, image) for name, image in others.items() if image),
+    ]
     for name, image in named:
         if image.shape != first.shape:
             raise InputError(
-                f"{name}: expected shape {first.shape} like the first, got {image.shape}; see tetopt.resample_mask"
+                f"{name}: expected shape {first.shape} like the first, got {image.shape}; see "
+                "tetopt.resample_mask"
             )
         last = np.array(first.shape) - 1
-        if np.abs(first.to_index(image.to_world([0 * last, last])) - [0 * last, last]).max() > SAME_PLACE_VOXELS:
-            raise InputError(f"{name}: expected the same voxel grid as the first image's; see tetopt.resample_mask")
+        if (
+            np.abs(first.to_index(image.to_world([0 * last, last])) - [0 * last, last]).max()
+            > SAME_PLACE_VOXELS
+        ):
+            raise InputError(
+                f"{name}: expected the same voxel grid as the first image's; see "
+                "tetopt.resample_mask"
+            )
     mask = others.get("mask")
     if mask is not None and not 0.0 <= mask.range[0] <= mask.range[1] <= 1.0:
         low, high = mask.range
-        raise InputError(f"mask: expected values from 0 to 1, got {low:g} to {high:g}; threshold or rescale it first")
+        raise InputError(
+            f"mask: expected values from 0 to 1, got {low:g} to {high:g}; threshold or rescale "
+            "it first"
+        )
     check_weights(len(images), weights, label_weight, smooth_interfaces)
 
 
 def _one_hot(
     rows: NDArray[np.integer], n_rows: int, region: Region | None
-) -> tuple[NDArray[np.integer], NDArray[np.float64]]:  # fmt: skip
-    """Channels that distinguish K labels: each voxel's label, and the labels' values in C channels, (C, K).
+) -> tuple[NDArray[np.integer], NDArray[np.float64]]:
+    """Channels that distinguish K labels: each voxel's label, and the labels' values in C channels,
+    (C, K).
 
-    `rows` are numbers of the voxels' labels, below `n_rows`, of which K lie in the region. Each label has its value in
-    one channel and 0 in the others. Labels that are nowhere near one another share a channel. The weight of a label's
-    voxels is its fraction of the voxels to the power -`RARITY_POWER`, so that small labels are not sacrificed for the
-    surfaces of large ones; the total variance is 1 (0 for one label).
+    `rows` are numbers of the voxels' labels, below `n_rows`, of which K lie in the region. Each
+    label has its value in one channel and 0 in the others. Labels that are nowhere near one another
+    share a channel. The weight of a label's voxels is its fraction of the voxels to the power
+    -`RARITY_POWER`, so that small labels are not sacrificed for the surfaces of large ones; the
+    total variance is 1 (0 for one label).
     """
-    counts = np.bincount((rows if region is None else rows[region.inside]).ravel(), minlength=n_rows)
+    counts = np.bincount(
+        (rows if region is None else rows[region.inside]).ravel(), minlength=n_rows
+    )
     present = np.flatnonzero(counts)
     if len(present) < n_rows:
         index = np.zeros(n_rows, dtype=rows.dtype)  # 0 beyond the region

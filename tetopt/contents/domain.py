@@ -1,8 +1,10 @@
-"""The part of an image's box that a mesh covers: a mask's region, with a surface that is smooth between voxels.
+"""The part of an image's box that a mesh covers: a mask's region, with a surface that is smooth
+between voxels.
 
-The surface is the zero level of a function at the voxel centres: the signed distance to the mask's surface in voxels,
-negative inside. Smoothing turns stairs of voxels into planes and curves, preserves volumes, and leaves each voxel's
-centre on its side. Between voxel centres the function is linear along each axis.
+The surface is the zero level of a function at the voxel centres: the signed distance to the mask's
+surface in voxels, negative inside. Smoothing turns stairs of voxels into planes and curves,
+preserves volumes, and leaves each voxel's centre on its side. Between voxel centres the function is
+linear along each axis.
 """
 
 from __future__ import annotations
@@ -29,22 +31,29 @@ class Region(NamedTuple):
     """The part of an image's box that a mask covers; made by `region_of`."""
 
     inside: NDArray[np.bool_]  # voxels whose centres lie in the mask
-    level: NDArray[np.float32]  # at voxel centres: distance to the surface in voxels, below 0 inside
+    # at voxel centres: distance to the surface in voxels, below 0 inside
+    level: NDArray[np.float32]
 
 
 def region_of(mask: Image) -> Region:
     """The region where a mask of values 0 to 1 is 0.5 or more.
 
-    A mask of two values has the smooth surface of a label (`tetopt.contents.smoothing.smooth_level`), except where
-    it, or a gap in it, is one voxel thick. A mask of fractions defines its surface between the voxels and keeps it.
-    Where the surface is far, the level counts voxels along the axis on which it is farthest.
+    A mask of two values has the smooth surface of a label
+    (`tetopt.contents.smoothing.smooth_level`), except where it, or a gap in it, is one voxel thick.
+    A mask of fractions defines its surface between the voxels and keeps it. Where the surface is
+    far, the level counts voxels along the axis on which it is farthest.
     """
     data, inside = mask.data, mask.data >= INSIDE_FRACTION
     if inside.all():
         return Region(inside, np.full(inside.shape, -float(max(inside.shape)), dtype=np.float32))
     if np.any((data > 0.0) & (data < 1.0)):
         level = raw_level(inside)
-        np.copyto(level, np.clip(0.5 - data.astype(np.float64), -0.5, 0.5), "same_kind", where=np.abs(level) < 1.0)
+        np.copyto(
+            level,
+            np.clip(0.5 - data.astype(np.float64), -0.5, 0.5),
+            "same_kind",
+            where=np.abs(level) < 1.0,
+        )
     else:
         level = _smoothed(inside)
     np.clip(level, -FARTHEST_LEVEL, FARTHEST_LEVEL, out=level)
@@ -54,7 +63,9 @@ def region_of(mask: Image) -> Region:
 
 
 def _smoothed(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """The smooth level of a mask, but the raw one around sheets and gaps of one voxel, which smoothing would tear."""
+    """The smooth level of a mask, but the raw one around sheets and gaps of one voxel, which
+    smoothing would tear.
+    """
     wide = np.pad(inside, BEYOND_VOXELS, "edge")
     level = smooth_level(wide, wide, None, (1,))
     is_single = np.zeros(wide.shape, dtype=bool)
@@ -65,7 +76,9 @@ def _smoothed(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
 
 
 def _opened(inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Voxels in cubes of two voxels a side that are inside: a tenth of the time of `scipy.ndimage.binary_opening`."""
+    """Voxels in cubes of two voxels a side that are inside: a tenth of the time of
+    `scipy.ndimage.binary_opening`.
+    """
     whole = inside
     for axis in range(inside.ndim):
         rows = np.moveaxis(whole, axis, 0)
@@ -81,11 +94,15 @@ def _opened(inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def levels(level: NDArray, index: NDArray[np.float64]) -> NDArray[np.float64]:
     """The level function at index coordinates (K, n), (K,)."""
-    return np.asarray(scipy.ndimage.map_coordinates(level, index.T, order=1, mode="nearest", output=np.float64))
+    return np.asarray(
+        scipy.ndimage.map_coordinates(level, index.T, order=1, mode="nearest", output=np.float64)
+    )
 
 
 def mask_text(mask: Image) -> dict[str, Any]:
-    """Return the voxels of 0.5 or more for the header of a mesh's file, in the box around them; `mask_of` reads it."""
+    """Return the voxels of 0.5 or more for the header of a mesh's file, in the box around them;
+    `mask_of` reads it.
+    """
     inside = mask.data >= INSIDE_FRACTION
     around = scipy.ndimage.find_objects(inside.astype(np.int8))[0]
     part = mask.box([s.start for s in around], [s.stop for s in around])

@@ -14,34 +14,76 @@ from tetopt.errors import InputError, warn
 from tetopt.image import Image, transformed
 from tetopt.system.kernel_cache import njit
 
-LARGEST_LABEL = 2**31 - 1  # largest signed 32-bit integer, the widest type of labels in most programs
-ROUNDING_DISTANCE = 1e-3  # by which values may differ from whole numbers: interpolated or scaled headers leave less
-# A grey image is recognised by pairs of neighbouring voxels, both not 0: few are equal, or, in one rounded to few
-# values, most others differ by one value. Measured on 27 volumes: of 10 label images 0.87 to 1 of the pairs are equal;
-# of 17 grey ones 0.15 or less, and rounded to 32 to 255 values 0.66 or less, then with 0.53 or more by one value.
+# largest signed 32-bit integer, the widest type of labels in most programs
+LARGEST_LABEL = 2**31 - 1
+# by which values may differ from whole numbers: interpolated or scaled headers leave less
+ROUNDING_DISTANCE = 1e-3
+# A grey image is recognised by pairs of neighbouring voxels, both not 0: few are equal, or, in one
+# rounded to few values, most others differ by one value. Measured on 27 volumes: of 10 label images
+# 0.87 to 1 of the pairs are equal; of 17 grey ones 0.15 or less, and rounded to 32 to 255 values
+# 0.66 or less, then with 0.53 or more by one value.
 LEAST_JUDGED_PAIRS = 2000  # fewer are by chance
 MOST_FEW_VALUES = 16  # a segmentation by thresholds has no more
 LEAST_EQUAL, LEAST_EQUAL_OF_RAMPS = 0.35, 0.75  # fractions of the pairs
 MOST_BY_ONE_VALUE = 0.4  # fraction of the pairs that are not equal
 APART_VOXELS = 4  # labels at least this far from one another may share a channel
 
-# Okabe and Ito's, then always the colour farthest in CIELAB from all before, and twice as far from the background,
-# black and white, as seen with normal, no red or no green cones (Machado et al. 2009): any two are 10 or more apart, of
-# the first 20 any two 14, and all are 20 from the background.
+# Okabe and Ito's, then always the colour farthest in CIELAB from all before, and twice as far from
+# the background, black and white, as seen with normal, no red or no green cones (Machado et al.
+# 2009): any two are 10 or more apart, of the first 20 any two 14, and all are 20 from the
+# background.
 LABEL_PALETTE = (
-    "#0072b2", "#e69f00", "#009e73", "#d55e00", "#56b4e9", "#cc79a7", "#f0e442", "#0000ff", "#6969ff", "#5a00b4",
-    "#963c1e", "#87d269", "#781e78", "#7896ff", "#f02d5a", "#a51e69", "#d200b4", "#004bff", "#b40f4b", "#f07887",
-    "#e15a3c", "#690f96", "#3cf096", "#f0964b", "#1e4b2d", "#2d6978", "#c32d00", "#a52dd2", "#3c00d2", "#e178d2",
-    "#f0d25a", "#a569d2", "#78b496", "#d2a5d2", "#870f2d", "#d2a578", "#965a3c", "#78d2f0", "#a569a5", "#d21e87",
-)  # fmt: skip
-LABEL_TINTS = (0.0, -0.4, 0.4)  # variants of the palette as it repeats: unchanged, mixed with black, mixed with white
+    "#0072b2",
+    "#e69f00",
+    "#009e73",
+    "#d55e00",
+    "#56b4e9",
+    "#cc79a7",
+    "#f0e442",
+    "#0000ff",
+    "#6969ff",
+    "#5a00b4",
+    "#963c1e",
+    "#87d269",
+    "#781e78",
+    "#7896ff",
+    "#f02d5a",
+    "#a51e69",
+    "#d200b4",
+    "#004bff",
+    "#b40f4b",
+    "#f07887",
+    "#e15a3c",
+    "#690f96",
+    "#3cf096",
+    "#f0964b",
+    "#1e4b2d",
+    "#2d6978",
+    "#c32d00",
+    "#a52dd2",
+    "#3c00d2",
+    "#e178d2",
+    "#f0d25a",
+    "#a569d2",
+    "#78b496",
+    "#d2a5d2",
+    "#870f2d",
+    "#d2a578",
+    "#965a3c",
+    "#78d2f0",
+    "#a569a5",
+    "#d21e87",
+)
+# variants of the palette as it repeats: unchanged, mixed with black, mixed with white
+LABEL_TINTS = (0.0, -0.4, 0.4)
 ABSENT_LISTED = 5  # labels without a voxel in an image or mask
 BACKGROUND_LABEL = 0  # the label outside all tissues
 BACKGROUND_COLOUR = "#e6e6e6"  # of that label
 
 
 def checked_labels(name: str, labels: Image, *, is_map: bool = False) -> Image:
-    """Return labels as whole numbers from 0 to `LARGEST_LABEL`; round values within 1e-3 of these, with a warning.
+    """Return labels as whole numbers from 0 to `LARGEST_LABEL`; round values within 1e-3 of these,
+    with a warning.
 
     Raises
     ------
@@ -51,12 +93,18 @@ def checked_labels(name: str, labels: Image, *, is_map: bool = False) -> Image:
     data = labels.data
     whole = np.rint(data)
     is_off = whole != data
-    if is_off.any() or data.min() < 0.0 or data.max() >= LARGEST_LABEL + 1:  # in 32 bits, not exact without 1
-        wrong = np.argwhere((whole < 0.0) | (whole >= LARGEST_LABEL + 1) | (np.abs(data - whole) > ROUNDING_DISTANCE))
+    # in 32 bits, not exact without 1
+    if is_off.any() or data.min() < 0.0 or data.max() >= LARGEST_LABEL + 1:
+        wrong = np.argwhere(
+            (whole < 0.0)
+            | (whole >= LARGEST_LABEL + 1)
+            | (np.abs(data - whole) > ROUNDING_DISTANCE)
+        )
         if len(wrong):
             first = tuple(int(i) for i in wrong[0])
             raise InputError(
-                f"{name}: labels must be whole numbers from 0 to {LARGEST_LABEL}; {len(wrong)} voxels have other "
+                f"{name}: labels must be whole numbers from 0 to {LARGEST_LABEL}; {len(wrong)} "
+                "voxels have other "
                 f"values, the first {data[first]:.10g} at {first}: is it a label image?"
             )
         warn(
@@ -65,12 +113,16 @@ def checked_labels(name: str, labels: Image, *, is_map: bool = False) -> Image:
         )
         labels = Image(whole + 0.0, labels.affine)  # no -0
     if is_map and (words := _grey_words(labels.data)):
-        raise InputError(f"{name}: expected a label image, got {words}, as in a grey image: is it a label image?")
+        raise InputError(
+            f"{name}: expected a label image, got {words}, as in a grey image: is it a label image?"
+        )
     return labels
 
 
 def is_label_map(image: Image) -> bool:
-    """Return whether an image's values are labels: whole numbers from 0, and not those of a grey image."""
+    """Return whether an image's values are labels: whole numbers from 0, and not those of a grey
+    image.
+    """
     return image.is_whole and image.range[0] >= 0.0 and not _grey_words(image.data)
 
 
@@ -86,10 +138,16 @@ def _grey_words(data: NDArray[np.floating]) -> str:
         return ""
     values, place = np.unique(data, return_inverse=True)
     ranks = np.where(data == 0.0, -2, place.reshape(data.shape))  # 0 is next to no other value
-    n_by_one = sum(np.count_nonzero(np.abs(np.subtract(*_neighbours(ranks, axis))) == 1) for axis in range(data.ndim))
+    n_by_one = sum(
+        np.count_nonzero(np.abs(np.subtract(*_neighbours(ranks, axis))) == 1)
+        for axis in range(data.ndim)
+    )
     is_ramp = n_by_one > MOST_BY_ONE_VALUE * (n_pairs - n_equal)
     if len(values) > MOST_FEW_VALUES and (n_equal < LEAST_EQUAL * n_pairs or is_ramp):
-        return f"{len(values)} values, of which only {n_equal / n_pairs:.0%} of neighbouring voxels share one"
+        return (
+            f"{len(values)} values, of which only {n_equal / n_pairs:.0%} of neighbouring "
+            "voxels share one"
+        )
     return ""
 
 
@@ -100,13 +158,20 @@ def _neighbours(data: NDArray, axis: int) -> tuple[NDArray, NDArray]:
 
 
 def warn_of_absent(name: str, labels: Image, is_kept: NDArray[np.bool_], where: str) -> None:
-    """Warn of labels above 0 none of whose voxels is kept, as it lies in the image or mask; the largest first."""
-    gone, counts = np.unique(labels.data[~is_kept & (labels.data > BACKGROUND_LABEL)], return_counts=True)
-    is_absent = ~np.isin(gone, np.unique(labels.data[is_kept])) if len(gone) else np.zeros(0, dtype=bool)
+    """Warn of labels above 0 none of whose voxels is kept, as it lies in the image or mask; the
+    largest first.
+    """
+    gone, counts = np.unique(
+        labels.data[~is_kept & (labels.data > BACKGROUND_LABEL)], return_counts=True
+    )
+    is_absent = (
+        ~np.isin(gone, np.unique(labels.data[is_kept])) if len(gone) else np.zeros(0, dtype=bool)
+    )
     if is_absent.any():
         rows = sorted(zip((-counts[is_absent]).tolist(), gone[is_absent].tolist(), strict=True))
         words = ", ".join(
-            f"{label:.10g} ({-voxels} voxel{'s' * (voxels < -1)})" for voxels, label in rows[:ABSENT_LISTED]
+            f"{label:.10g} ({-voxels} voxel{'s' * (voxels < -1)})"
+            for voxels, label in rows[:ABSENT_LISTED]
         )
         more = f" and {len(rows) - ABSENT_LISTED} more" * (len(rows) > ABSENT_LISTED)
         warn(f"{name}labels without a voxel in the {where}: {words}{more}")
@@ -133,9 +198,13 @@ class LostComponent(NamedTuple):
 
 
 def voxel_components(
-    inside: NDArray[np.bool_], is_met: NDArray[np.bool_], affine: NDArray[np.float64], box: Sequence[slice] = ()
+    inside: NDArray[np.bool_],
+    is_met: NDArray[np.bool_],
+    affine: NDArray[np.float64],
+    box: Sequence[slice] = (),
 ) -> tuple[int, tuple[LostComponent, ...]]:
-    """Number of face-connected components of voxels, and those without one that `is_met`, the largest first.
+    """Number of face-connected components of voxels, and those without one that `is_met`, the
+    largest first.
 
     The voxels are in a `box` of the grid with this affine, by default at its corner.
     """
@@ -144,7 +213,9 @@ def voxel_components(
     start, length = [side.start for side in box] or 0, end - begin
     of_voxel = np.repeat(np.unique(component, return_inverse=True)[1], length)
     along = np.repeat(begin - np.cumsum(length) + length, length) + np.arange(len(of_voxel))
-    index = np.column_stack(np.unravel_index(np.repeat(row, length) * inside.shape[-1] + along, inside.shape))
+    index = np.column_stack(
+        np.unravel_index(np.repeat(row, length) * inside.shape[-1] + along, inside.shape)
+    )
     sizes = np.bincount(of_voxel)
     sums = np.column_stack([np.bincount(of_voxel, column) for column in index.T])
     middle = sums / sizes[:, None]
@@ -158,19 +229,24 @@ def voxel_components(
 def component_runs(
     inside: NDArray[np.bool_], is_met: NDArray[np.bool_], *, has_corners: bool = False
 ) -> tuple[int, NDArray[np.int64]]:
-    """Number of components of voxels that faces connect, or corners, too, and the runs of those of which none is met.
+    """Number of components of voxels that faces connect, or corners, too, and the runs of those of
+    which none is met.
 
-    A run (L, 4) of voxels along the last axis has the number of its component, the number of its row, the first column,
-    and the one after its last.
+    A run (L, 4) of voxels along the last axis has the number of its component, the number of its
+    row, the first column, and the one after its last.
     """
     whole = (1,) * (3 - inside.ndim) + inside.shape
-    n_components, lost = _component_runs(inside.reshape(whole), is_met.reshape(whole), int(has_corners))
+    n_components, lost = _component_runs(
+        inside.reshape(whole), is_met.reshape(whole), int(has_corners)
+    )
     return int(n_components), lost
 
 
 @njit(cache=True, nogil=True)
 def _component_runs(inside: NDArray, is_met: NDArray, reach: int) -> tuple[int, NDArray]:
-    """`component_runs`: each run joins the runs of earlier rows that it touches, within `reach` columns."""
+    """`component_runs`: each run joins the runs of earlier rows that it touches, within `reach`
+    columns.
+    """
     n_planes, n_rows, n_columns = inside.shape
     first, n_runs = np.zeros(n_planes * n_rows + 1, dtype=np.int64), 0
     for at in range(n_planes * n_rows):
@@ -179,14 +255,19 @@ def _component_runs(inside: NDArray, is_met: NDArray, reach: int) -> tuple[int, 
             n_runs += own[k] and not was
             was = own[k]
         first[at + 1] = n_runs
-    runs, root = np.empty((n_runs, 4), dtype=np.int64), np.arange(n_runs)  # the run's root is in the first column later
+    # the run's root is in the first column later
+    runs, root = np.empty((n_runs, 4), dtype=np.int64), np.arange(n_runs)
     has_met, number = np.zeros(n_runs, dtype=np.bool_), -1
     for at in range(n_planes * n_rows):
         i, j, was = at // n_rows, at % n_rows, False
         for k in range(n_columns):
             if inside[i, j, k]:
                 number += not was
-                runs[number, 1], runs[number, 2], runs[number, 3] = at, runs[number, 2] if was else k, k + 1
+                runs[number, 1], runs[number, 2], runs[number, 3] = (
+                    at,
+                    runs[number, 2] if was else k,
+                    k + 1,
+                )
                 has_met[number] |= is_met[i, j, k]
             was = inside[i, j, k]
         for a, b in ((i, j - 1), (i - 1, j - 1), (i - 1, j), (i - 1, j + 1)):
@@ -217,10 +298,16 @@ def _root(root: NDArray, run: int) -> int:
 
 
 def label_channels(number: NDArray[np.integer], n_labels: int) -> NDArray[np.int64]:
-    """A channel for each label: labels within `APART_VOXELS` voxels of one another have different ones."""
+    """A channel for each label: labels within `APART_VOXELS` voxels of one another have
+    different ones.
+    """
     shape = tuple(-(-s // APART_VOXELS) for s in number.shape)
-    is_in, block = np.zeros((n_labels, int(np.prod(shape))), dtype=bool), np.arange(np.prod(shape)).reshape(shape)
-    for place in itertools.product(range(APART_VOXELS), repeat=number.ndim):  # the voxels of all blocks in turn
+    is_in, block = (
+        np.zeros((n_labels, int(np.prod(shape))), dtype=bool),
+        np.arange(np.prod(shape)).reshape(shape),
+    )
+    # the voxels of all blocks in turn
+    for place in itertools.product(range(APART_VOXELS), repeat=number.ndim):
         part = number[tuple(slice(first, None, APART_VOXELS) for first in place)]
         is_in[part, block[tuple(slice(n) for n in part.shape)]] = True
     is_beside = np.stack([largest_around(row.reshape(shape), 1).ravel() for row in is_in])
@@ -246,8 +333,8 @@ def hex_colour(text: Any) -> tuple[float, float, float] | None:
 def colours_by_number(labels: NDArray[np.int64]) -> NDArray[np.float64]:
     """Default colours (K, 3) of labels from 0: red, green and blue, 0 to 1; label 0 is light grey.
 
-    They depend only on the number, so that a label has the same colour in every picture and file. Any two of as many
-    successive labels as three palettes have different colours.
+    They depend only on the number, so that a label has the same colour in every picture and file.
+    Any two of as many successive labels as three palettes have different colours.
     """
     palette = np.array([hex_colour(text) for text in LABEL_PALETTE])
     rounds, place = np.divmod(labels - 1, len(palette))

@@ -1,8 +1,10 @@
-"""Labels between voxels: a smooth level for each label; each place has the label with the smallest level.
+"""Labels between voxels: a smooth level for each label; each place has the label with the smallest
+level.
 
-A label's level is the signed distance to its surface, in voxels, negative inside, so that the interface between
-labels a and b is where their levels are equal. Since each place has the label of the smallest level, labels neither
-overlap nor leave gaps, even where three of them meet. Between voxel centres a level is linear along each axis.
+A label's level is the signed distance to its surface, in voxels, negative inside, so that the
+interface between labels a and b is where their levels are equal. Since each place has the label of
+the smallest level, labels neither overlap nor leave gaps, even where three of them meet. Between
+voxel centres a level is linear along each axis.
 """
 
 from __future__ import annotations
@@ -18,20 +20,30 @@ import scipy
 from numpy.typing import NDArray
 
 from tetopt.contents.labels import checked_labels, label_channels
-from tetopt.contents.smoothing import FARTHEST_DISTANCE, FARTHEST_LEVEL, NEAR_SURFACE, largest_around, smooth_level
+from tetopt.contents.smoothing import (
+    FARTHEST_DISTANCE,
+    FARTHEST_LEVEL,
+    NEAR_SURFACE,
+    largest_around,
+    smooth_level,
+)
 from tetopt.image import Image
 from tetopt.system.budget import check_memory
 from tetopt.system.kernel_cache import njit
 from tetopt.system.slabs import over_slabs
 
-PARTITION_BYTES = 40.0  # per voxel, in addition to levels: its label, the nearest label, and temporaries
+# per voxel, in addition to levels: its label, the nearest label, and temporaries
+PARTITION_BYTES = 40.0
 NO_ROOM = "crop the image, or set `smooth_interfaces` to 0"  # remedy in messages on memory
 LARGE_BOX = 1 << 20  # voxels of a label's box from which its level is computed on all threads
 AGREEMENT_ROUNDS = 8  # with none, ribs of a CT have .77 to .86 of their volume
 AGREEMENT_FRACTION = 0.02  # of a label's volume, whose lack or excess between labels is corrected
-AGREEMENT_STEP = 0.6  # of the missing depth: levels of thin labels are flat, so that a whole step goes too far
-AGREEMENT_REACH = 2  # voxels from a label within which its level is corrected, half of `APART_VOXELS` at most
-AGREEMENT_VOXELS, PLACES_PER_VOXEL = 20_000, 8  # of those near a label, about as many are sampled, at so many places
+# of the missing depth: levels of thin labels are flat, so that a whole step goes too far
+AGREEMENT_STEP = 0.6
+# voxels from a label within which its level is corrected, half of `APART_VOXELS` at most
+AGREEMENT_REACH = 2
+# of those near a label, about as many are sampled, at so many places
+AGREEMENT_VOXELS, PLACES_PER_VOXEL = 20_000, 8
 PLASTIC_RATIO = 1.2207440846057596  # root of x^4 = x + 1, of Roberts' sequence in three dimensions
 ABSENT_DISTANCE = 1e4  # voxels to a label that is absent from a slice
 
@@ -40,7 +52,8 @@ class Memberships(NamedTuple):
     """Levels of labels on a grid of voxel centres; made by `memberships`."""
 
     labels: NDArray[np.int64]  # (K,) labels present, ascending
-    channel: NDArray[np.int64]  # (K,) row of `levels` for each label; labels nowhere near one another share one
+    # (K,) row of `levels` for each label; labels nowhere near one another share one
+    channel: NDArray[np.int64]
     levels: NDArray[np.float32]  # (C, *shape) distance to the surface, voxels, below 0 inside
     partition: NDArray[np.integer]  # (*shape) row of `labels` with the smallest level at each voxel
     parts: int = 1  # voxels of this grid per voxel of the labels
@@ -49,7 +62,8 @@ class Memberships(NamedTuple):
 def supersampling(spacing: NDArray[np.float64]) -> tuple[int, ...]:
     """Number of parts along each axis that divide a voxel with edges (n,), mm, nearly into cubes.
 
-    Odd numbers, so that a slice's plane goes through voxels' centres: 1, 3, 5, ..., whichever is nearest in ratio.
+    Odd numbers, so that a slice's plane goes through voxels' centres: 1, 3, 5, ..., whichever is
+    nearest in ratio.
     """
     ratio = np.asarray(spacing) / np.min(spacing)
     odd = np.arange(1, ratio.max() + 4.0, 2.0)
@@ -59,14 +73,17 @@ def supersampling(spacing: NDArray[np.float64]) -> tuple[int, ...]:
 def finer(image: Image, factors: Sequence[int]) -> Image:
     """The image on voxels divided by `factors` along the axes; its box stays the same.
 
-    Between the centres of two voxels intensities are linear; beyond the outermost they are constant.
+    Between the centres of two voxels intensities are linear; beyond the outermost they are
+    constant.
     """
     data = _spread(image.data.astype(np.float64), factors)
     return Image(data.astype(image.data.dtype), finer_affine(image.affine, factors))
 
 
 def finer_index(n: int, factor: int) -> NDArray[np.float64]:
-    """Centres of `n` voxels divided into `factor` each, in index coordinates of the whole voxels, (n * factor,)."""
+    """Centres of `n` voxels divided into `factor` each, in index coordinates of the whole
+    voxels, (n * factor,).
+    """
     return (np.arange(n * factor) + 0.5) / factor - 0.5
 
 
@@ -81,9 +98,10 @@ def finer_affine(affine: NDArray[np.float64], factors: Sequence[int]) -> NDArray
 def memberships(labels: Image, factors: Sequence[int] | None = None) -> Memberships:
     """Signed distance to the smooth surface of each label, on the labels' voxels or finer ones.
 
-    Every voxel's centre keeps its label: on a slice's plane the surface stays between the same two voxel centres.
-    Between divided slices it is interpolated by shape (Raya and Udupa 1990, IEEE Trans. Med. Imaging 9, 32), and
-    smoothing may move it by one more fine voxel for each fine voxel of distance from the plane.
+    Every voxel's centre keeps its label: on a slice's plane the surface stays between the same two
+    voxel centres. Between divided slices it is interpolated by shape (Raya and Udupa 1990, IEEE
+    Trans. Med. Imaging 9, 32), and smoothing may move it by one more fine voxel for each fine voxel
+    of distance from the plane.
 
     Parameters
     ----------
@@ -97,24 +115,33 @@ def memberships(labels: Image, factors: Sequence[int] | None = None) -> Membersh
     InputError
         Labels that are not whole numbers from 0.
     """
-    return memberships_of(*numbered(checked_labels("labels", labels)), tuple(factors or (1,) * labels.ndim))
+    return memberships_of(
+        *numbered(checked_labels("labels", labels)), tuple(factors or (1,) * labels.ndim)
+    )
 
 
 def numbered(labels: Image) -> tuple[NDArray[np.int64], NDArray[np.integer]]:
-    """Labels present, (K,), ascending, and the number of each voxel's among them; 16 bits if (K+1)^2 fits."""
+    """Labels present, (K,), ascending, and the number of each voxel's among them; 16 bits if
+    (K+1)^2 fits.
+    """
     values = np.unique(labels.data)
     rows = np.empty(labels.shape, dtype=np.int16 if (len(values) + 1) ** 2 <= 1 << 15 else np.int32)
 
-    def fill(first: int, stop: int) -> None:  # with `return_inverse`, voxels are sorted, in 12 times the time
+    # with `return_inverse`, voxels are sorted, in 12 times the time
+    def fill(first: int, stop: int) -> None:
         rows[first:stop] = np.searchsorted(values, labels.data[first:stop])
 
     over_slabs(fill, len(rows), rows.size)
     return values.astype(np.int64), rows
 
 
-def memberships_of(values: NDArray[np.int64], start: NDArray[np.integer], factors: tuple[int, ...]) -> Memberships:
+def memberships_of(
+    values: NDArray[np.int64], start: NDArray[np.integer], factors: tuple[int, ...]
+) -> Memberships:
     """`memberships` of numbered labels."""
-    assert all(factor % 2 == 1 for factor in factors), f"factors: expected odd numbers, got {factors}"
+    assert all(factor % 2 == 1 for factor in factors), (
+        f"factors: expected odd numbers, got {factors}"
+    )
     raw, n_voxels = start, start.size * prod(factors)
     what = f"labels: {len(values)} labels on {n_voxels} voxels"
     if max(factors) > 1:
@@ -130,7 +157,10 @@ def memberships_of(values: NDArray[np.int64], start: NDArray[np.integer], factor
     def level_in(row: int, box: tuple[slice, ...]) -> NDArray[np.float32]:
         inside = start[box] == row
         return smooth_level(
-            inside, inside if raw is start else raw[box] == row, None if off is None else off[box], factors
+            inside,
+            inside if raw is start else raw[box] == row,
+            None if off is None else off[box],
+            factors,
         )
 
     members = gathered(values, start, level_in, prod(factors))
@@ -142,29 +172,38 @@ def memberships_of(values: NDArray[np.int64], start: NDArray[np.integer], factor
 
 
 def _agree(members: Memberships) -> None:
-    """Raise or lower levels, in place, until each label has its volume where its level is the smallest.
+    """Raise or lower levels, in place, until each label has its volume where its level is the
+    smallest.
 
-    Where two labels meet, their levels are opposite. Where more meet, each level alone has the volume of its label,
-    but overlaps others: a rib between muscle and fat would lose a fifth. Every voxel's centre keeps its label.
+    Where two labels meet, their levels are opposite. Where more meet, each level alone has the
+    volume of its label, but overlaps others: a rib between muscle and fat would lose a fifth. Every
+    voxel's centre keeps its label.
     """
     due, partition = list(range(len(members.labels))), members.partition
     boxes = [_around(box, partition.shape) for box in scipy.ndimage.find_objects(partition + 1)]
     with ThreadPoolExecutor(numba.get_num_threads()) as threads:
         nears = list(threads.map(lambda row, box: _near(partition[box] == row), due, boxes))
         for _ in range(AGREEMENT_ROUNDS):
-            steps = list(threads.map(lambda row: _missing_depth(members, row, boxes[row], nears[row]), due))
+            steps = list(
+                threads.map(lambda row: _missing_depth(members, row, boxes[row], nears[row]), due)
+            )
             due = [row for row, step in zip(due, steps, strict=True) if step != 0.0]
             for row, step in zip(due, filter(None, steps), strict=True):
                 level = members.levels[members.channel[row]][boxes[row]]
                 is_near = _mask_of(nears[row], level.shape)
                 is_own = partition[boxes[row]][is_near] == row
                 moved = level[is_near] - np.float32(AGREEMENT_STEP * step)
-                least, most = np.minimum(moved, -NEAR_SURFACE[0]), np.maximum(moved, NEAR_SURFACE[0])
+                least, most = (
+                    np.minimum(moved, -NEAR_SURFACE[0]),
+                    np.maximum(moved, NEAR_SURFACE[0]),
+                )
                 level[is_near] = np.where(is_own, least, most)
 
 
 def _near(inside: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Voxels so near to a label that no other label of its channel has its level there, as bits: boxes overlap."""
+    """Voxels so near to a label that no other label of its channel has its level there, as bits:
+    boxes overlap.
+    """
     return np.packbits(largest_around(inside, AGREEMENT_REACH))
 
 
@@ -172,20 +211,33 @@ def _mask_of(bits: NDArray[np.uint8], shape: tuple[int, ...]) -> NDArray[np.bool
     return np.unpackbits(bits, count=prod(shape)).view(np.bool_).reshape(shape)
 
 
-def _missing_depth(members: Memberships, row: int, box: tuple[slice, ...], near: NDArray[np.uint8]) -> float:
-    """Volume that a label lacks between labels, over its area, voxels; 0 if that is next to nothing of its volume.
+def _missing_depth(
+    members: Memberships, row: int, box: tuple[slice, ...], near: NDArray[np.uint8]
+) -> float:
+    """Volume that a label lacks between labels, over its area, voxels; 0 if that is next to nothing
+    of its volume.
 
-    Sampled at places in voxels near the label, quasi-random (Roberts' sequence R3), as regular ones would miss layers.
+    Sampled at places in voxels near the label, quasi-random (Roberts' sequence R3), as regular ones
+    would miss layers.
     """
     inside = members.partition[box] == row
     place = np.flatnonzero(_mask_of(near, inside.shape))
-    place = place[:: max(len(place) // AGREEMENT_VOXELS, 1)].copy()  # not as a view, which keeps all
+    # not as a view, which keeps all
+    place = place[:: max(len(place) // AGREEMENT_VOXELS, 1)].copy()
     is_own, n = inside.ravel()[place], inside.ndim
     at = np.stack(np.unravel_index(place, inside.shape), axis=1) + [side.start for side in box]
     index = np.repeat(at, PLACES_PER_VOXEL, axis=0)
-    index = index + (np.arange(1, len(index) + 1)[:, None] * PLASTIC_RATIO ** -np.arange(1.0, n + 1.0)) % 1.0 - 0.5
+    index = (
+        index
+        + (np.arange(1, len(index) + 1)[:, None] * PLASTIC_RATIO ** -np.arange(1.0, n + 1.0)) % 1.0
+        - 0.5
+    )
     cells = np.broadcast_to(np.arange(len(index))[:, None], (len(index), n + 1))
-    fraction = (labels_at(members, index, cells, np.eye(1, n + 1)) == row).reshape(len(place), -1).mean(axis=1)
+    fraction = (
+        (labels_at(members, index, cells, np.eye(1, n + 1)) == row)
+        .reshape(len(place), -1)
+        .mean(axis=1)
+    )
     lacking = float((is_own - fraction).sum())
     area = int(((fraction > 0.0) & (fraction < 1.0)).sum())
     return lacking / area if area and abs(lacking) > AGREEMENT_FRACTION * is_own.sum() else 0.0
@@ -197,7 +249,8 @@ def gathered(
     level_in: Callable[[int, tuple[slice, ...]], NDArray[np.float32]],
     parts: int,
 ) -> Memberships:
-    """Collect the levels of labels in as few channels as possible, with the label of the smallest at each voxel.
+    """Collect the levels of labels in as few channels as possible, with the label of the smallest
+    at each voxel.
 
     Parameters
     ----------
@@ -206,7 +259,8 @@ def gathered(
     start : (*shape) int
         Initial row of `values` of each voxel.
     level_in : callable
-        Function that returns the level of a row within a box of the voxels; called on several threads.
+        Function that returns the level of a row within a box of the voxels; called on several
+        threads.
     parts : int
         Voxels per voxel of the labels.
     """
@@ -220,8 +274,13 @@ def gathered(
     boxes = [_around(box, start.shape) for box in scipy.ndimage.find_objects(start + 1)]
     sizes = [prod(side.stop - side.start for side in box) for box in boxes]
     with ThreadPoolExecutor(numba.get_num_threads()) as threads:
-        # Small labels take a thread each, large ones all threads, one after the other, as their temporaries are large.
-        small = {row: threads.submit(level_in, row, boxes[row]) for row, n in enumerate(sizes) if n < LARGE_BOX}
+        # Small labels take a thread each, large ones all threads, one after the other, as their
+        # temporaries are large.
+        small = {
+            row: threads.submit(level_in, row, boxes[row])
+            for row, n in enumerate(sizes)
+            if n < LARGE_BOX
+        }
         for row in range(len(values)):
             level = small.pop(row).result() if row in small else level_in(row, boxes[row])
             shared = levels[channel[row]][boxes[row]]
@@ -235,9 +294,13 @@ def gathered(
 
 
 def labels_at(
-    members: Memberships, index: NDArray[np.float64], cells: NDArray[np.int64], places: NDArray[np.float64]
+    members: Memberships,
+    index: NDArray[np.float64],
+    cells: NDArray[np.int64],
+    places: NDArray[np.float64],
 ) -> NDArray[np.int64]:
-    """Rows of the labels with the smallest level at barycentric places (S, K) in cells (M, K), (M, S).
+    """Rows of the labels with the smallest level at barycentric places (S, K) in cells (M, K), (M,
+    S).
 
     Nodes lie at index positions (N, n).
     """
@@ -246,14 +309,26 @@ def labels_at(
     node[:, 3 - index.shape[1] :] = index
     row = np.empty((len(cells), len(places)), dtype=np.int64)
     _fill_labels(
-        row, members.partition.reshape(shape), members.levels.reshape(-1, *shape), members.channel, node, cells, places
+        row,
+        members.partition.reshape(shape),
+        members.levels.reshape(-1, *shape),
+        members.channel,
+        node,
+        cells,
+        places,
     )
     return row
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_labels(
-    row: NDArray, partition: NDArray, levels: NDArray, channel: NDArray, node: NDArray, cells: NDArray, places: NDArray
+    row: NDArray,
+    partition: NDArray,
+    levels: NDArray,
+    channel: NDArray,
+    node: NDArray,
+    cells: NDArray,
+    places: NDArray,
 ) -> None:
     corner, fraction = np.empty((8, 3), dtype=np.int64), np.empty(3)
     for cell in range(len(cells)):
@@ -271,8 +346,12 @@ def _fill_labels(
 
 
 @njit(cache=True, nogil=True)
-def _label_between(partition: NDArray, levels: NDArray, channel: NDArray, corner: NDArray, fraction: NDArray) -> int:
-    """The label of smallest level among the voxels (8, 3) around a place, given as fractions from the first."""
+def _label_between(
+    partition: NDArray, levels: NDArray, channel: NDArray, corner: NDArray, fraction: NDArray
+) -> int:
+    """The label of smallest level among the voxels (8, 3) around a place, given as fractions
+    from the first.
+    """
     best, least, is_same = partition[corner[0, 0], corner[0, 1], corner[0, 2]], np.inf, True
     for m in range(1, 8):
         is_same = is_same and partition[corner[m, 0], corner[m, 1], corner[m, 2]] == best
@@ -295,13 +374,17 @@ def _around(box: tuple[slice, ...], shape: tuple[int, ...]) -> tuple[slice, ...]
 
 
 def _spread(data: NDArray, factors: Sequence[int]) -> NDArray:
-    """Values at the centres of voxels divided by `factors` along the axes: linear, constant beyond the outermost."""
+    """Values at the centres of voxels divided by `factors` along the axes: linear, constant
+    beyond the outermost.
+    """
     for axis, factor in enumerate(factors):
         if factor > 1:
             n = data.shape[axis]
             at = np.clip(finer_index(n, factor), 0.0, n - 1.0)
             below = np.minimum(at.astype(np.int64), max(n - 2, 0))
-            fraction = (at - below).astype(data.dtype).reshape((-1,) + (1,) * (data.ndim - 1 - axis))
+            fraction = (
+                (at - below).astype(data.dtype).reshape((-1,) + (1,) * (data.ndim - 1 - axis))
+            )
             above = np.minimum(below + 1, n - 1)
             low = np.take(data, below, axis)
             data = low + (np.take(data, above, axis) - low) * fraction
@@ -309,7 +392,9 @@ def _spread(data: NDArray, factors: Sequence[int]) -> NDArray:
 
 
 def _off_planes(number: NDArray[np.integer], axis: int, factor: int) -> NDArray[np.float32]:
-    """Distance of each divided voxel from its slice's plane, voxels, where slices differ; 0 elsewhere."""
+    """Distance of each divided voxel from its slice's plane, voxels, where slices differ; 0
+    elsewhere.
+    """
     n = number.shape[axis]
     along = np.arange(n * factor)
     away = along % factor - factor // 2
@@ -319,9 +404,13 @@ def _off_planes(number: NDArray[np.integer], axis: int, factor: int) -> NDArray[
 
 
 def _merge_crumbs(
-    levels: NDArray[np.float32], partition: NDArray[np.integer], channel: NDArray[np.int64], is_plane: NDArray[np.bool_]
+    levels: NDArray[np.float32],
+    partition: NDArray[np.integer],
+    channel: NDArray[np.int64],
+    is_plane: NDArray[np.bool_],
 ) -> None:
-    """Merge components of a label between slices that reach no slice's plane into the nearest label, in place.
+    """Merge components of a label between slices that reach no slice's plane into the nearest
+    label, in place.
 
     The two labels' levels are exchanged there.
     """
@@ -333,7 +422,9 @@ def _merge_crumbs(
         reaches[0] = True
         is_crumb[box] |= ~reaches[piece]
     if is_crumb.any():
-        place = scipy.ndimage.distance_transform_edt(is_crumb, return_distances=False, return_indices=True)
+        place = scipy.ndimage.distance_transform_edt(
+            is_crumb, return_distances=False, return_indices=True
+        )
         nearest = place[:, is_crumb]
         at, old, new = np.nonzero(is_crumb), partition[is_crumb], partition[tuple(nearest)]
         low, high = levels[(channel[old], *at)], levels[(channel[new], *at)]
@@ -341,11 +432,13 @@ def _merge_crumbs(
         partition[is_crumb] = new
 
 
-def _between_slices(number: NDArray[np.integer], axis: int, factors: Sequence[int]) -> NDArray[np.integer]:
+def _between_slices(
+    number: NDArray[np.integer], axis: int, factors: Sequence[int]
+) -> NDArray[np.integer]:
     """Labels on slices divided along one axis, interpolated by shape.
 
-    Within a slice a label's level is the signed distance to its outline; between slices it is linear. A component that
-    is absent from the next slice shrinks to its innermost point halfway.
+    Within a slice a label's level is the signed distance to its outline; between slices it is
+    linear. A component that is absent from the next slice shrinks to its innermost point halfway.
 
     Parameters
     ----------
@@ -354,15 +447,22 @@ def _between_slices(number: NDArray[np.integer], axis: int, factors: Sequence[in
     axis : int
         The divided axis.
     factors : sequence of int
-        Factors of all axes; axes after `axis` are not divided yet, so that their voxels are longer by their factors.
+        Factors of all axes; axes after `axis` are not divided yet, so that their voxels are longer
+        by their factors.
     """
     length = [float(f) if i > axis else 1.0 for i, f in enumerate(factors)]
     length[axis] = ABSENT_DISTANCE
     divided = [factors[axis] if i == axis else 1 for i in range(number.ndim)]
     shape = tuple(n * f for n, f in zip(number.shape, divided, strict=True))
-    smallest, partition = np.full(shape, np.inf, dtype=np.float32), np.zeros(shape, dtype=number.dtype)
+    smallest, partition = (
+        np.full(shape, np.inf, dtype=np.float32),
+        np.zeros(shape, dtype=number.dtype),
+    )
     for row, box in enumerate(scipy.ndimage.find_objects(number + 1)):
-        margin = tuple(slice(max(s.start - 1, 0), min(s.stop + 1, n)) for s, n in zip(box, number.shape, strict=True))
+        margin = tuple(
+            slice(max(s.start - 1, 0), min(s.stop + 1, n))
+            for s, n in zip(box, number.shape, strict=True)
+        )
         fine = tuple(slice(s.start * f, s.stop * f) for s, f in zip(margin, divided, strict=True))
         level = _interpolated(number[margin] == row, axis, factors[axis], length)
         least = smallest[fine]
@@ -371,7 +471,9 @@ def _between_slices(number: NDArray[np.integer], axis: int, factors: Sequence[in
     return partition
 
 
-def _interpolated(inside: NDArray[np.bool_], axis: int, factor: int, length: Sequence[float]) -> NDArray[np.float32]:
+def _interpolated(
+    inside: NDArray[np.bool_], axis: int, factor: int, length: Sequence[float]
+) -> NDArray[np.float32]:
     """A label's level on slices divided along one axis."""
     inside = np.moveaxis(inside, axis, 0)
     length = [length[axis], *length[:axis], *length[axis + 1 :]]
@@ -392,21 +494,32 @@ def _interpolated(inside: NDArray[np.bool_], axis: int, factor: int, length: Seq
 def _rest(level: NDArray[np.float32], deepest: NDArray[np.float32], k: int) -> NDArray[np.float32]:
     """Largest distance of a slice from its outline where slice `k` is on the other side.
 
-    A component of depth D that ends there is cut off at its depth d after the fraction t = sqrt(1 - (1 - d / D)^2) / 2
-    of the way, like half an ellipsoid that ends halfway. Linear from -d, the other level is d (1 / t - 1).
+    A component of depth D that ends there is cut off at its depth d after the fraction t = sqrt(1 -
+    (1 - d / D)^2) / 2 of the way, like half an ellipsoid that ends halfway. Linear from -d, the
+    other level is d (1 / t - 1).
     """
     fraction = np.abs(level[k]) / deepest[k]
     return deepest[k] * (2.0 * np.sqrt(fraction / (2.0 - fraction)) - fraction)
 
 
-def _outlined(inside: NDArray[np.bool_], length: Sequence[float]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Signed distance to the outline within each slice, and the largest in each voxel's component."""
+def _outlined(
+    inside: NDArray[np.bool_], length: Sequence[float]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Signed distance to the outline within each slice, and the largest in each voxel's
+    component.
+    """
     link = np.zeros((3,) * inside.ndim)
     link[1] = [[0, 1, 0], [1, 1, 1], [0, 1, 0]] if inside.ndim == 3 else [1, 1, 1]
-    level, deepest = np.zeros(inside.shape, dtype=np.float32), np.zeros(inside.shape, dtype=np.float32)
+    level, deepest = (
+        np.zeros(inside.shape, dtype=np.float32),
+        np.zeros(inside.shape, dtype=np.float32),
+    )
     for side, sign in ((inside, -1.0), (~inside, 1.0)):
         distance = np.minimum(
-            scipy.ndimage.distance_transform_edt(side, length) if not side.all() else ABSENT_DISTANCE, ABSENT_DISTANCE
+            scipy.ndimage.distance_transform_edt(side, length)
+            if not side.all()
+            else ABSENT_DISTANCE,
+            ABSENT_DISTANCE,
         )
         piece, n = scipy.ndimage.label(side, link)
         largest = np.zeros(n + 1, dtype=np.float32)

@@ -10,7 +10,8 @@ import scipy
 from numpy.typing import NDArray
 
 SAMPLED_VOXELS = 100_000  # sample whose most frequent value counts as the background's
-NOISE_VOXELS = 1_000_000  # least number of voxels for estimating the noise; a smaller image uses all
+# least number of voxels for estimating the noise; a smaller image uses all
+NOISE_VOXELS = 1_000_000
 MOST_LABEL_VALUES = 32  # an image with no more distinct values holds labels, and has no noise
 
 
@@ -22,15 +23,18 @@ class NoiseSample(NamedTuple):
 
 
 def noise_level(data: NDArray, inside: NDArray[np.bool_] | None = None) -> float:
-    """Standard deviation of the noise in an image's data, estimated from second differences along every axis.
+    """Standard deviation of the noise in an image's data, estimated from second differences along
+    every axis.
 
-    Structure wider than a voxel cancels in (1, -2, 1) along all axes (Immerkaer 1996, here in n-D), and the lower
-    quartile of the magnitude is that of noise in most of the volume. A constant background is ignored; differences in
-    less than a tenth of the voxels are edges, not noise, and labels have none. Smoothed noise is underestimated. With
-    `inside` only voxels there, with all neighbours inside, are used; without any, as in a mask of one plane, the noise
-    is 0. A large image is sampled at about `NOISE_VOXELS`, in slices an odd number apart along the first axis: for four
-    real volumes this was within 0.7 % of the estimate from all voxels, and equal to the last bit for whole numbers. If
-    no such slice has a voxel to use, as many of those with most of them are sampled instead.
+    Structure wider than a voxel cancels in (1, -2, 1) along all axes (Immerkaer 1996, here in n-D),
+    and the lower quartile of the magnitude is that of noise in most of the volume. A constant
+    background is ignored; differences in less than a tenth of the voxels are edges, not noise, and
+    labels have none. Smoothed noise is underestimated. With `inside` only voxels there, with all
+    neighbours inside, are used; without any, as in a mask of one plane, the noise is 0. A large
+    image is sampled at about `NOISE_VOXELS`, in slices an odd number apart along the first axis:
+    for four real volumes this was within 0.7 % of the estimate from all voxels, and equal to the
+    last bit for whole numbers. If no such slice has a voxel to use, as many of those with most of
+    them are sampled instead.
     """
     if inside is None:
         return sampled_noise(noise_sample(data))
@@ -39,7 +43,9 @@ def noise_level(data: NDArray, inside: NDArray[np.bool_] | None = None) -> float
 
 
 def noise_planes(inside: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Indices of the planes at which second differences are taken within a mask; none if no voxel is surrounded."""
+    """Indices of the planes at which second differences are taken within a mask; none if no
+    voxel is surrounded.
+    """
     middles = noise_places(inside.shape)[1]
     if len(middles) == 0 or _surrounded(_near(inside, middles)).any():
         return middles
@@ -50,7 +56,8 @@ def noise_planes(inside: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 
 def noise_places(shape: tuple[int, ...]) -> tuple[int, NDArray[np.int64]]:
-    """Sampling distance of values, voxels, and indices of the planes at which second differences are taken.
+    """Sampling distance of values, voxels, and indices of the planes at which second differences
+    are taken.
 
     An image with fewer than three voxels along an axis has no such planes.
     """
@@ -61,7 +68,9 @@ def noise_places(shape: tuple[int, ...]) -> tuple[int, NDArray[np.int64]]:
 
 
 def noise_sample(data: NDArray, middles: NDArray[np.int64] | None = None) -> NoiseSample:
-    """The sample of voxels in memory; second differences are taken at the planes `middles`, if given."""
+    """The sample of voxels in memory; second differences are taken at the planes `middles`, if
+    given.
+    """
     stride, usual = noise_places(data.shape)
     return NoiseSample(data.ravel()[::stride], _near(data, usual if middles is None else middles))
 
@@ -72,9 +81,13 @@ def _near(data: NDArray, middles: NDArray[np.int64]) -> NDArray:
 
 
 def _surrounded(near: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Voxels of the middle planes, but for those at their borders, with all neighbours inside, (P, ...)."""
+    """Voxels of the middle planes, but for those at their borders, with all neighbours inside,
+    (P, ...).
+    """
     middle = (slice(None), *(slice(1, -1),) * (near.ndim - 2))
-    return np.asarray(scipy.ndimage.minimum_filter(near.all(axis=0), (1, *(3,) * (near.ndim - 2)))[middle])
+    return np.asarray(
+        scipy.ndimage.minimum_filter(near.all(axis=0), (1, *(3,) * (near.ndim - 2)))[middle]
+    )
 
 
 def sampled_noise(sample: NoiseSample, inside: NDArray[np.bool_] | None = None) -> float:

@@ -8,16 +8,22 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 
 HISTOGRAM_BINS = 256  # bins of the histogram, as many as the values of 8-bit images
-TAIL_FRACTION = 0.0005  # of the weight at either end, which may be a few voxels far brighter than all others
-FEWEST_BINS = 64  # least number of bins for all but the tails: with fewer, thresholds are too coarse
+# of the weight at either end, which may be a few voxels far brighter than all others
+TAIL_FRACTION = 0.0005
+# least number of bins for all but the tails: with fewer, thresholds are too coarse
+FEWEST_BINS = 64
 
 
-def class_thresholds(values: NDArray, classes: int, weights: NDArray | None = None) -> NDArray[np.float64]:
-    """Thresholds between classes that minimise the variance within them (Otsu 1979, for any number).
+def class_thresholds(
+    values: NDArray, classes: int, weights: NDArray | None = None
+) -> NDArray[np.float64]:
+    """Thresholds between classes that minimise the variance within them (Otsu 1979, for any
+    number).
 
-    Exact on a histogram of 256 bins, by dynamic programming over the last bin of each class (Fisher 1958). The bins
-    span the least to the greatest value. If all but a thousandth of the weight lies in fewer than 64 of them, as where
-    one voxel is far brighter than the rest, they span these alone, and the end bins take the remaining values.
+    Exact on a histogram of 256 bins, by dynamic programming over the last bin of each class (Fisher
+    1958). The bins span the least to the greatest value. If all but a thousandth of the weight lies
+    in fewer than 64 of them, as where one voxel is far brighter than the rest, they span these
+    alone, and the end bins take the remaining values.
 
     Parameters
     ----------
@@ -44,7 +50,8 @@ def class_thresholds(values: NDArray, classes: int, weights: NDArray | None = No
     is_filled = counts > 0
     if is_filled.sum() < classes:
         raise InputError(
-            f"classes: {classes} requested, but the values fill only {is_filled.sum()} of {HISTOGRAM_BINS} bins"
+            f"classes: {classes} requested, but the values fill only {is_filled.sum()} of "
+            f"{HISTOGRAM_BINS} bins"
         )
     centres = 0.5 * (edges[1:] + edges[:-1])[is_filled]
     counts = counts[is_filled].astype(np.float64)
@@ -72,7 +79,8 @@ def _histogram(values: NDArray, weights: NDArray | None) -> tuple[NDArray, NDArr
     steps = np.linspace(low, high, HISTOGRAM_BINS + 1, dtype=values.dtype)  # like numpy's bins
     if low < high and not (steps[:-1] < steps[1:]).all():
         raise InputError(
-            f"classes: expected intensities that {HISTOGRAM_BINS} bins can separate, got {low} to {high}; subtract "
+            f"classes: expected intensities that {HISTOGRAM_BINS} bins can separate, got {low} "
+            f"to {high}; subtract "
             "their common offset"
         )
     counts, edges = np.histogram(values, bins=HISTOGRAM_BINS, weights=weights)
@@ -91,8 +99,12 @@ def _histogram(values: NDArray, weights: NDArray | None) -> tuple[NDArray, NDArr
     return narrow if (narrow[0] > 0).sum() > (counts > 0).sum() else (counts, edges)
 
 
-def _within_class_sums(counts: NDArray[np.float64], centres: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Sum of squares around the mean over bins a .. b-1, entry [a, b]; infinite for empty runs, (n, n+1)."""
+def _within_class_sums(
+    counts: NDArray[np.float64], centres: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Sum of squares around the mean over bins a .. b-1, entry [a, b]; infinite for empty runs,
+    (n, n+1).
+    """
     n = len(counts)
     sums = [np.concatenate([[0.0], np.cumsum(counts * centres**power)]) for power in range(3)]
     weight, first, second = (s[None, :] - s[:-1, None] for s in sums)

@@ -17,23 +17,23 @@ A phantom is a TOML file, for example ::
     label = 1
 
 Top level
-    ``name``, ``description``, ``size_mm``, ``voxel_mm`` and ``background`` are required. Optional are
-    ``center_mm`` (world position of the box's centre, by default the origin), ``axes``, ``blur_mm`` and
-    ``noise_sd`` (standard deviations, default 0), ``seed`` (default 0) and the shapes. ``axes`` has one *row* for
-    each voxel axis: its direction in the world, of any length (it is normalised); rows need not be
-    orthogonal. They are the directions of the affine's *columns*, and the domain is the parallelepiped that
-    they span with the lengths ``size_mm``.
+    ``name``, ``description``, ``size_mm``, ``voxel_mm`` and ``background`` are required. Optional
+    are ``center_mm`` (world position of the box's centre, by default the origin), ``axes``,
+    ``blur_mm`` and ``noise_sd`` (standard deviations, default 0), ``seed`` (default 0) and the
+    shapes. ``axes`` has one *row* for each voxel axis: its direction in the world, of any length
+    (it is normalised); rows need not be orthogonal. They are the directions of the affine's
+    *columns*, and the domain is the parallelepiped that they span with the lengths ``size_mm``.
 Shapes
-    All shapes are in world millimetres, whatever ``axes`` is. Each has a ``kind``, an ``intensity``, a ``label``
-    (an integer, 0 or more) and optionally a ``name``:
+    All shapes are in world millimetres, whatever ``axes`` is. Each has a ``kind``, an
+    ``intensity``, a ``label`` (an integer, 0 or more) and optionally a ``name``:
 
     - ``ellipsoid``: ``center_mm``, ``radii_mm`` and optionally ``rotation_deg``;
     - ``box``: ``center_mm``, ``size_mm`` and optionally ``rotation_deg``;
-    - ``layer``: the slab ``|normal . x - offset_mm| <= thickness_mm / 2``; ``normal`` has any length (it is
-      normalised first).
+    - ``layer``: the slab ``|normal . x - offset_mm| <= thickness_mm / 2``; ``normal`` has any
+      length (it is normalised first).
 
-    In 2-D ``rotation_deg`` is one counter-clockwise angle; in 3-D it is three angles, about the fixed world axes x,
-    then y, then z. A shape contains its own surface, up to rounding.
+    In 2-D ``rotation_deg`` is one counter-clockwise angle; in 3-D it is three angles, about the
+    fixed world axes x, then y, then z. A shape contains its own surface, up to rounding.
 """
 
 from __future__ import annotations
@@ -54,9 +54,11 @@ from tetopt.image import SINGULAR_DETERMINANT, Image, transformed
 from tetopt.system.budget import check_memory
 from tetopt.system.incoming import toml_of
 
-PHANTOM_VOXEL_BYTES = 30.0  # intensities, noise or blur, labels, and the data written; 17 were measured
+# intensities, noise or blur, labels, and the data written; 17 were measured
+PHANTOM_VOXEL_BYTES = 30.0
 MAX_PHANTOM_VOXELS = 2**36  # 4096^3: 137 GB of 16 bits, box by box
-MAX_SUPERSAMPLE = 64  # sub-voxels along an axis: 262,144 per voxel in 3-D, which fit into one chunk of points
+# sub-voxels along an axis: 262,144 per voxel in 3-D, which fit into one chunk of points
+MAX_SUPERSAMPLE = 64
 BLUR_SIGMAS = 4.0  # reach of a blur, in standard deviations: less than 1e-4 of it lies beyond
 POINTS_PER_CHUNK = 2**18  # evaluated at once, with a few tens of MB of temporaries
 
@@ -70,7 +72,9 @@ _SHAPE_KEYS = {
 
 
 def _lock(record: Any, state: dict[str, Any]) -> None:
-    """Set the fields of a copied or unpickled record, with read-only arrays: pickle does not keep that."""
+    """Set the fields of a copied or unpickled record, with read-only arrays: pickle does not
+    keep that.
+    """
     for value in state.values():
         if isinstance(value, np.ndarray):
             value.setflags(write=False)
@@ -120,11 +124,13 @@ class Shape:
 
 
 def signed_distance(shape: Shape, points: ArrayLike) -> NDArray[np.float64]:
-    """Lower bound of the distance from the shape's surface, negative inside, with the exact zero set.
+    """Lower bound of the distance from the shape's surface, negative inside, with the exact zero
+    set.
 
-    Its Lipschitz constant is 1, so a ball of radius r about x can meet the surface only if the absolute value
-    at x is at most r. For a layer and a box it is the distance itself. For an ellipsoid with radii D it is
-    ``(|D^-1 (x - c)| - 1) min(D)``: the gradient of ``|D^-1 y|`` is no longer than ``1 / min(D)``.
+    Its Lipschitz constant is 1, so a ball of radius r about x can meet the surface only if the
+    absolute value at x is at most r. For a layer and a box it is the distance itself. For an
+    ellipsoid with radii D it is ``(|D^-1 (x - c)| - 1) min(D)``: the gradient of ``|D^-1 y|`` is no
+    longer than ``1 / min(D)``.
 
     Parameters
     ----------
@@ -136,10 +142,12 @@ def signed_distance(shape: Shape, points: ArrayLike) -> NDArray[np.float64]:
     (...) float64, mm
     """
     points = np.asarray(points, dtype=np.float64)
-    # One axis at a time instead of a matrix product: the rounding of BLAS depends on the batch's size, and a point on a
-    # surface must fall on the same side in every batch.
+    # One axis at a time instead of a matrix product: the rounding of BLAS depends on the batch's
+    # size, and a point on a surface must fall on the same side in every batch.
     shifted = [points[..., i] - c for i, c in enumerate(shape.center)]
-    local = [sum(r * x for r, x in zip(row, shifted, strict=True) if r != 0.0) for row in shape.frame]
+    local = [
+        sum(r * x for r, x in zip(row, shifted, strict=True) if r != 0.0) for row in shape.frame
+    ]
     if shape.kind == "ellipsoid":
         square = sum((x / radius) ** 2 for x, radius in zip(local, shape.half, strict=True))
         return (np.sqrt(square) - 1.0) * shape.half.min()
@@ -151,7 +159,8 @@ def signed_distance(shape: Shape, points: ArrayLike) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, eq=False)
 class Phantom:
-    """A box with a background and shapes painted over it in order; the module's docstring describes the file.
+    """A box with a background and shapes painted over it in order; the module's docstring describes
+    the file.
 
     `load_phantom` makes phantoms and checks everything. Arrays are read-only.
 
@@ -266,21 +275,23 @@ class Phantom:
     ) -> Image:
         """Render the phantom as voxels; options default to the file's.
 
-        A voxel that a surface may cut (its centre is no farther from it than half the voxel's longest
-        diagonal, by the bound of `signed_distance`) holds the mean over the ``supersample**n`` midpoints of its
-        sub-voxels; any other voxel lies in one shape and holds its value exactly. Then the blur and the noise are
-        applied. A layer thinner than a sub-voxel shows only where it meets a midpoint: raise `supersample`.
+        A voxel that a surface may cut (its centre is no farther from it than half the voxel's
+        longest diagonal, by the bound of `signed_distance`) holds the mean over the
+        ``supersample**n`` midpoints of its sub-voxels; any other voxel lies in one shape and holds
+        its value exactly. Then the blur and the noise are applied. A layer thinner than a sub-voxel
+        shows only where it meets a midpoint: raise `supersample`.
 
         Parameters
         ----------
         voxel_mm : float or (n,) floats, optional
-            Voxel edges. An axis gets ``round(size / voxel)`` voxels, at least one, and the edge is then
-            adjusted so that they cover the box exactly.
+            Voxel edges. An axis gets ``round(size / voxel)`` voxels, at least one, and the edge is
+            then adjusted so that they cover the box exactly.
         blur_mm : float, optional
-            Standard deviation of a Gaussian along each voxel axis, so on sheared axes it is not isotropic in
-            the world. The image is continued by its border values.
+            Standard deviation of a Gaussian along each voxel axis, so on sheared axes it is not
+            isotropic in the world. The image is continued by its border values.
         noise_sd : float, optional
-            Standard deviation of white Gaussian noise, in units of intensity. It may make values negative.
+            Standard deviation of white Gaussian noise, in units of intensity. It may make values
+            negative.
         seed : int, optional
             Seed of the noise; the same seed gives the same bits.
         supersample : int
@@ -317,7 +328,8 @@ class Phantom:
         seed: int | None = None,
         supersample: int = 4,
     ) -> PhantomVoxels:
-        """The voxels of `image`, rendered box by box on demand, so that they need not fit into memory.
+        """The voxels of `image`, rendered box by box on demand, so that they need not fit into
+        memory.
 
         Parameters
         ----------
@@ -350,8 +362,12 @@ class Phantom:
         """
         where = f"phantom {self.name!r}"
         blur = _number(self.blur_mm if blur_mm is None else blur_mm, f"{where}: blur_mm", 0.0)
-        if blur > self.size_mm.max():  # a wider blur leaves only the mean, and its filter would be as long
-            raise InputError(f"{where}: blur_mm: expected at most the box's {self.size_mm.max():g} mm, got {blur:g}")
+        # a wider blur leaves only the mean, and its filter would be as long
+        if blur > self.size_mm.max():
+            raise InputError(
+                f"{where}: blur_mm: expected at most the box's {self.size_mm.max():g} mm, got "
+                f"{blur:g}"
+            )
         sd = _number(self.noise_sd if noise_sd is None else noise_sd, f"{where}: noise_sd", 0.0)
         seed = _integer(self.seed if seed is None else seed, f"{where}: seed")
         supersample = _integer(supersample, f"{where}: supersample", 1, MAX_SUPERSAMPLE)
@@ -390,7 +406,9 @@ class Phantom:
 
     def _intensities(self) -> NDArray[np.float64]:
         """Intensities in painting order, the background's first."""
-        return np.array([self.background_intensity, *(s.intensity for s in self.shapes)], dtype=np.float64)
+        return np.array(
+            [self.background_intensity, *(s.intensity for s in self.shapes)], dtype=np.float64
+        )
 
     def _labels(self) -> NDArray[np.int64]:
         """Labels in painting order, the background's first."""
@@ -402,19 +420,25 @@ class Phantom:
             checked = np.asarray(points, dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise InputError(
-                f"phantom {self.name!r}: points: expected numbers of shape (..., {self.ndim}), got {points!r}"
+                f"phantom {self.name!r}: points: expected numbers of shape (..., {self.ndim}), "
+                f"got {points!r}"
             ) from error
         if checked.ndim == 0 or checked.shape[-1] != self.ndim:
             raise InputError(
-                f"phantom {self.name!r}: points: expected shape (..., {self.ndim}), got {checked.shape}; "
+                f"phantom {self.name!r}: points: expected shape (..., {self.ndim}), got "
+                f"{checked.shape}; "
                 f"give {self.ndim} world coordinates in mm for each"
             )
         if not np.isfinite(checked).all():
-            raise InputError(f"phantom {self.name!r}: points: some are NaN or infinite; remove those points")
+            raise InputError(
+                f"phantom {self.name!r}: points: some are NaN or infinite; remove those points"
+            )
         return checked
 
     def _top_shape(self, points: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Position in painting order of the last shape at each point: 1 is the first, 0 the background."""
+        """Position in painting order of the last shape at each point: 1 is the first, 0 the
+        background.
+        """
         top = np.zeros(points.shape[:-1], dtype=np.int64)
         for k, shape in enumerate(self.shapes, start=1):
             top[signed_distance(shape, points) <= 0.0] = k
@@ -431,14 +455,16 @@ class Phantom:
             power = MAX_PHANTOM_VOXELS.bit_length() - 1
             raise InputError(
                 f"{where}: voxel_mm: expected at most 2**{power} voxels, got "
-                f"{' x '.join(f'{count:.6g}' for count in counts)} of {voxel.tolist()} mm; use larger ones"
+                f"{' x '.join(f'{count:.6g}' for count in counts)} of {voxel.tolist()} mm; use "
+                "larger ones"
             )
         linear = self.axes.T * (self.size_mm / counts)
         affine = np.eye(self.ndim + 1)
         affine[:-1, :-1] = linear
         affine[:-1, -1] = self.center_mm - linear @ ((counts - 1) / 2)
         try:
-            Image(np.zeros((1,) * self.ndim), affine)  # checks the voxels' size before they are rendered
+            # checks the voxels' size before they are rendered
+            Image(np.zeros((1,) * self.ndim), affine)
         except InputError as error:
             raise InputError(f"{where}: {error}") from error
         return tuple(int(c) for c in counts), affine
@@ -446,15 +472,17 @@ class Phantom:
     def _check_whole(self, shape: tuple[int, ...]) -> None:
         """Raise InputError unless the voxels and their temporaries fit into memory."""
         what = f"phantom {self.name!r}: {' x '.join(map(str, shape))} voxels"
-        check_memory(PHANTOM_VOXEL_BYTES * math.prod(shape), what, "use larger voxels, or write it as .zarr")
+        check_memory(
+            PHANTOM_VOXEL_BYTES * math.prod(shape), what, "use larger voxels, or write it as .zarr"
+        )
 
     def _voxel_means(
         self, centers: NDArray[np.float64], offsets: NDArray[np.float64], reach: float
     ) -> NDArray[np.float64]:
         """Mean intensity, (M,), over voxels with these centres (M, n).
 
-        `offsets` (S, n) lead from a centre to its sub-voxels' midpoints; no point of a voxel is farther from
-        its centre than `reach`.
+        `offsets` (S, n) lead from a centre to its sub-voxels' midpoints; no point of a voxel is
+        farther from its centre than `reach`.
         """
         top = np.zeros(len(centers), dtype=np.int64)  # last shape that contains the centre
         base = np.zeros(len(centers), dtype=np.int64)  # last shape that contains the whole voxel
@@ -464,8 +492,9 @@ class Phantom:
             top[distance <= 0.0] = k
             base[distance < -reach] = k
             is_cut[k - 1] = np.abs(distance) <= reach
-        # A surface under a shape that contains the whole voxel is hidden. Testing the sub-voxels only against the
-        # shapes that cut their voxel, instead of all, renders ellipsoids_brain in 0.7 s instead of 3.3 s.
+        # A surface under a shape that contains the whole voxel is hidden. Testing the sub-voxels
+        # only against the shapes that cut their voxel, instead of all, renders ellipsoids_brain in
+        # 0.7 s instead of 3.3 s.
         is_cut &= np.arange(1, len(self.shapes) + 1)[:, None] > base
         intensities = self._intensities()
         means = intensities[top]
@@ -481,7 +510,8 @@ class Phantom:
                 is_inside = signed_distance(shape, centers[voxels[rows], None] + offsets) <= 0.0
                 paint[rows] = np.where(is_inside, k, paint[rows])
             values = intensities[paint]
-            # Relative to the first sub-voxel, so that a uniform voxel keeps its value to the last bit.
+            # Relative to the first sub-voxel, so that a uniform voxel keeps its value to the last
+            # bit.
             means[voxels] = values[:, 0] + (values - values[:, :1]).mean(axis=1)
         return means
 
@@ -489,9 +519,9 @@ class Phantom:
 class PhantomVoxels:
     """The voxels of a phantom as an array whose boxes are rendered on demand, by slices.
 
-    A box has the same values, to the last bit, whatever other boxes are read. Noise is one stream of numbers in the
-    order of the voxels: read boxes in the order of the first axis if possible; they take memory for all planes that
-    they lie on.
+    A box has the same values, to the last bit, whatever other boxes are read. Noise is one stream
+    of numbers in the order of the voxels: read boxes in the order of the first axis if possible;
+    they take memory for all planes that they lie on.
 
     Parameters
     ----------
@@ -508,9 +538,15 @@ class PhantomVoxels:
     dtype = np.dtype(np.float64)
 
     def __init__(
-        self, phantom: Phantom, shape: tuple[int, ...], affine: NDArray[np.float64], blur_mm: float, noise_sd: float,
-        seed: int, supersample: int,
-    ) -> None:  # fmt: skip
+        self,
+        phantom: Phantom,
+        shape: tuple[int, ...],
+        affine: NDArray[np.float64],
+        blur_mm: float,
+        noise_sd: float,
+        seed: int,
+        supersample: int,
+    ) -> None:
         self.phantom, self.shape, self.affine = phantom, shape, affine
         self.noise_sd, self.seed = noise_sd, seed
         linear, n = affine[:-1, :-1], len(shape)
@@ -528,7 +564,9 @@ class PhantomVoxels:
         ranges = [each.indices(size)[:2] for each, size in zip(box, self.shape, strict=True)]
         values = self._blurred([start for start, _ in ranges], [stop for _, stop in ranges])
         if self.noise_sd > 0.0:
-            values += self._noise_of(*ranges[0])[(slice(None), *(slice(*each) for each in ranges[1:]))]
+            values += self._noise_of(*ranges[0])[
+                (slice(None), *(slice(*each) for each in ranges[1:]))
+            ]
         return values
 
     def _blurred(self, start: list[int], stop: list[int]) -> NDArray[np.float64]:
@@ -541,7 +579,9 @@ class PhantomVoxels:
         values = scipy.ndimage.gaussian_filter(
             self._painted(low, high), self._sigmas, mode="nearest", truncate=BLUR_SIGMAS
         )
-        return values[tuple(slice(a - at, b - at) for a, b, at in zip(start, stop, low, strict=True))].copy()
+        return values[
+            tuple(slice(a - at, b - at) for a, b, at in zip(start, stop, low, strict=True))
+        ].copy()
 
     def _painted(self, start: list[int], stop: list[int]) -> NDArray[np.float64]:
         values = np.empty([b - a for a, b in zip(start, stop, strict=True)])
@@ -551,7 +591,9 @@ class PhantomVoxels:
         return values
 
     def _noise_of(self, start: int, stop: int) -> NDArray[np.float64]:
-        """Noise of planes along the first axis; earlier numbers of the stream are drawn and discarded."""
+        """Noise of planes along the first axis; earlier numbers of the stream are drawn and
+        discarded.
+        """
         if self._planes != (start, stop):
             self._noise = np.empty(0)  # frees memory before the next is drawn
             if start < self._next_plane:
@@ -570,7 +612,9 @@ class PhantomVoxels:
 
 
 def phantom_folder() -> Path:
-    """Folder of the project's own phantoms: inside the installed package, or next to it in a checkout."""
+    """Folder of the project's own phantoms: inside the installed package, or next to it in a
+    checkout.
+    """
     package = Path(__file__).resolve().parents[1]
     inside = package / "phantoms"
     return inside if inside.is_dir() else package.parent / "phantoms"
@@ -597,7 +641,8 @@ def load_phantom(name_or_path: str | Path) -> Phantom:
     Raises
     ------
     InputError
-        No such phantom or file, or a file that does not describe a phantom; the message says where and why.
+        No such phantom or file, or a file that does not describe a phantom; the message says where
+        and why.
 
     Examples
     --------
@@ -611,24 +656,31 @@ def load_phantom(name_or_path: str | Path) -> Phantom:
     if isinstance(name_or_path, str) and path.suffix != ".toml":
         if name_or_path not in phantom_names():
             raise InputError(
-                f"phantom {name_or_path!r}: no such phantom; use one of {', '.join(phantom_names())}, "
+                f"phantom {name_or_path!r}: no such phantom; use one of "
+                f"{', '.join(phantom_names())}, "
                 "or the path of a .toml file"
             )
         path = phantom_folder() / f"{name_or_path}.toml"
     try:
         table = toml_of(path, "phantom's file")
     except InputError as error:
-        known = f"; or use one of the names {', '.join(phantom_names())}" if not path.exists() else ""
+        known = (
+            f"; or use one of the names {', '.join(phantom_names())}" if not path.exists() else ""
+        )
         raise InputError(f"phantom {error}{known}") from error
     return _phantom(table, f"phantom {path}")
 
 
 def _phantom(table: dict[str, Any], where: str) -> Phantom:
-    """The phantom of a parsed file; raise InputError, starting with `where`, for invalid entries."""
+    """The phantom of a parsed file; raise InputError, starting with `where`, for invalid
+    entries.
+    """
     _check_keys(table, _TOP_KEYS, _TOP_OPTIONS, where)
     size = table["size_mm"]
     if not isinstance(size, list) or len(size) not in (2, 3):
-        raise InputError(f"{where}: size_mm: expected a list of 2 or 3 numbers, one per axis, got {size!r}")
+        raise InputError(
+            f"{where}: size_mm: expected a list of 2 or 3 numbers, one per axis, got {size!r}"
+        )
     n = len(size)
     size_mm = _positive(_numbers(size, n, f"{where}: size_mm"), f"{where}: size_mm")
     background = table["background"]
@@ -640,7 +692,9 @@ def _phantom(table: dict[str, Any], where: str) -> Phantom:
     _check_keys(background, ("intensity",), ("label",), f"{where}: background")
     shapes = table.get("shape", [])
     if not isinstance(shapes, list) or not all(isinstance(shape, dict) for shape in shapes):
-        raise InputError(f"{where}: shape: expected tables, got {shapes!r}; start each shape with [[shape]]")
+        raise InputError(
+            f"{where}: shape: expected tables, got {shapes!r}; start each shape with [[shape]]"
+        )
     return Phantom(
         name=_text(table["name"], f"{where}: name"),
         description=_text(table["description"], f"{where}: description"),
@@ -650,7 +704,9 @@ def _phantom(table: dict[str, Any], where: str) -> Phantom:
         axes=_axes(table.get("axes", np.eye(n).tolist()), n, f"{where}: axes"),
         background_intensity=_number(background["intensity"], f"{where}: background: intensity"),
         background_label=_integer(background.get("label", 0), f"{where}: background: label"),
-        shapes=tuple(_shape(shape, n, f"{where}: shape {k}") for k, shape in enumerate(shapes, start=1)),
+        shapes=tuple(
+            _shape(shape, n, f"{where}: shape {k}") for k, shape in enumerate(shapes, start=1)
+        ),
         blur_mm=_number(table.get("blur_mm", 0.0), f"{where}: blur_mm", 0.0),
         noise_sd=_number(table.get("noise_sd", 0.0), f"{where}: noise_sd", 0.0),
         seed=_integer(table.get("seed", 0), f"{where}: seed"),
@@ -665,18 +721,28 @@ def _shape(table: dict[str, Any], n: int, where: str) -> Shape:
     if not isinstance(kind, str) or kind not in _SHAPE_KEYS:
         raise InputError(f"{where}: kind: expected one of {', '.join(_SHAPE_KEYS)}, got {kind!r}")
     needed = ("kind", "intensity", "label", *_SHAPE_KEYS[kind])
-    _check_keys(table, needed, ("name",) if kind == "layer" else ("name", "rotation_deg"), f"{where}: {kind}")
+    _check_keys(
+        table,
+        needed,
+        ("name",) if kind == "layer" else ("name", "rotation_deg"),
+        f"{where}: {kind}",
+    )
     if kind == "layer":
         normal = _numbers(table["normal"], n, f"{where}: normal")
         if not normal.any():
-            raise InputError(f"{where}: normal: expected a direction, got all zeros; make at least one entry non-zero")
+            raise InputError(
+                f"{where}: normal: expected a direction, got all zeros; make at least one entry "
+                "non-zero"
+            )
         frame = _unit(normal)[None]
         center = frame[0] * _number(table["offset_mm"], f"{where}: offset_mm")
         thickness = np.array([_number(table["thickness_mm"], f"{where}: thickness_mm")])
         half = _positive(thickness, f"{where}: thickness_mm") / 2
     else:
         key = _SHAPE_KEYS[kind][1]
-        lengths = _positive(_numbers(table[key], n, f"{where}: {key}", is_one_enough=True), f"{where}: {key}")
+        lengths = _positive(
+            _numbers(table[key], n, f"{where}: {key}", is_one_enough=True), f"{where}: {key}"
+        )
         frame = _rotation(table.get("rotation_deg"), n, f"{where}: rotation_deg").T
         center = _numbers(table["center_mm"], n, f"{where}: center_mm")
         half = lengths if kind == "ellipsoid" else lengths / 2
@@ -692,18 +758,29 @@ def _rotation(angles: Any, n: int, what: str) -> NDArray[np.float64]:
     if angles is None:
         return np.eye(n)
     if n == 2:
-        return scipy.spatial.transform.Rotation.from_euler("z", _number(angles, what), degrees=True).as_matrix()[:2, :2]
-    return scipy.spatial.transform.Rotation.from_euler("xyz", _numbers(angles, n, what), degrees=True).as_matrix()
+        return scipy.spatial.transform.Rotation.from_euler(
+            "z", _number(angles, what), degrees=True
+        ).as_matrix()[:2, :2]
+    return scipy.spatial.transform.Rotation.from_euler(
+        "xyz", _numbers(angles, n, what), degrees=True
+    ).as_matrix()
 
 
 def _axes(rows: Any, n: int, what: str) -> NDArray[np.float64]:
     """Unit rows (n, n), read-only."""
     if not isinstance(rows, list) or len(rows) != n:
-        raise InputError(f"{what}: expected {n} rows, the directions of the voxel axes, got {rows!r}")
+        raise InputError(
+            f"{what}: expected {n} rows, the directions of the voxel axes, got {rows!r}"
+        )
     with np.errstate(invalid="ignore"):  # a row of zeros becomes NaN, and with it the determinant
-        axes = np.array([_unit(_numbers(row, n, f"{what}: row {i}")) for i, row in enumerate(rows, start=1)])
+        axes = np.array(
+            [_unit(_numbers(row, n, f"{what}: row {i}")) for i, row in enumerate(rows, start=1)]
+        )
     if not abs(np.linalg.det(axes)) >= SINGULAR_DETERMINANT:
-        raise InputError(f"{what}: the directions {rows!r} do not span {n}-D space; make them linearly independent")
+        raise InputError(
+            f"{what}: the directions {rows!r} do not span {n}-D space; make them linearly "
+            "independent"
+        )
     axes.setflags(write=False)
     return axes
 
@@ -720,7 +797,8 @@ def _voxel_edges(voxel_mm: Any, size_mm: NDArray[np.float64], where: str) -> NDA
     voxel = _positive(_numbers(voxel_mm, len(size_mm), what, is_one_enough=True), what)
     if (voxel > size_mm).any():
         raise InputError(
-            f"{what}: expected voxels no larger than the box of {size_mm.tolist()} mm, got {voxel.tolist()}; "
+            f"{what}: expected voxels no larger than the box of {size_mm.tolist()} mm, got "
+            f"{voxel.tolist()}; "
             "use smaller voxels"
         )
     return voxel
@@ -728,16 +806,19 @@ def _voxel_edges(voxel_mm: Any, size_mm: NDArray[np.float64], where: str) -> NDA
 
 def _index_block(shape: Sequence[int]) -> NDArray[np.float64]:
     """Index coordinates, (product of shape, n), of all voxels in C order."""
-    return np.stack(np.unravel_index(np.arange(math.prod(shape)), shape), axis=-1).astype(np.float64)
+    return np.stack(np.unravel_index(np.arange(math.prod(shape)), shape), axis=-1).astype(
+        np.float64
+    )
 
 
 def _voxel_centers(
     start: Sequence[int], stop: Sequence[int], affine: NDArray[np.float64]
 ) -> Iterator[tuple[tuple[slice, ...], NDArray[np.float64]]]:
-    """Iterate over parts of a box, as indices from its start, with the world centres (M, n) of voxels in C order.
+    """Iterate over parts of a box, as indices from its start, with the world centres (M, n) of
+    voxels in C order.
 
-    Centres are summed term by term, not by BLAS, whose rounding depends on the number of rows: a voxel must be the same
-    in every box.
+    Centres are summed term by term, not by BLAS, whose rounding depends on the number of rows: a
+    voxel must be the same in every box.
     """
     edge = round(POINTS_PER_CHUNK ** (1 / len(start)))
     for corner in itertools.product(*(range(a, b, edge) for a, b in zip(start, stop, strict=True))):
@@ -747,7 +828,9 @@ def _voxel_centers(
         yield part, transformed(index, affine[:-1, :-1]) + affine[:-1, -1]
 
 
-def _check_keys(table: dict[str, Any], needed: Iterable[str], optional: Iterable[str], where: str) -> None:
+def _check_keys(
+    table: dict[str, Any], needed: Iterable[str], optional: Iterable[str], where: str
+) -> None:
     """Raise InputError if a required key is missing, or a key is neither required nor optional."""
     missing = [key for key in needed if key not in table]
     if missing:
@@ -761,7 +844,9 @@ def _check_keys(table: dict[str, Any], needed: Iterable[str], optional: Iterable
 
 
 def _is_number(value: Any) -> bool:
-    """True for a finite int or float; the comparison also rejects NaN and integers beyond float64."""
+    """True for a finite int or float; the comparison also rejects NaN and integers beyond
+    float64.
+    """
     return isinstance(value, int | float) and not isinstance(value, bool) and -1e300 < value < 1e300
 
 
@@ -809,5 +894,7 @@ def _text(value: Any, what: str) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Convert NumPy arrays and scalars to Python lists and numbers; return other values unchanged."""
+    """Convert NumPy arrays and scalars to Python lists and numbers; return other values
+    unchanged.
+    """
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value

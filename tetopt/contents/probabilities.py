@@ -12,14 +12,17 @@ from tetopt.errors import InputError, warn
 from tetopt.image import Image
 
 RANGE_TOLERANCE = 1e-3  # by which a probability may be below 0 or above 1, from rounding in files
-SUM_TOLERANCE = 0.02  # by which the sum may exceed 1 without a warning: rounding to bytes for six tissues
+# by which the sum may exceed 1 without a warning: rounding to bytes for six tissues
+SUM_TOLERANCE = 0.02
 BYTE_SCALE, PERCENT = 255.0, 100.0  # whole numbers between them are probabilities times 255
 
 
 def resample_tissue(tissue: Image, image: Image, name: str = "tissue") -> Image:
-    """Return a tissue's probabilities on the image's voxels, interpolated linearly if their grid differs.
+    """Return a tissue's probabilities on the image's voxels, interpolated linearly if their grid
+    differs.
 
-    Whole numbers with a maximum of 101 to 255, as in unscaled byte files, are divided by 255, with a warning.
+    Whole numbers with a maximum of 101 to 255, as in unscaled byte files, are divided by 255, with
+    a warning.
 
     Parameters
     ----------
@@ -56,9 +59,11 @@ def resample_tissue(tissue: Image, image: Image, name: str = "tissue") -> Image:
 
 
 def tissue_labels(tissues: Sequence[Image]) -> Image:
-    """Return the most probable tissue of each voxel: 1 to K in the given order, 0 where the remainder to 1 is larger.
+    """Return the most probable tissue of each voxel: 1 to K in the given order, 0 where the
+    remainder to 1 is larger.
 
-    Warns of probabilities that sum to more than 1, and of tissues that are the most probable nowhere.
+    Warns of probabilities that sum to more than 1, and of tissues that are the most probable
+    nowhere.
 
     Parameters
     ----------
@@ -87,7 +92,9 @@ def tissue_labels(tissues: Sequence[Image]) -> Image:
     for number, tissue in enumerate(tissues, 1):
         name = f"tissues, number {number}"
         if tissue.shape != tissues[0].shape or not is_same_grid(tissue, tissues[0]):
-            raise InputError(f"{name}: expected the voxels of the first; see tetopt.resample_tissue")
+            raise InputError(
+                f"{name}: expected the voxels of the first; see tetopt.resample_tissue"
+            )
         _check_range(name, tissue)
         fraction = np.clip(tissue.data, 0.0, 1.0)
         total += fraction
@@ -95,9 +102,17 @@ def tissue_labels(tissues: Sequence[Image]) -> Image:
         np.maximum(largest, fraction, out=largest, casting="unsafe")
     labels[1.0 - total >= largest] = 0
     if n_over := int(np.count_nonzero(total > 1.0 + SUM_TOLERANCE)):
-        warn(f"tissues: probabilities sum to more than 1 in {n_over} of {total.size} voxels (up to {total.max():.3g})")
-    if lost := sorted(set(range(1, len(tissues) + 1)) - set(np.unique(labels).astype(int).tolist())):
-        warn(f"tissues: label {', '.join(map(str, lost))} is not the most probable in any voxel: no cell gets it")
+        warn(
+            f"tissues: probabilities sum to more than 1 in {n_over} of {total.size} voxels (up "
+            f"to {total.max():.3g})"
+        )
+    if lost := sorted(
+        set(range(1, len(tissues) + 1)) - set(np.unique(labels).astype(int).tolist())
+    ):
+        warn(
+            f"tissues: label {', '.join(map(str, lost))} is not the most probable in any voxel: "
+            "no cell gets it"
+        )
     return Image(labels, tissues[0].affine)
 
 
@@ -105,6 +120,7 @@ def _check_range(name: str, tissue: Image) -> None:
     low, high = tissue.range
     if low < -RANGE_TOLERANCE or high > 1.0 + RANGE_TOLERANCE:
         raise InputError(
-            f"{name}: expected probabilities from 0 to 1, got {low:g} to {high:g}; first divide by the value that "
+            f"{name}: expected probabilities from 0 to 1, got {low:g} to {high:g}; first divide "
+            "by the value that "
             "stands for 1, such as 100 or 255"
         )

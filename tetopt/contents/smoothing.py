@@ -1,6 +1,8 @@
-"""The smooth level of a label or a mask: the signed distance to a surface without the stairs of voxels.
+"""The smooth level of a label or a mask: the signed distance to a surface without the stairs of
+voxels.
 
-All passes over the voxels are kernels that fill slabs, so that one label takes all threads and the temporaries of one.
+All passes over the voxels are kernels that fill slabs, so that one label takes all threads and the
+temporaries of one.
 """
 
 from __future__ import annotations
@@ -15,33 +17,45 @@ from numpy.typing import NDArray
 from tetopt.system.kernel_cache import njit
 from tetopt.system.slabs import over_slabs
 
-FARTHEST_LEVEL = 6.0  # levels are clipped there: nodes that move in steps near an interface need no larger ones
-FARTHEST_DISTANCE = 8  # voxels beyond which distances to a label are irrelevant, more than levels and smoothing use
-FINE_SIGMA, BROAD_SIGMA = 1.0, 3.0  # voxels, sigma of the Gaussian where a label or gap is thin, and elsewhere
-THIN_REACH = 4.0, 7.0  # voxels from middle to surface of labels too thin for the broad Gaussian, and of thick ones
+# levels are clipped there: nodes that move in steps near an interface need no larger ones
+FARTHEST_LEVEL = 6.0
+# voxels beyond which distances to a label are irrelevant, more than levels and smoothing use
+FARTHEST_DISTANCE = 8
+# voxels, sigma of the Gaussian where a label or gap is thin, and elsewhere
+FINE_SIGMA, BROAD_SIGMA = 1.0, 3.0
+# voxels from middle to surface of labels too thin for the broad Gaussian, and of thick ones
+THIN_REACH = 4.0, 7.0
 REACH_VOXELS = 6  # within which the middle of a label is looked for
 VOLUME_SIGMA = 3.0  # voxels, least sigma of the Gaussian within which volumes are preserved
 VOLUME_BLOCK = 2  # voxels: volumes are summed over blocks
-NEAR_SURFACE = 0.05, 0.95  # distance range of voxels next to the surface: below 1, and centres keep their label
-MOST_LIFTED = 1.0  # voxels by which smoothing may change levels farther off: the error of distances to voxels
-LEAST_SLOPE = 0.3  # least slope of a level in measuring volumes; flatter levels are those of sheets of one voxel
+# distance range of voxels next to the surface: below 1, and centres keep their label
+NEAR_SURFACE = 0.05, 0.95
+# voxels by which smoothing may change levels farther off: the error of distances to voxels
+MOST_LIFTED = 1.0
+# least slope of a level in measuring volumes; flatter levels are those of sheets of one voxel
+LEAST_SLOPE = 0.3
 FLOW_STEPS = 4  # more steps do not improve spheres of 3 to 20 voxels or shells of 2 to 6
 FARTHEST_SQUARE = FARTHEST_DISTANCE**2
 DISTANCES = np.sqrt(np.arange(FARTHEST_SQUARE + 1)).astype(np.float32)  # by their squares
-# The distance to the voxels' surface by the squared distance to the nearest centre beyond it, negative inside.
+# The distance to the voxels' surface by the squared distance to the nearest centre beyond it,
+# negative inside.
 RAW_LEVELS = np.concatenate([0.5 - DISTANCES[:0:-1], [np.float32(0.0)], DISTANCES[1:] - 0.5])
 # Fraction of the broad Gaussian, by the squared distance from the middle to the surface.
 BROAD_FRACTIONS = np.clip((DISTANCES - THIN_REACH[0]) / (THIN_REACH[1] - THIN_REACH[0]), 0.0, 1.0)
 
 
 def smooth_level(
-    inside: NDArray[np.bool_], raw: NDArray[np.bool_], off: NDArray[np.float32] | None, factors: Sequence[int]
+    inside: NDArray[np.bool_],
+    raw: NDArray[np.bool_],
+    off: NDArray[np.float32] | None,
+    factors: Sequence[int],
 ) -> NDArray[np.float32]:
     """The smooth level of a label or a mask, (*shape) float32, clipped at `FARTHEST_LEVEL`.
 
-    Smoothing removes stairs like biharmonic flow: 2 G - G^2, with a Gaussian G, preserves planes and quadrics. Each
-    step then corrects volumes and returns voxels next to the surface to their own side, which undoes excessive
-    smoothing. Where nothing is thin the Gaussian is broad, since the stairs of a nearly flat surface are.
+    Smoothing removes stairs like biharmonic flow: 2 G - G^2, with a Gaussian G, preserves planes
+    and quadrics. Each step then corrects volumes and returns voxels next to the surface to their
+    own side, which undoes excessive smoothing. Where nothing is thin the Gaussian is broad, since
+    the stairs of a nearly flat surface are.
 
     Parameters
     ----------
@@ -50,7 +64,8 @@ def smooth_level(
     raw : (*shape) bool
         The same with the label of each voxel's slice, whose volume is preserved.
     off : (*shape) float32, optional
-        Distance of each voxel from the plane of a slice, voxels; 0 between slices with the same label, and by default.
+        Distance of each voxel from the plane of a slice, voxels; 0 between slices with the same
+        label, and by default.
     factors : sequence of int
         Thickness of a slice along each axis, voxels.
     """
@@ -58,7 +73,9 @@ def smooth_level(
         return np.full(inside.shape, -FARTHEST_LEVEL, dtype=np.float32)
     n, whole = inside.ndim, (1,) * (3 - inside.ndim) + inside.shape
     within, without = _near_squares(inside), _near_squares(~inside)
-    reach = np.minimum(largest_around(within, REACH_VOXELS), largest_around(without, REACH_VOXELS)).reshape(whole)
+    reach = np.minimum(
+        largest_around(within, REACH_VOXELS), largest_around(without, REACH_VOXELS)
+    ).reshape(whole)
     square = (without.view(np.int8) - within.view(np.int8)).reshape(whole)
     del within, without
     level, raw = _levels_of(square), raw.reshape(whole)
@@ -67,13 +84,16 @@ def smooth_level(
     for _ in range(FLOW_STEPS):
         level = _stepped(level, reach, n)
         _keep_volume(level, raw, sigma, square, off, n)
-    if max(factors) == 1:  # once more, between voxel centres: walls of two voxels would be 2 % too thick
+    # once more, between voxel centres: walls of two voxels would be 2 % too thick
+    if max(factors) == 1:
         _keep_volume(level, raw, sigma, square, off, n, is_exact=True)
     return np.clip(level, -FARTHEST_LEVEL, FARTHEST_LEVEL, out=level).reshape(inside.shape)
 
 
 def raw_level(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Distance to the nearest voxel centre on the other side less 0.5, voxels; negative inside, clipped where far."""
+    """Distance to the nearest voxel centre on the other side less 0.5, voxels; negative inside,
+    clipped where far.
+    """
     return _levels_of(_near_squares(~inside).view(np.int8) - _near_squares(inside).view(np.int8))
 
 
@@ -91,8 +111,8 @@ def _levels_of(square: NDArray[np.int8]) -> NDArray[np.float32]:
 def _near_squares(inside: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """Squares of distances to the nearest voxel centre outside; 0 outside, clipped where it is far.
 
-    The least sum of squared steps, axis by axis (Felzenszwalb and Huttenlocher 2012). As only short steps matter, all
-    are tried, in bytes: a tenth of the time of scipy's transform.
+    The least sum of squared steps, axis by axis (Felzenszwalb and Huttenlocher 2012). As only short
+    steps matter, all are tried, in bytes: a tenth of the time of scipy's transform.
     """
     assert FARTHEST_SQUARE + (FARTHEST_DISTANCE - 1) ** 2 < 256
     square = np.where(inside, np.uint8(FARTHEST_SQUARE), np.uint8(0))
@@ -119,12 +139,16 @@ def largest_around(values: NDArray, reach: int) -> NDArray:
         while 2 * length <= width:
             rows = np.maximum(rows[:-length], rows[length:])
             length *= 2
-        values = np.moveaxis(np.maximum(rows[:n], rows[width - length : width - length + n]), 0, axis)
+        values = np.moveaxis(
+            np.maximum(rows[:n], rows[width - length : width - length + n]), 0, axis
+        )
     return np.ascontiguousarray(values)
 
 
 def _stepped(level: NDArray[np.float32], reach: NDArray[np.uint8], n: int) -> NDArray[np.float32]:
-    """A step of the flow, with the broad Gaussian where nothing within `reach` is thin; the level is overwritten."""
+    """A step of the flow, with the broad Gaussian where nothing within `reach` is thin; the
+    level is overwritten.
+    """
     is_broad = BROAD_FRACTIONS[reach.max()] > 0.0
     broad = _flowed(level, BROAD_SIGMA, n, np.empty_like(level)) if is_broad else None
     smooth = _flowed(level, FINE_SIGMA, n, level)
@@ -133,8 +157,12 @@ def _stepped(level: NDArray[np.float32], reach: NDArray[np.uint8], n: int) -> ND
     return smooth
 
 
-def _flowed(level: NDArray[np.float32], sigma: float, n: int, rest: NDArray[np.float32]) -> NDArray[np.float32]:
-    """2 G - G^2 of a level (s_0, s_1, s_2), for the Gaussian G along its last n axes; `rest` gets what G removes."""
+def _flowed(
+    level: NDArray[np.float32], sigma: float, n: int, rest: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """2 G - G^2 of a level (s_0, s_1, s_2), for the Gaussian G along its last n axes; `rest`
+    gets what G removes.
+    """
     weights = np.exp(-0.5 / (sigma * sigma) * np.arange(int(3.0 * sigma + 0.5) + 1) ** 2)
     weights /= np.concatenate([weights[:0:-1], weights]).sum()
     result = np.empty_like(level)
@@ -148,21 +176,28 @@ def _flowed(level: NDArray[np.float32], sigma: float, n: int, rest: NDArray[np.f
         result[first:stop] += again
 
     over_slabs(fill_once, len(level), level.size)
-    over_slabs(lambda a, b: np.subtract(level[a:b], result[a:b], out=rest[a:b]), len(level), level.size)
+    over_slabs(
+        lambda a, b: np.subtract(level[a:b], result[a:b], out=rest[a:b]), len(level), level.size
+    )
     over_slabs(add_again, len(level), level.size)
     return result
 
 
 @njit(cache=True, nogil=True)
 def _fill_correlated(result: NDArray, data: NDArray, weights: NDArray, first: int, n: int) -> None:
-    """Correlate `data` along its last n axes with symmetric `weights` (R+1,), from the middle; constant beyond faces.
+    """Correlate `data` along its last n axes with symmetric `weights` (R+1,), from the middle;
+    constant beyond faces.
 
-    The planes of `result` are those of `data` from `first`. It equals `scipy.ndimage.correlate1d` along each axis to
-    the last bit, with sums in float64 and in its order, but rows are done at once, and a plane along two axes while it
-    is in the cache.
+    The planes of `result` are those of `data` from `first`. It equals `scipy.ndimage.correlate1d`
+    along each axis to the last bit, with sums in float64 and in its order, but rows are done at
+    once, and a plane along two axes while it is in the cache.
     """
     reach, (n_planes, n_rows, length) = len(weights) - 1, data.shape
-    plane, total, wide = np.empty((n_rows, length), dtype=np.float32), np.empty(length), np.empty(length + 2 * reach)
+    plane, total, wide = (
+        np.empty((n_rows, length), dtype=np.float32),
+        np.empty(length),
+        np.empty(length + 2 * reach),
+    )
     for p in range(len(result)):
         i = first + p
         for j in range(n_rows):
@@ -173,7 +208,11 @@ def _fill_correlated(result: NDArray, data: NDArray, weights: NDArray, first: in
                 for c in range(length):
                     total[c] *= weights[0]
                 for m in range(reach, 0, -1):
-                    low, high, weight = data[max(i - m, 0), j], data[min(i + m, n_planes - 1), j], weights[m]
+                    low, high, weight = (
+                        data[max(i - m, 0), j],
+                        data[min(i + m, n_planes - 1), j],
+                        weights[m],
+                    )
                     for c in range(length):
                         total[c] += (np.float64(low[c]) + np.float64(high[c])) * weight
             for c in range(length):
@@ -199,9 +238,13 @@ def _fill_correlated(result: NDArray, data: NDArray, weights: NDArray, first: in
                 row[c] = total[c]
 
 
-def _blend(smooth: NDArray[np.float32], broad: NDArray[np.float32], reach: NDArray[np.uint8]) -> None:
+def _blend(
+    smooth: NDArray[np.float32], broad: NDArray[np.float32], reach: NDArray[np.uint8]
+) -> None:
     """Replace a fraction of a level by that of the broad Gaussian, in place."""
-    over_slabs(lambda a, b: _blend_planes(smooth[a:b], broad[a:b], reach[a:b]), len(smooth), smooth.size)
+    over_slabs(
+        lambda a, b: _blend_planes(smooth[a:b], broad[a:b], reach[a:b]), len(smooth), smooth.size
+    )
 
 
 @njit(cache=True, nogil=True)
@@ -209,14 +252,22 @@ def _blend_planes(smooth: NDArray, broad: NDArray, reach: NDArray) -> None:
     for i in range(smooth.shape[0]):
         for j in range(smooth.shape[1]):
             for k in range(smooth.shape[2]):
-                smooth[i, j, k] += BROAD_FRACTIONS[reach[i, j, k]] * (broad[i, j, k] - smooth[i, j, k])
+                smooth[i, j, k] += BROAD_FRACTIONS[reach[i, j, k]] * (
+                    broad[i, j, k] - smooth[i, j, k]
+                )
 
 
 def _keep_volume(
-    level: NDArray[np.float32], raw: NDArray[np.bool_], sigma: float, square: NDArray[np.int8],
-    off: NDArray[np.float32], n: int, is_exact: bool = False,
-) -> None:  # fmt: skip
-    """Raise or lower the level smoothly, in place, so that it has the label's volume within `sigma`.
+    level: NDArray[np.float32],
+    raw: NDArray[np.bool_],
+    sigma: float,
+    square: NDArray[np.int8],
+    off: NDArray[np.float32],
+    n: int,
+    is_exact: bool = False,
+) -> None:
+    """Raise or lower the level smoothly, in place, so that it has the label's volume within
+    `sigma`.
 
     It stays within the bounds of `_bounds`.
     """
@@ -229,16 +280,23 @@ def _keep_volume(
             _add_between_centres(missing, area, level, raw, first, stop)
             return
         planes = VOLUME_BLOCK * first, min(VOLUME_BLOCK * stop, len(level))
-        mean = np.empty((planes[1] - planes[0], *whole[1:]), dtype=np.float32)  # with the level linear between centres
+        # with the level linear between centres
+        mean = np.empty((planes[1] - planes[0], *whole[1:]), dtype=np.float32)
         _fill_correlated(mean, level, np.array([0.75, 0.125]), planes[0], n)
         _fill_block_sums(missing[first:stop], area[first:stop], level, mean, raw, planes[0])
 
     over_slabs(fill_sums, blocks[0], level.size)
     both = np.stack([missing, area]).reshape(2, *blocks[3 - n :])
-    missing, area = np.concatenate(over_slabs(lambda a, b: _blurred(both[a:b], sigma), 2, level.size, 2))
-    lowered = np.where(area > 0.01 * VOLUME_BLOCK**n, missing / np.maximum(area, 1e-3), np.float32(0.0))
+    missing, area = np.concatenate(
+        over_slabs(lambda a, b: _blurred(both[a:b], sigma), 2, level.size, 2)
+    )
+    lowered = np.where(
+        area > 0.01 * VOLUME_BLOCK**n, missing / np.maximum(area, 1e-3), np.float32(0.0)
+    )
     lowered = lowered.reshape(blocks)
-    over_slabs(lambda first, stop: _lower(level, lowered, square, off, first, stop), len(level), level.size)
+    over_slabs(
+        lambda first, stop: _lower(level, lowered, square, off, first, stop), len(level), level.size
+    )
 
 
 def _blurred(sums: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
@@ -250,11 +308,12 @@ def _blurred(sums: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_block_sums(
     missing: NDArray, area: NDArray, level: NDArray, mean: NDArray, raw: NDArray, first: int
-) -> None:  # fmt: skip
-    """Sum over blocks the volume that a level lacks compared with its label, and the voxels that its surface crosses.
+) -> None:
+    """Sum over blocks the volume that a level lacks compared with its label, and the voxels that
+    its surface crosses.
 
-    The fraction of a voxel inside follows from the level's mean over it and its slope. The blocks and the planes of
-    `mean` begin at the plane `first`.
+    The fraction of a voxel inside follows from the level's mean over it and its slope. The blocks
+    and the planes of `mean` begin at the plane `first`.
     """
     lacking, is_near = np.zeros((2, 2, 2), dtype=np.float32), np.zeros((2, 2, 2), dtype=np.float32)
     half, one = np.float32(0.5), np.float32(1.0)
@@ -269,8 +328,11 @@ def _fill_block_sums(
                             if x >= level.shape[0] or y >= level.shape[1] or z >= level.shape[2]:
                                 continue
                             distance = mean[x - first, y, z]
-                            if abs(distance) < half:  # as the slope is 1 at most, others are full or empty anyway
-                                distance /= min(max(_slope(level, x, y, z), np.float32(LEAST_SLOPE)), one)
+                            # as the slope is 1 at most, others are full or empty anyway
+                            if abs(distance) < half:
+                                distance /= min(
+                                    max(_slope(level, x, y, z), np.float32(LEAST_SLOPE)), one
+                                )
                                 is_near[i, j, k] = np.float32(abs(distance) < half)
                             filled = min(max(half - distance, np.float32(0.0)), one)
                             lacking[i, j, k] = np.float32(raw[x, y, z]) - filled
@@ -280,12 +342,14 @@ def _fill_block_sums(
 @njit(cache=True, nogil=True, error_model="numpy")
 def _add_between_centres(
     missing: NDArray, area: NDArray, level: NDArray, raw: NDArray, first: int, stop: int
-) -> None:  # fmt: skip
-    """Add the sums of `_fill_block_sums`, by octants of the cubes of eight voxel centres that the surface crosses.
+) -> None:
+    """Add the sums of `_fill_block_sums`, by octants of the cubes of eight voxel centres that the
+    surface crosses.
 
     Only those of blocks from layer `first` to `stop`.
 
-    Every centre is on its label's side, so other cubes lack nothing. The area counts by what a lower level would fill.
+    Every centre is on its label's side, so other cubes lack nothing. The area counts by what a
+    lower level would fill.
     """
     corner, value = np.empty((8, 3), dtype=np.int64), np.empty(8)
     for i in range(max(2 * first - 1, 0), min(2 * stop, max(level.shape[0] - 1, 1))):
@@ -321,10 +385,16 @@ def _ends(level: NDArray, i: int, j: int, i1: int, j1: int, k: int) -> tuple[flo
 
 @njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
 def _in_octant(value: NDArray, m: int) -> tuple[float, float]:
-    """Distance of the middle of a cube's octant at corner m to the surface, in its edges, and the level's slope."""
+    """Distance of the middle of a cube's octant at corner m to the surface, in its edges, and
+    the level's slope.
+    """
     level, rise_x, rise_y, rise_z = 0.0, 0.0, 0.0, 0.0
     for q in range(8):
-        x, y, z = 0.25 + 0.5 * ((q ^ m) & 4 == 0), 0.25 + 0.5 * ((q ^ m) & 2 == 0), 0.25 + 0.5 * ((q ^ m) & 1 == 0)
+        x, y, z = (
+            0.25 + 0.5 * ((q ^ m) & 4 == 0),
+            0.25 + 0.5 * ((q ^ m) & 2 == 0),
+            0.25 + 0.5 * ((q ^ m) & 1 == 0),
+        )
         level += x * y * z * value[q]
         rise_x += y * z * (value[q] if q & 4 else -value[q])
         rise_y += x * z * (value[q] if q & 2 else -value[q])
@@ -341,7 +411,9 @@ def _block_sum(values: NDArray) -> np.float32:
 
 @njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
 def _slope(level: NDArray, x: int, y: int, z: int) -> np.float32:
-    """Length of the gradient, from the larger one-sided differences, as both sides cancel across a thin sheet."""
+    """Length of the gradient, from the larger one-sided differences, as both sides cancel across
+    a thin sheet.
+    """
     here, square = level[x, y, z], np.float32(0.0)
     last = level.shape[0] - 1, level.shape[1] - 1, level.shape[2] - 1
     for axis in range(3):
@@ -354,9 +426,16 @@ def _slope(level: NDArray, x: int, y: int, z: int) -> np.float32:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _lower(level: NDArray, lowered: NDArray, square: NDArray, off: NDArray, start: int, stop: int) -> None:
-    """Lower a level by values for blocks, linear between their centres, and keep it within bounds, in some planes."""
-    first, part = np.zeros((3, max(level.shape)), dtype=np.int64), np.zeros((3, max(level.shape)), dtype=np.float32)
+def _lower(
+    level: NDArray, lowered: NDArray, square: NDArray, off: NDArray, start: int, stop: int
+) -> None:
+    """Lower a level by values for blocks, linear between their centres, and keep it within
+    bounds, in some planes.
+    """
+    first, part = (
+        np.zeros((3, max(level.shape)), dtype=np.int64),
+        np.zeros((3, max(level.shape)), dtype=np.float32),
+    )
     for axis in range(3):
         n = lowered.shape[axis]
         for i in range(level.shape[axis] if level.shape[axis] > 1 else 0):
@@ -372,19 +451,27 @@ def _lower(level: NDArray, lowered: NDArray, square: NDArray, off: NDArray, star
             beside = min(b + 1, lowered.shape[1] - 1)
             for c in range(len(row)):
                 here = lowered[a, b, c] + (lowered[above, b, c] - lowered[a, b, c]) * u
-                there = lowered[a, beside, c] + (lowered[above, beside, c] - lowered[a, beside, c]) * u
+                there = (
+                    lowered[a, beside, c] + (lowered[above, beside, c] - lowered[a, beside, c]) * u
+                )
                 row[c] = here + (there - here) * v
             for z in range(level.shape[2]):
                 c = first[2, z]
                 here = row[c] + (row[min(c + 1, len(row) - 1)] - row[c]) * part[2, z]
-                low, high = _bounds(square[x, y, z], off[x, y, z] if len(off) > 0 else np.float32(0.0))
+                low, high = _bounds(
+                    square[x, y, z], off[x, y, z] if len(off) > 0 else np.float32(0.0)
+                )
                 level[x, y, z] = min(max(level[x, y, z] - here, low), high)
 
 
 @njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def _bounds(square: int, off: float) -> tuple[Any, Any]:
     """The least and the largest level of a voxel `off` voxels from a slice's plane."""
-    lifted, nearest, farthest = np.float32(MOST_LIFTED), np.float32(NEAR_SURFACE[0]), np.float32(NEAR_SURFACE[1])
+    lifted, nearest, farthest = (
+        np.float32(MOST_LIFTED),
+        np.float32(NEAR_SURFACE[0]),
+        np.float32(NEAR_SURFACE[1]),
+    )
     raw = RAW_LEVELS[square + FARTHEST_SQUARE]
     size = abs(raw)
     least = max(size - lifted, nearest) - off

@@ -1,7 +1,9 @@
-"""Statistics of an image's voxels from one pass over boxes, so that the volume need not fit into memory.
+"""Statistics of an image's voxels from one pass over boxes, so that the volume need not fit into
+memory.
 
-Sums run along rows of the last axis first, and rows are added in their order, so that results are the same to the last
-bit however the volume is divided into boxes, and whether it is stored or in memory.
+Sums run along rows of the last axis first, and rows are added in their order, so that results are
+the same to the last bit however the volume is divided into boxes, and whether it is stored or in
+memory.
 """
 
 from __future__ import annotations
@@ -74,13 +76,19 @@ def statistics(image: Image) -> Statistics:
     Raises
     ------
     InputError
-        Voxels that are invalid for an `Image`: not real numbers, NaN, infinite, or too large to be squared.
+        Voxels that are invalid for an `Image`: not real numbers, NaN, infinite, or too large to be
+        squared.
     """
     shape = image.shape
     check_kind(image.voxels.dtype)
     stride, middles = noise_places(shape)
-    n_voxels, need = float(np.prod(shape, dtype=np.float64)), NOISE_PLANE_BYTES * len(middles) * shape[1] * shape[2]
-    check_memory(need + image.box_bytes, f"image: {n_voxels:.3g} voxels", "make its shortest axis the last")
+    n_voxels, need = (
+        float(np.prod(shape, dtype=np.float64)),
+        NOISE_PLANE_BYTES * len(middles) * shape[1] * shape[2],
+    )
+    check_memory(
+        need + image.box_bytes, f"image: {n_voxels:.3g} voxels", "make its shortest axis the last"
+    )
     sums, squares = np.empty(shape[:2]), np.empty(shape[:2])
     near = np.empty((3, len(middles), *shape[1:]))
     places = np.unravel_index(np.arange(0, int(n_voxels), stride), shape)
@@ -89,22 +97,33 @@ def statistics(image: Image) -> Statistics:
     for box in image.boxes():
         values = image.read([s.start for s in box], [s.stop for s in box])
         for k in range(3):
-            for number in np.flatnonzero((middles + k - 1 >= box[0].start) & (middles + k - 1 < box[0].stop)):
+            for number in np.flatnonzero(
+                (middles + k - 1 >= box[0].start) & (middles + k - 1 < box[0].stop)
+            ):
                 near[k, number, box[1]] = values[middles[number] + k - 1 - box[0].start]
         is_here = (places[0] >= box[0].start) & (places[0] < box[0].stop)
         is_here &= (places[1] >= box[1].start) & (places[1] < box[1].stop)
-        sample[is_here] = values[tuple(axis[is_here] - s.start for axis, s in zip(places, box, strict=True))]
+        sample[is_here] = values[
+            tuple(axis[is_here] - s.start for axis, s in zip(places, box, strict=True))
+        ]
         for piece in pieces(values.shape):
             part = np.array(values[piece], dtype=np.float64, order="C")
             is_bad = ~np.isfinite(part)
             if is_bad.any():
                 n_bad += int(np.count_nonzero(is_bad))
-                place = np.argwhere(is_bad)[0] + [a.start + b.start for a, b in zip(box, piece, strict=True)]
+                place = np.argwhere(is_bad)[0] + [
+                    a.start + b.start for a, b in zip(box, piece, strict=True)
+                ]
                 first_bad = min(first_bad, tuple(int(i) for i in place))
                 continue
             low, high = min(low, float(part.min())), max(high, float(part.max()))
-            is_whole = is_whole and (values.dtype.kind in "bui" or bool((part == np.rint(part)).all()))
-            rows = tuple(slice(a.start + b.start, a.start + b.stop) for a, b in zip(box[:2], piece[:2], strict=True))
+            is_whole = is_whole and (
+                values.dtype.kind in "bui" or bool((part == np.rint(part)).all())
+            )
+            rows = tuple(
+                slice(a.start + b.start, a.start + b.stop)
+                for a, b in zip(box[:2], piece[:2], strict=True)
+            )
             with np.errstate(over="ignore", invalid="ignore"):
                 sums[rows] = row_sums(part)
                 part -= sums[rows][..., None] / shape[2]
@@ -115,7 +134,9 @@ def statistics(image: Image) -> Statistics:
     # Variance of all voxels: within rows, and between the rows' means (Chan, Golub & LeVeque 1983).
     variance = (squares.sum() + shape[2] * ((sums / shape[2] - mean) ** 2).sum()) / n_voxels
     of_voxels = NoiseSample(sample, near)
-    result = Statistics(mean, low, high, float(variance), sampled_noise(of_voxels) ** 2, 0.0, is_whole)
+    result = Statistics(
+        mean, low, high, float(variance), sampled_noise(of_voxels) ** 2, 0.0, is_whole
+    )
     scaled = NoiseSample(*((each - mean) / result.scale for each in of_voxels))
     return result._replace(scaled_noise=sampled_noise(scaled) ** 2)
 

@@ -1,10 +1,11 @@
 """Local thickness of labels: the diameter of the largest ball within a label that covers a place.
 
-The local thickness of Hildebrand and Ruegsegger (1997, J. Microsc. 185, 67) is measured between the smooth surfaces of
-labels (`tetopt.contents.memberships`) rather than between voxels: a sheet of 1.5 voxels has 1.5, where distances of
-voxel centres would give 1 or 2. At a voxel in the middle of its label, the diameter is the shortest of the 13 chords
-through it along axes and diagonals, times the cosine of its angle with the surfaces' normals (the mean of both ends).
-A chord ends where another label's level becomes as small; between facets, it ends where it crosses one.
+The local thickness of Hildebrand and Ruegsegger (1997, J. Microsc. 185, 67) is measured between the
+smooth surfaces of labels (`tetopt.contents.memberships`) rather than between voxels: a sheet of 1.5
+voxels has 1.5, where distances of voxel centres would give 1 or 2. At a voxel in the middle of its
+label, the diameter is the shortest of the 13 chords through it along axes and diagonals, times the
+cosine of its angle with the surfaces' normals (the mean of both ends). A chord ends where another
+label's level becomes as small; between facets, it ends where it crosses one.
 """
 
 from __future__ import annotations
@@ -24,33 +25,41 @@ from tetopt.system.budget import check_memory
 from tetopt.system.kernel_cache import njit
 from tetopt.system.slabs import over_slabs
 
-THICKNESS_PERCENTILES = (5.0, 50.0, 95.0)  # percentiles over a label's voxels that describe its thickness
+# percentiles over a label's voxels that describe its thickness
+THICKNESS_PERCENTILES = (5.0, 50.0, 95.0)
 THICKNESS_BYTES = 19.0  # per voxel: chords, thickness, the labels, and the labels within a region
 STEP_BYTES, CROSSING_BYTES = 1.0, 2.0  # per direction, and voxel of the slabs in work
 BEYOND_REGION = -1  # stands for a label beyond the region
 NO_CROSSING = 2**16 - 1  # marks a step that no facet crosses
 COSINE_STEPS = 256  # steps of a cosine; a crossing is a multiple of as many steps
-SLAB_PLANES = 80  # planes of a slab, at least: crossings and steps are counted in those around it, too
+# planes of a slab, at least: crossings and steps are counted in those around it, too
+SLAB_PLANES = 80
 MOST_STEPS = 255  # counted steps within a label
-LEAST_COSINE = 0.75  # between the shortest chord and a normal; smaller at creases, which have no normal
+# between the shortest chord and a normal; smaller at creases, which have no normal
+LEAST_COSINE = 0.75
 BESIDE_FRACTION = 1e-9  # of a triangle's size: places this little outside count as inside
 ABOVE_LIMIT = 1.0 + 1e-9  # times an upper limit of a chord: above it, however rounded
-OFF_MIDDLE_STEPS = 1.01  # largest difference of the two ways along the shortest chord through a middle
+# largest difference of the two ways along the shortest chord through a middle
+OFF_MIDDLE_STEPS = 1.01
 
 
 class _Labels(NamedTuple):
     """Labels on a grid, as passed to kernels."""
 
-    partition: NDArray[np.int16]  # (s_0, s_1, s_2) row of the label; -1 beyond the region; small, to fit into caches
+    # (s_0, s_1, s_2) row of the label; -1 beyond the region; small, to fit into caches
+    partition: NDArray[np.int16]
     levels: NDArray[np.float32]  # (C, s_0, s_1, s_2)
     channel: NDArray[np.int64]  # (K,)
-    # (D, s_0, s_1, s_2) place where facets cross each step up, 0 to 254, times 256, plus the cosine of the angle, 0 to
-    # 255;
+    # (D, s_0, s_1, s_2) place where facets cross each step up, 0 to 254, times 256, plus the cosine
+    # of the angle, 0 to 255;
     crossing: NDArray[np.uint16]  # empty if there are levels
 
 
 def local_thickness(
-    members: Memberships, spacing: NDArray[np.float64], most: float, inside: NDArray[np.bool_] | None = None
+    members: Memberships,
+    spacing: NDArray[np.float64],
+    most: float,
+    inside: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float32]:
     """The local thickness of each voxel's label.
 
@@ -76,21 +85,27 @@ def local_thickness(
         Not enough memory for it.
     """
     _check_room(members.partition.shape, STEP_BYTES, spacing, 0.0)
-    partition = members.partition if inside is None else np.where(inside, members.partition, BEYOND_REGION)
+    partition = (
+        members.partition if inside is None else np.where(inside, members.partition, BEYOND_REGION)
+    )
     whole = (1,) * (3 - members.partition.ndim) + members.partition.shape
     levels = members.levels.reshape(-1, *whole)
     return _thickness(partition, levels, members.channel, None, spacing, most)
 
 
 def thickness_between(
-    corners: NDArray[np.float64], partition: NDArray[np.integer], spacing: NDArray[np.float64], most: float
+    corners: NDArray[np.float64],
+    partition: NDArray[np.integer],
+    spacing: NDArray[np.float64],
+    most: float,
 ) -> NDArray[np.float32]:
     """Local thickness of labels whose surfaces are facets, such as those of a mesh.
 
     Parameters
     ----------
     corners : (F, n, n) float64
-        Nodes of each facet between two labels, mm from the centre of the first voxel, along the grid's axes.
+        Nodes of each facet between two labels, mm from the centre of the first voxel, along the
+        grid's axes.
     partition : (s_0, ..., s_{n-1}) array of int
         Label of each voxel's centre, any whole number from 0; -1 beyond the region.
     spacing : (n,) float64
@@ -110,15 +125,23 @@ def thickness_between(
     """
     _check_room(partition.shape, STEP_BYTES + CROSSING_BYTES, spacing, most)
     if partition.ndim == 2:  # a segment becomes a rectangle across the plane, of two triangles
-        flat = np.stack([np.pad(corners, ((0, 0), (0, 0), (1, 0)), constant_values=x) for x in (-1.0, 1.0)], axis=2)
-        flat = flat.reshape(len(corners), 4, 3)  # below and above the first node, and then the second
+        flat = np.stack(
+            [np.pad(corners, ((0, 0), (0, 0), (1, 0)), constant_values=x) for x in (-1.0, 1.0)],
+            axis=2,
+        )
+        # below and above the first node, and then the second
+        flat = flat.reshape(len(corners), 4, 3)
         corners = np.concatenate([flat[:, :3], flat[:, 1:]])
     no_levels = np.zeros((1, 1, 1, 1), dtype=np.float32)
     return _thickness(partition, no_levels, np.zeros(1, dtype=np.int64), corners, spacing, most)
 
 
-def _check_room(shape: tuple[int, ...], n_bytes: float, spacing: NDArray[np.float64], beyond: float) -> None:
-    """Check the memory for a grid, with `n_bytes` per direction in the slabs in work and `beyond` them, mm."""
+def _check_room(
+    shape: tuple[int, ...], n_bytes: float, spacing: NDArray[np.float64], beyond: float
+) -> None:
+    """Check the memory for a grid, with `n_bytes` per direction in the slabs in work and
+    `beyond` them, mm.
+    """
     planes = 2.0 * beyond / float(min(spacing)) + SLAB_PLANES
     fraction = min(numba.get_num_threads() * planes / shape[0], 1.0)
     n_bytes = THICKNESS_BYTES + n_bytes * len(_rays(spacing)[0][0]) * fraction
@@ -126,16 +149,27 @@ def _check_room(shape: tuple[int, ...], n_bytes: float, spacing: NDArray[np.floa
 
 
 def _thickness(
-    partition: NDArray[np.integer], levels: NDArray[np.float32], channel: NDArray[np.int64],
-    corners: NDArray[np.float64] | None, spacing: NDArray[np.float64], most: float,
-) -> NDArray[np.float32]:  # fmt: skip
-    """`local_thickness` of labels by row (-1 beyond the region), between levels or facets' corners on a 3-D grid."""
+    partition: NDArray[np.integer],
+    levels: NDArray[np.float32],
+    channel: NDArray[np.int64],
+    corners: NDArray[np.float64] | None,
+    spacing: NDArray[np.float64],
+    most: float,
+) -> NDArray[np.float32]:
+    """`local_thickness` of labels by row (-1 beyond the region), between levels or facets'
+    corners on a 3-D grid.
+    """
     n, axis = partition.ndim, 3 - partition.ndim
     whole = (1,) * axis + partition.shape
-    rows, no_crossing = partition.reshape(whole).astype(np.int16, copy=False), np.zeros((0, 1, 1, 1), np.uint16)
+    rows, no_crossing = (
+        partition.reshape(whole).astype(np.int16, copy=False),
+        np.zeros((0, 1, 1, 1), np.uint16),
+    )
     labels = _Labels(rows, levels, channel, no_crossing)
     (steps, lengths), edges = _rays(spacing)
-    ways = np.cumsum(np.pad(np.repeat(lengths[:, None], MOST_STEPS, axis=1), ((0, 0), (1, 0))), axis=1)
+    ways = np.cumsum(
+        np.pad(np.repeat(lengths[:, None], MOST_STEPS, axis=1), ((0, 0), (1, 0))), axis=1
+    )
     rays = steps, ways, edges
     chord, is_middle = np.zeros(whole, dtype=np.float32), np.zeros(whole, dtype=np.bool_)
     reach = int(most / lengths.min()) + 1
@@ -144,7 +178,8 @@ def _thickness(
         if corners is None:
             _fill_chords(chord, is_middle, labels, rays, most, reach, slab)
             return
-        # Crossings are kept as far from the slab as chords reach: 26 bytes a voxel of these planes alone.
+        # Crossings are kept as far from the slab as chords reach: 26 bytes a voxel of these planes
+        # alone.
         first, stop = slab[axis]
         ends = max(first - reach, 0), min(stop + reach, whole[axis])
         around = (slice(None),) * axis + (slice(*ends),)
@@ -158,41 +193,76 @@ def _thickness(
     n_slabs = max(whole[axis] // SLAB_PLANES, numba.get_num_threads())
     _over_slabs(fill, whole, n, n_slabs)
     thickness = chord.copy()
-    _over_slabs(lambda slab: _spread_balls(thickness, chord, is_middle, labels.partition, edges, slab), whole, n)
+    _over_slabs(
+        lambda slab: _spread_balls(thickness, chord, is_middle, labels.partition, edges, slab),
+        whole,
+        n,
+    )
     return thickness.reshape(partition.shape)
 
 
 def _over_slabs(
-    fill: Callable[[tuple[tuple[int, int], ...]], None], whole: tuple[int, ...], n: int, most: int | None = None
+    fill: Callable[[tuple[tuple[int, int], ...]], None],
+    whole: tuple[int, ...],
+    n: int,
+    most: int | None = None,
 ) -> None:
-    """Call a function for each slab of a grid, on all threads; each call writes only to its slab."""
+    """Call a function for each slab of a grid, on all threads; each call writes only to its
+    slab.
+    """
     box = [(0, size) for size in whole]
-    over_slabs(lambda *ends: fill((*box[: 3 - n], ends, *box[4 - n :])), whole[3 - n], prod(whole), most)
+    over_slabs(
+        lambda *ends: fill((*box[: 3 - n], ends, *box[4 - n :])), whole[3 - n], prod(whole), most
+    )
 
 
-def _rays(spacing: NDArray[np.float64]) -> tuple[tuple[NDArray[np.int64], NDArray[np.float64]], NDArray[np.float64]]:
-    """Steps (D, 3) along axes and diagonals, one of each opposite pair, their lengths, and a voxel's edges."""
+def _rays(
+    spacing: NDArray[np.float64],
+) -> tuple[tuple[NDArray[np.int64], NDArray[np.float64]], NDArray[np.float64]]:
+    """Steps (D, 3) along axes and diagonals, one of each opposite pair, their lengths, and a
+    voxel's edges.
+    """
     n = len(spacing)
     edges = np.concatenate([np.ones(3 - n), spacing])
-    steps = np.array([s for s in itertools.product((-1, 0, 1), repeat=3) if s > (0, 0, 0) and not any(s[: 3 - n])])
+    steps = np.array(
+        [
+            s
+            for s in itertools.product((-1, 0, 1), repeat=3)
+            if s > (0, 0, 0) and not any(s[: 3 - n])
+        ]
+    )
     return (steps, np.linalg.norm(steps * edges, axis=1)), edges
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_chords(
-    chord: NDArray, is_middle: NDArray, labels: _Labels, rays: tuple[NDArray, NDArray, NDArray], most: float,
-    reach: int, slab: tuple[tuple[int, int], ...],
-) -> None:  # fmt: skip
-    """Fill in the shortest chord through each voxel of a slab, across its surfaces, and mark voxels in its middle.
+    chord: NDArray,
+    is_middle: NDArray,
+    labels: _Labels,
+    rays: tuple[NDArray, NDArray, NDArray],
+    most: float,
+    reach: int,
+    slab: tuple[tuple[int, int], ...],
+) -> None:
+    """Fill in the shortest chord through each voxel of a slab, across its surfaces, and mark voxels
+    in its middle.
 
-    Ways begin after the steps that stay within the label, which are counted from voxel to voxel, from as many planes
-    (rows in 2-D) beyond the slab as chords reach: a tenth of the time of walking from each voxel.
+    Ways begin after the steps that stay within the label, which are counted from voxel to voxel,
+    from as many planes (rows in 2-D) beyond the slab as chords reach: a tenth of the time of
+    walking from each voxel.
     """
     (steps, ways, edges), partition = rays, labels.partition
     low, high = max(slab[1][0] - reach, 0), min(slab[1][1] + reach, partition.shape[1])
     before, after = max(slab[0][0] - reach, 0), min(slab[0][1] + reach, partition.shape[0])
-    first, size, most_steps = slab[0][0], (len(steps), high - low, partition.shape[2]), min(reach, MOST_STEPS)
-    up, beyond = np.zeros((slab[0][1] - first, *size), dtype=np.uint8), np.zeros((2, *size), dtype=np.uint8)
+    first, size, most_steps = (
+        slab[0][0],
+        (len(steps), high - low, partition.shape[2]),
+        min(reach, MOST_STEPS),
+    )
+    up, beyond = (
+        np.zeros((slab[0][1] - first, *size), dtype=np.uint8),
+        np.zeros((2, *size), dtype=np.uint8),
+    )
     part = partition[:, low:high]
     for i in range(after - 1, first - 1, -1):
         here = up[i - first] if i < slab[0][1] else beyond[i % 2]
@@ -206,7 +276,8 @@ def _fill_chords(
                 if partition[i, j, k] < 0:
                     continue
                 least, off_middle, shortest = most, np.inf, -1
-                for d in range(len(steps)):  # a chord ends within a step of both voxels, if these are known
+                # a chord ends within a step of both voxels, if these are known
+                for d in range(len(steps)):
                     n, m = up[i - first, d, j - low, k], down[d, j - low, k]
                     if max(n, m) < most_steps:
                         least = min(least, (ways[d, n + 1] + ways[d, m + 1]) * ABOVE_LIMIT)
@@ -221,7 +292,11 @@ def _fill_chords(
                     step = (-step[0], -step[1], -step[2])
                     back = _way(labels, (i, j, k), (-1 - d, step), ways, m, least - forth)
                     if forth + back < least:
-                        least, off_middle, shortest = forth + back, abs(forth - back) / ways[d, 1], d
+                        least, off_middle, shortest = (
+                            forth + back,
+                            abs(forth - back) / ways[d, 1],
+                            d,
+                        )
                 if shortest >= 0:
                     step, length = row(steps, shortest), ways[shortest, 1]
                     forth = _cosine(labels, (i, j, k), (shortest, step), length, edges)
@@ -233,11 +308,14 @@ def _fill_chords(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fill_steps(count: NDArray, last: NDArray, partition: NDArray, i: int, steps: NDArray, most: int) -> None:
-    """Count the steps (D, 3) from voxels of plane i that stay within their label, (D, s_1, s_2), up to `most`.
+def _fill_steps(
+    count: NDArray, last: NDArray, partition: NDArray, i: int, steps: NDArray, most: int
+) -> None:
+    """Count the steps (D, 3) from voxels of plane i that stay within their label, (D, s_1, s_2), up
+    to `most`.
 
-    It is `most`, too, where they leave the grid. `last` has the counts of the plane before, to which steps across
-    planes lead, all of them in the same sense.
+    It is `most`, too, where they leave the grid. `last` has the counts of the plane before, to
+    which steps across planes lead, all of them in the same sense.
     """
     _, n_rows, n_columns = partition.shape
     for d in range(len(steps)):
@@ -251,8 +329,14 @@ def _fill_steps(count: NDArray, last: NDArray, partition: NDArray, i: int, steps
                 count[d, j] = most
                 continue
             count[d, j, 0] = count[d, j, n_columns - 1] = most
-            own, other = partition[i, j, begin : begin + size], partition[a, b, begin + t : begin + t + size]
-            here, there = count[d, j, begin : begin + size], source[d, b, begin + t : begin + t + size]
+            own, other = (
+                partition[i, j, begin : begin + size],
+                partition[a, b, begin + t : begin + t + size],
+            )
+            here, there = (
+                count[d, j, begin : begin + size],
+                source[d, b, begin + t : begin + t + size],
+            )
             for m in range(size):
                 at = size - 1 - m if t > 0 and b == j else m
                 here[at] = min(there[at] + 1, most) if own[at] == other[at] else 0
@@ -260,14 +344,20 @@ def _fill_steps(count: NDArray, last: NDArray, partition: NDArray, i: int, steps
 
 @njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
 def _way(
-    labels: _Labels, place: tuple[int, int, int], direction: tuple[int, tuple[int, int, int]], ways: NDArray, n: int,
+    labels: _Labels,
+    place: tuple[int, int, int],
+    direction: tuple[int, tuple[int, int, int]],
+    ways: NDArray,
+    n: int,
     most: float,
-) -> float:  # fmt: skip
-    """Distance from a voxel's centre to its label's surface along steps, mm; infinite if the grid ends, or at `most`.
+) -> float:
+    """Distance from a voxel's centre to its label's surface along steps, mm; infinite if the grid
+    ends, or at `most`.
 
-    `direction` is its number and its step; steps down have numbers -1 to -D. `ways` has the length of any number of
-    steps along each, of which the first `n` stay within the label. It is inlined: a call would take twice as long as
-    its body. Steps are tuples: views of arrays, which threads count together, doubled the time of all chords.
+    `direction` is its number and its step; steps down have numbers -1 to -D. `ways` has the length
+    of any number of steps along each, of which the first `n` stay within the label. It is inlined:
+    a call would take twice as long as its body. Steps are tuples: views of arrays, which threads
+    count together, doubled the time of all chords.
     """
     partition, levels, channel, crossing = labels
     (i, j, k), (d, step) = place, direction
@@ -276,7 +366,11 @@ def _way(
     i, j, k = i + n * step[0], j + n * step[1], k + n * step[2]
     while way < most:
         a, b, c = i + step[0], j + step[1], k + step[2]
-        is_in = 0 <= a < partition.shape[0] and 0 <= b < partition.shape[1] and 0 <= c < partition.shape[2]
+        is_in = (
+            0 <= a < partition.shape[0]
+            and 0 <= b < partition.shape[1]
+            and 0 <= c < partition.shape[2]
+        )
         if not is_in:
             return np.inf
         if partition[a, b, c] < 0:
@@ -298,10 +392,14 @@ def _way(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _cosine(
-    labels: _Labels, place: tuple[int, int, int], direction: tuple[int, tuple[int, int, int]], length: float,
+    labels: _Labels,
+    place: tuple[int, int, int],
+    direction: tuple[int, tuple[int, int, int]],
+    length: float,
     edges: NDArray,
-) -> float:  # fmt: skip
-    """Cosine of the angle between a way to the label's surface (`_way`) and the normal there; 1 if that is unknown.
+) -> float:
+    """Cosine of the angle between a way to the label's surface (`_way`) and the normal there; 1 if
+    that is unknown.
 
     Between levels the normal is along the gradient of the other label's level.
     """
@@ -309,7 +407,11 @@ def _cosine(
     (i, j, k), (d, step) = place, direction
     a, b, c = i + step[0], j + step[1], k + step[2]
     while True:
-        is_in = 0 <= a < partition.shape[0] and 0 <= b < partition.shape[1] and 0 <= c < partition.shape[2]
+        is_in = (
+            0 <= a < partition.shape[0]
+            and 0 <= b < partition.shape[1]
+            and 0 <= c < partition.shape[2]
+        )
         if not is_in or partition[a, b, c] < 0:
             return 1.0
         if partition[a, b, c] != partition[i, j, k]:
@@ -317,7 +419,11 @@ def _cosine(
         i, j, k, a, b, c = a, b, c, a + step[0], b + step[1], c + step[2]
     if len(crossing) > 0:
         part = crossing[d, i, j, k] if d >= 0 else crossing[-1 - d, a, b, c]
-        return 1.0 if part == NO_CROSSING else max((part % COSINE_STEPS) / (COSINE_STEPS - 1.0), LEAST_COSINE)
+        return (
+            1.0
+            if part == NO_CROSSING
+            else max((part % COSINE_STEPS) / (COSINE_STEPS - 1.0), LEAST_COSINE)
+        )
     level, at = levels[channel[partition[a, b, c]]], (a, b, c)
     along, square = 0.0, 0.0
     for axis in range(3):
@@ -333,10 +439,16 @@ def _cosine(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _spread_balls(
-    thickness: NDArray, chord: NDArray, is_middle: NDArray, partition: NDArray, edges: NDArray,
+    thickness: NDArray,
+    chord: NDArray,
+    is_middle: NDArray,
+    partition: NDArray,
+    edges: NDArray,
     slab: tuple[tuple[int, int], ...],
-) -> None:  # fmt: skip
-    """Raise the thickness of a slab's voxels to the diameter of the largest ball around a middle that covers them."""
+) -> None:
+    """Raise the thickness of a slab's voxels to the diameter of the largest ball around a middle
+    that covers them.
+    """
     for i in range(partition.shape[0]):
         for j in range(partition.shape[1]):
             for k in range(partition.shape[2]):
@@ -351,23 +463,35 @@ def _spread_balls(
                         if y > r * r:
                             continue
                         for c in range(max(k - r2, slab[2][0]), min(k + r2 + 1, slab[2][1])):
-                            is_in = thickness[a, b, c] < size and y + ((c - k) * edges[2]) ** 2 <= r * r
+                            is_in = (
+                                thickness[a, b, c] < size and y + ((c - k) * edges[2]) ** 2 <= r * r
+                            )
                             if is_in and partition[a, b, c] == partition[i, j, k]:
                                 thickness[a, b, c] = size
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_crossings(
-    crossing: NDArray, corners: NDArray, ways: NDArray, edges: NDArray, ends: tuple[int, int], axis: int
+    crossing: NDArray,
+    corners: NDArray,
+    ways: NDArray,
+    edges: NDArray,
+    ends: tuple[int, int],
+    axis: int,
 ) -> None:
-    """Find where triangles first cross the ways (D, 3), mm, up from voxel centres, in a slab across an axis.
+    """Find where triangles first cross the ways (D, 3), mm, up from voxel centres, in a slab across
+    an axis.
 
     `crossing` has the planes of the slab alone.
     The cosine of the angle between way and normal is stored, too (`_Labels`).
 
     A triangle's height over a place is in lengths of its normal, which is not a unit vector.
     """
-    first, last, rise = np.zeros(3, dtype=np.int64), np.zeros(3, dtype=np.int64), np.zeros(len(ways))
+    first, last, rise = (
+        np.zeros(3, dtype=np.int64),
+        np.zeros(3, dtype=np.int64),
+        np.zeros(len(ways)),
+    )
     lengths, origin = np.sqrt((ways * ways).sum(axis=1)), np.zeros(3, dtype=np.int64)
     origin[axis] = ends[0]
     for facet in range(len(corners)):
@@ -395,13 +519,18 @@ def _fill_crossings(
                         t = -height / rise[s]
                         if _is_within(minus(place, scaled(-t, row(ways, s))), u, v):
                             part = COSINE_STEPS * int((COSINE_STEPS - 2) * t + 0.5)
-                            part += int((COSINE_STEPS - 1) * min(abs(rise[s]) / (size * lengths[s]), 1.0) + 0.5)
+                            part += int(
+                                (COSINE_STEPS - 1) * min(abs(rise[s]) / (size * lengths[s]), 1.0)
+                                + 0.5
+                            )
                             at = s, i - origin[0], j - origin[1], k - origin[2]
                             crossing[at] = min(crossing[at], np.uint16(part))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _is_within(place: tuple[float, float, float], u: tuple[float, float, float], v: tuple[float, float, float]) -> bool:
+def _is_within(
+    place: tuple[float, float, float], u: tuple[float, float, float], v: tuple[float, float, float]
+) -> bool:
     """True if a place in the plane of a triangle (corners 0, u and v) lies inside it."""
     uu, vv, uv, along_u, along_v = dot(u, u), dot(v, v), dot(u, v), dot(u, place), dot(v, place)
     square = uu * vv - uv * uv

@@ -6,7 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.contents.content import Content
-from tetopt.energy.sampling import cell_moments, channel_grid, check_orientations, moment_sums, to_ticks
+from tetopt.energy.sampling import (
+    cell_moments,
+    channel_grid,
+    check_orientations,
+    moment_sums,
+    to_ticks,
+)
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 
@@ -14,9 +20,10 @@ from tetopt.mesh import Mesh
 def cell_E_D(image: Image, mesh: Mesh) -> NDArray[np.float64]:
     """Each cell's contribution to E_D, (M,) float64, intensity^2 mm^n.
 
-    E_D = sum_j integral over cell j of (h - hbar_j)^2, with h constant on a voxel, each voxel counted whole in
-    the cell that contains its centre, and hbar_j the cell's mean. So E_D lies between 0 and the image's variance
-    times its volume, the value of a single cell around everything. Cells without a voxel centre have 0.
+    E_D = sum_j integral over cell j of (h - hbar_j)^2, with h constant on a voxel, each voxel
+    counted whole in the cell that contains its centre, and hbar_j the cell's mean. So E_D lies
+    between 0 and the image's variance times its volume, the value of a single cell around
+    everything. Cells without a voxel centre have 0.
 
     Raises
     ------
@@ -30,9 +37,9 @@ def cell_E_D(image: Image, mesh: Mesh) -> NDArray[np.float64]:
 def E_D(image: Image, mesh: Mesh) -> float:
     """The discretization energy of equation (3), intensity^2 mm^n.
 
-    The sum over cells of the integral of (h - hbar)^2, where hbar is the mean of h over the cell. h is constant on a
-    voxel, and each voxel counts fully in the cell that contains its centre. E_D lies between 0 and the image's variance
-    times its volume.
+    The sum over cells of the integral of (h - hbar)^2, where hbar is the mean of h over the cell. h
+    is constant on a voxel, and each voxel counts fully in the cell that contains its centre. E_D
+    lies between 0 and the image's variance times its volume.
 
     Parameters
     ----------
@@ -71,10 +78,11 @@ def E_D(image: Image, mesh: Mesh) -> float:
 
 
 def unexplained(content: Content, mesh: Mesh) -> float | None:
-    """Return the unexplained variance: the fraction of the variance of the voxels in cells that is left within cells.
+    """Return the unexplained variance: the fraction of the variance of the voxels in cells that is
+    left within cells.
 
-    It is over all channels, from 0 to 1. Unlike E_D it has no penalty for voxels on the wrong side of a mask's surface.
-    None if these voxels are equal, or if there are none.
+    It is over all channels, from 0 to 1. Unlike E_D it has no penalty for voxels on the wrong side
+    of a mask's surface. None if these voxels are equal, or if there are none.
 
     Raises
     ------
@@ -97,20 +105,25 @@ def _columns(content: Content) -> list[int]:
 
 
 def _channel_sums(content: Content, mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the sums over each cell (M, D), see `moment_sums`, and its sum of squares about its means (M,)."""
+    """Return the sums over each cell (M, D), see `moment_sums`, and its sum of squares about its
+    means (M,).
+    """
     grid = channel_grid(content, mesh.points)
     ticks = to_ticks(content.image.to_index(mesh.points), grid)
     check_orientations(content.image, ticks, mesh.cells)
     sums = moment_sums(grid, ticks, mesh.cells)
-    squares = sums[:, 2] - (sums[:, _columns(content)] ** 2).sum(axis=1) / np.maximum(sums[:, 0], 1.0)
+    squares = sums[:, 2] - (sums[:, _columns(content)] ** 2).sum(axis=1) / np.maximum(
+        sums[:, 0], 1.0
+    )
     return sums, np.where(sums[:, 0] > 0.0, np.maximum(squares, 0.0), 0.0)
 
 
 def content_E_D(content: Content, mesh: Mesh) -> tuple[float, int]:
-    """E_D of a mesh over all channels of a content, intensity^2 mm^n, and the number of voxels in its cells.
+    """E_D of a mesh over all channels of a content, intensity^2 mm^n, and the number of voxels in
+    its cells.
 
-    A run's history records this value: with a mask, each voxel on the wrong side of its surface adds
-    `Content.wrong_side`.
+    A run's history records this value: with a mask, each voxel on the wrong side of its surface
+    adds `Content.wrong_side`.
 
     Raises
     ------
@@ -125,7 +138,8 @@ def content_E_D(content: Content, mesh: Mesh) -> tuple[float, int]:
 
 
 def combined(E_G: float, E_D: float, E_G0: float, E_D0: float, k_D: float) -> float:
-    """E = (1 - k_D) E_G / E_G0 + k_D E_D / E_D0, Eq. (4) normalised by the initial mesh as in Section 4.
+    """E = (1 - k_D) E_G / E_G0 + k_D E_D / E_D0, Eq. (4) normalised by the initial mesh as in
+    Section 4.
 
     On a constant image E_D0 = 0; the second term is then 0.
     """

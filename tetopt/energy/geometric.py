@@ -1,8 +1,9 @@
 """The geometric energy E_G: the interpolation error of the paraboloid x^2, Eq. (1) of the paper.
 
-The printed form, 1/(n+1) sum_i x_i^2 |Omega_i| - integral of x^2, subtracts two large numbers. For each cell it is
-the integral over the simplex of the linear interpolant of x^2 minus x^2 itself. With barycentric coordinates b_i
-that difference is sum_{i<k} b_i b_k |x_i - x_k|^2, and the mean of b_i b_k over a simplex is 1/((n+1)(n+2)), so
+The printed form, 1/(n+1) sum_i x_i^2 |Omega_i| - integral of x^2, subtracts two large numbers. For
+each cell it is the integral over the simplex of the linear interpolant of x^2 minus x^2 itself.
+With barycentric coordinates b_i that difference is sum_{i<k} b_i b_k |x_i - x_k|^2, and the mean of
+b_i b_k over a simplex is 1/((n+1)(n+2)), so
 
     E_G = sum_j v_j / ((n+1)(n+2)) * sum over the edges of cell j of its squared length,
 
@@ -20,7 +21,9 @@ from tetopt.system.kernel_cache import njit
 
 
 def cell_E_G(points: Points, cells: Cells) -> NDArray[np.float64]:
-    """Each cell's contribution to E_G, (M,) float64, mm^(n+2), for points (N, n) in mm and cells (M, n+1)."""
+    """Each cell's contribution to E_G, (M,) float64, mm^(n+2), for points (N, n) in mm and cells
+    (M, n+1).
+    """
     n = points.shape[1]
     return volumes(points, cells) * squared_edges(points, cells).sum(axis=1) / ((n + 1) * (n + 2))
 
@@ -28,8 +31,8 @@ def cell_E_G(points: Points, cells: Cells) -> NDArray[np.float64]:
 def E_G(points: Points, cells: Cells) -> float:
     """The geometric energy of equation (1), mm^(n+2).
 
-    The sum over cells of the volume times the squared lengths of all edges, over (n + 1) (n + 2). It is small if cells
-    are round and uniform, and independent of the image.
+    The sum over cells of the volume times the squared lengths of all edges, over (n + 1) (n + 2).
+    It is small if cells are round and uniform, and independent of the image.
 
     Parameters
     ----------
@@ -60,7 +63,9 @@ def E_G(points: Points, cells: Cells) -> float:
 
 @njit(cache=True)
 def volume_and_E_G(x: NDArray, n_corners: int) -> tuple[float, float]:
-    """Unsigned volume and E_G of a cell with corners x (4, 3) in mm; a triangle lies in coordinates 1 and 2."""
+    """Unsigned volume and E_G of a cell with corners x (4, 3) in mm; a triangle lies in
+    coordinates 1 and 2.
+    """
     edges = 0.0
     for i in range(n_corners):
         for k in range(i + 1, n_corners):

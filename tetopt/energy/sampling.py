@@ -1,22 +1,25 @@
 """From voxels to cells: the cell that contains each voxel centre, and the sums of h over each cell.
 
-The contract: every voxel centre inside the mesh belongs to *exactly one* cell. Rounding cannot break it, because
-nothing here rounds. Nodes are mapped to voxel-index space and onto a fixed-point grid of 2**-bits voxels
-(`to_ticks`; about 1e-6 voxel for a brain), so that the side of a facet on which a voxel centre lies is the sign of an
-integer. A centre exactly on a facet, edge or node belongs to the cell that would contain it if it were shifted by
-(eps^3, eps^2, eps) along the axes, with eps infinitely small: one rule for all cells (simulation of simplicity,
-Edelsbrunner and Muecke 1990), under which no centre ever lies on a facet.
+The contract: every voxel centre inside the mesh belongs to *exactly one* cell. Rounding cannot
+break it, because nothing here rounds. Nodes are mapped to voxel-index space and onto a fixed-point
+grid of 2**-bits voxels (`to_ticks`; about 1e-6 voxel for a brain), so that the side of a facet on
+which a voxel centre lies is the sign of an integer. A centre exactly on a facet, edge or node
+belongs to the cell that would contain it if it were shifted by (eps^3, eps^2, eps) along the axes,
+with eps infinitely small: one rule for all cells (simulation of simplicity, Edelsbrunner and Muecke
+1990), under which no centre ever lies on a facet.
 
-Sums over a cell are taken on its facets, as in the divergence theorem. Along a row of voxels (the last axis) let
-P(k) be the sum over the row's first k voxels. A row that meets a cell enters it through one facet and leaves it
-through another; if the first voxel beyond each is k_in and k_out, the cell contains voxels k_in ... k_out - 1 of the
-row, and their sum is P(k_out) - P(k_in). So each facet has a *flux*, the sum of P(k) over the rows that cross it,
-signed by the side it faces, and the sum over a cell is the signed sum of its facets' fluxes. A facet's flux is computed
-once for its two cells; one cell gains what the other loses, so that totals are exact by construction; and when a node
-moves, only the facets around it change. P is kept for 1, h and h^2.
+Sums over a cell are taken on its facets, as in the divergence theorem. Along a row of voxels (the
+last axis) let P(k) be the sum over the row's first k voxels. A row that meets a cell enters it
+through one facet and leaves it through another; if the first voxel beyond each is k_in and k_out,
+the cell contains voxels k_in ... k_out - 1 of the row, and their sum is P(k_out) - P(k_in). So each
+facet has a *flux*, the sum of P(k) over the rows that cross it, signed by the side it faces, and
+the sum over a cell is the signed sum of its facets' fluxes. A facet's flux is computed once for its
+two cells; one cell gains what the other loses, so that totals are exact by construction; and when a
+node moves, only the facets around it change. P is kept for 1, h and h^2.
 
-The place where a facet cuts a row is computed in float64, and in integers if it is too close to a voxel centre.
-The facets of triangles are segments and are treated alike; a 2-D image gets a leading axis of length 1.
+The place where a facet cuts a row is computed in float64, and in integers if it is too close to a
+voxel centre. The facets of triangles are segments and are treated alike; a 2-D image gets a leading
+axis of length 1.
 """
 
 from __future__ import annotations
@@ -56,7 +59,8 @@ from tetopt.system.kernels import (
 )
 from tetopt.system.slabs import over_slabs
 
-EDGE_MARGIN = 0.5 - 1e-9  # voxels: between its ends, the error of an edge's cut is far below the remainder to 0.5
+# voxels: between its ends, the error of an edge's cut is far below the remainder to 0.5
+EDGE_MARGIN = 0.5 - 1e-9
 SUM_BYTES = 12.0  # per prefix sum and voxel: 8, and temporary arrays
 ONE_CELL = 1 << 40  # counts one cell in sums of cell numbers from 1; see `_visited`
 OWNER_SLABS = 2  # per thread, in finding the cell of each voxel: each slab looks for its facets
@@ -93,8 +97,9 @@ class CellMoments(NamedTuple):
 def cell_moments(image: Image, mesh: Mesh) -> CellMoments:
     """Count, mean and variance of the voxels whose centres lie in each cell.
 
-    The mean is the single value that represents the cell in a finite-element model (Eq. 2). A cell smaller than
-    a voxel may contain no voxel centre: its mean is h at the centroid (the nearest voxel's value) and its variance 0.
+    The mean is the single value that represents the cell in a finite-element model (Eq. 2). A cell
+    smaller than a voxel may contain no voxel centre: its mean is h at the centroid (the nearest
+    voxel's value) and its variance 0.
 
     Parameters
     ----------
@@ -111,8 +116,8 @@ def cell_moments(image: Image, mesh: Mesh) -> CellMoments:
     Raises
     ------
     InputError
-        Mesh and image of different dimension, a cell that is flat or inverted at the sampling's resolution, or
-        a mesh far larger than the image.
+        Mesh and image of different dimension, a cell that is flat or inverted at the sampling's
+        resolution, or a mesh far larger than the image.
 
     Examples
     --------
@@ -151,7 +156,9 @@ def _placed(image: Image, mesh: Mesh) -> _Sampled:
     """Like `_sampled`, but without values: only the places of cells."""
     shape = (1,) * (3 - image.ndim) + image.shape
     return _on_grid(
-        image, mesh, SamplingGrid(np.empty((*shape[:2], shape[2] + 1, 0)), grid_bits(image, mesh.points), 0)
+        image,
+        mesh,
+        SamplingGrid(np.empty((*shape[:2], shape[2] + 1, 0)), grid_bits(image, mesh.points), 0),
     )
 
 
@@ -167,7 +174,8 @@ def _moments(image: Image, mesh: Mesh, sampled: _Sampled) -> CellMoments:
     n_voxels = sums[:, 0].astype(np.int64)
     is_empty = n_voxels == 0
     count = np.maximum(sums[:, 0], 1.0)
-    offset = sums[:, 1] / count  # unlike multiplying by 1 / count, gives the exact mean of equal whole numbers
+    # unlike multiplying by 1 / count, gives the exact mean of equal whole numbers
+    offset = sums[:, 1] / count
     mean = grid.shift + offset
     variance = np.maximum(sums[:, 2] / count - offset**2, 0.0)
     mean[is_empty] = nearest_values(image, mesh.points[mesh.cells[is_empty]].mean(axis=1))
@@ -187,7 +195,8 @@ def cell_of_voxel(image: Image, mesh: Mesh) -> NDArray[np.int64]:
     Returns
     -------
     (s_0, ..., s_{n-1}) int64
-        Cell numbers in the image's shape; -1 outside the mesh. Where cells overlap, the first that contains the voxel.
+        Cell numbers in the image's shape; -1 outside the mesh. Where cells overlap, the first that
+        contains the voxel.
 
     Raises
     ------
@@ -216,7 +225,8 @@ class Overlap(NamedTuple):
     def __str__(self) -> str:
         """Return a sentence for a message."""
         return (
-            f"cells overlap: {self.n_voxels} voxels lie in several cells; cells {self.cells[0]} and {self.cells[1]} "
+            f"cells overlap: {self.n_voxels} voxels lie in several cells; cells {self.cells[0]} "
+            f"and {self.cells[1]} "
             f"both contain voxel {list(self.voxel)}"
         )
 
@@ -237,23 +247,32 @@ def overlap_of(image: Image, mesh: Mesh) -> Overlap | None:
 class _Visited(NamedTuple):
     """Results of visiting each cell's voxels."""
 
-    owner: NDArray[np.int64]  # (s_0, s_1, s_2) the cell of each voxel, the first of several; -1 for none
+    # (s_0, s_1, s_2) the cell of each voxel, the first of several; -1 for none
+    owner: NDArray[np.int64]
     low: NDArray[np.float64]  # (M,) least intensity of each cell's voxels, inf without any
     high: NDArray[np.float64]  # (M,) greatest intensity, -inf without any
-    shared: NDArray[np.int64]  # (6,) number of voxels in several cells, the index of one, and two of its cells
+    # (6,) number of voxels in several cells, the index of one, and two of its cells
+    shared: NDArray[np.int64]
 
 
 def _visited(mesh: Mesh, sampled: _Sampled, h: NDArray[np.floating] | None = None) -> _Visited:
     """Find the voxels of each cell, and the range of their intensities `h`, by default 0."""
     grid, ticks, sides = sampled
     n_cells, hand = len(mesh.cells), _hand(ticks, mesh.cells)
-    low, high, shared = np.full(n_cells, np.inf), np.full(n_cells, -np.inf), np.zeros(6, dtype=np.int64)
-    # Crossing a facet upwards, a row changes from the cells below to the cells above. The changes of the cells' count
-    # and of the sum of their numbers, accumulated along the row, give those of the cells that contain each voxel.
+    low, high, shared = (
+        np.full(n_cells, np.inf),
+        np.full(n_cells, -np.inf),
+        np.zeros(6, dtype=np.int64),
+    )
+    # Crossing a facet upwards, a row changes from the cells below to the cells above. The changes
+    # of the cells' count and of the sum of their numbers, accumulated along the row, give those of
+    # the cells that contain each voxel.
     of_cell, signs = sides.of_cell.ravel(), -hand * sides.sign
     numbers = signs * np.arange(1, n_cells + 1)[:, None]
     # Sums of whole numbers below 2^53 are exact in float64.
-    number, count = (np.bincount(of_cell, weights.ravel(), len(sides.nodes)) for weights in (numbers, signs))
+    number, count = (
+        np.bincount(of_cell, weights.ravel(), len(sides.nodes)) for weights in (numbers, signs)
+    )
     change = number.astype(np.int64) + ONE_CELL * count.astype(np.int64)
     along = ticks[sides.nodes, 0]
     bottom, top = along.min(axis=1), along.max(axis=1)
@@ -262,11 +281,19 @@ def _visited(mesh: Mesh, sampled: _Sampled, h: NDArray[np.floating] | None = Non
     def fill(first: int, stop: int) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
         """Find the owners in some planes, as in a volume of these alone."""
         is_near = (top >= first << grid.bits) & (bottom <= stop << grid.bits)
-        steps, volume = _volume_of(owner[first:stop], None if h is None else h.reshape(grid.shape)[first:stop])
+        steps, volume = _volume_of(
+            owner[first:stop], None if h is None else h.reshape(grid.shape)[first:stop]
+        )
         moved = ticks - [first << grid.bits, 0, 0]
-        _scatter_changes(steps, change[is_near], moved, sides.nodes[is_near], grid.bits, steps[..., None])
+        _scatter_changes(
+            steps, change[is_near], moved, sides.nodes[is_near], grid.bits, steps[..., None]
+        )
         least, most = (low, high) if h is None else (low.copy(), high.copy())
-        return least, most, _fill_owners(owner[first:stop], least, most, steps, volume, h is not None)
+        return (
+            least,
+            most,
+            _fill_owners(owner[first:stop], least, most, steps, volume, h is not None),
+        )
 
     slabs = over_slabs(fill, len(owner), owner.size, OWNER_SLABS * numba.get_num_threads())
     shared[0] = sum(n_shared for *_, n_shared in slabs)
@@ -276,21 +303,26 @@ def _visited(mesh: Mesh, sampled: _Sampled, h: NDArray[np.floating] | None = Non
     if shared[0] > 0:  # sums of several numbers are meaningless
         steps, volume = _volume_of(owner, None if h is None else h.reshape(grid.shape))
         owner[:], low[:], high[:] = -1, np.inf, -np.inf
-        cells = _Cells(ticks, np.ascontiguousarray(mesh.cells), sides.nodes, sides.of_cell, signs, grid.bits)
+        cells = _Cells(
+            ticks, np.ascontiguousarray(mesh.cells), sides.nodes, sides.of_cell, signs, grid.bits
+        )
         _visit_cells(owner, low, high, shared, cells, volume, steps, steps[..., None])
     return _Visited(owner, low, high, shared)
 
 
 def _volume_of(
     owner: NDArray[np.int64], h: NDArray[np.floating] | None
-) -> tuple[NDArray[np.int64], NDArray[np.float32]]:  # fmt: skip
-    """Steps of 0 along the rows of a volume, whose shape alone matters as prefix sums, and its intensities or 0."""
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Steps of 0 along the rows of a volume, whose shape alone matters as prefix sums, and its
+    intensities or 0.
+    """
     steps = np.zeros((*owner.shape[:2], owner.shape[2] + 1), dtype=np.int64)
     return steps, np.zeros(owner.shape, dtype=np.float32) if h is None else h
 
 
 def cell_ranges(image: Image, mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The least and the greatest intensity among the voxels whose centres lie in each cell, (M,) float64 each.
+    """The least and the greatest intensity among the voxels whose centres lie in each cell, (M,)
+    float64 each.
 
     In a cell without voxel centre both are the nearest voxel's value, as in `cell_moments`.
 
@@ -302,18 +334,25 @@ def cell_ranges(image: Image, mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[
     return _ranges(image, mesh, _sampled(image, mesh))
 
 
-def _ranges(image: Image, mesh: Mesh, sampled: _Sampled) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _ranges(
+    image: Image, mesh: Mesh, sampled: _Sampled
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     _, low, high, _ = _visited(mesh, sampled, image.data)
     is_empty = low > high
-    low[is_empty] = high[is_empty] = nearest_values(image, mesh.points[mesh.cells[is_empty]].mean(axis=1))
+    low[is_empty] = high[is_empty] = nearest_values(
+        image, mesh.points[mesh.cells[is_empty]].mean(axis=1)
+    )
     return low, high
 
 
 def ranges_of(
     owner: NDArray[np.int64], h: NDArray[np.floating], n_cells: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Least and greatest of the values (K,) that each cell owns, (M,) float64; inf and -inf if it owns none."""
-    # Runs of voxels of one cell are reduced first: `ufunc.at` by voxel takes twice as long (MNI152 T1, 15,000 nodes).
+    """Least and greatest of the values (K,) that each cell owns, (M,) float64; inf and -inf if
+    it owns none.
+    """
+    # Runs of voxels of one cell are reduced first: `ufunc.at` by voxel takes twice as long (MNI152
+    # T1, 15,000 nodes).
     start = np.flatnonzero(np.concatenate([[True], owner[1:] != owner[:-1]]))
     inside = owner[start] >= 0
     cell = owner[start][inside]
@@ -324,12 +363,16 @@ def ranges_of(
 
 
 def nearest_values(image: Image, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Value of the voxel nearest to each world point, (K,) float64; points outside get the border's value."""
+    """Value of the voxel nearest to each world point, (K,) float64; points outside get the
+    border's value.
+    """
     return image.data[tuple(nearest_voxels(image, points).T)].astype(np.float64)
 
 
 def nearest_voxels(image: Image, points: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Index of the voxel nearest to each world point, (K, n) int64; points outside get the border's voxel."""
+    """Index of the voxel nearest to each world point, (K, n) int64; points outside get the
+    border's voxel.
+    """
     index = np.rint(image.to_index(points)).astype(np.int64)
     return np.clip(index, 0, np.array(image.shape) - 1)
 
@@ -337,7 +380,8 @@ def nearest_voxels(image: Image, points: NDArray[np.float64]) -> NDArray[np.int6
 class SamplingGrid(NamedTuple):
     """An image prepared for the kernels."""
 
-    prefix: NDArray  # (s_0, s_1, s_2 + 1, 2) sums of h - shift and its square over a row's first k voxels
+    # (s_0, s_1, s_2 + 1, 2) sums of h - shift and its square over a row's first k voxels
+    prefix: NDArray
     bits: int  # node coordinates are integers in units of 2**-bits voxel
     shift: float  # subtracted from h before squaring, so that sums of squares lose no digits
     n_channels: int = 1  # see `channel_grid`
@@ -348,14 +392,18 @@ class SamplingGrid(NamedTuple):
         return self.prefix.shape[0], self.prefix.shape[1], self.prefix.shape[2] - 1
 
 
-def sampling_grid(image: Image, points: NDArray[np.float64], bits: int | None = None) -> SamplingGrid:
+def sampling_grid(
+    image: Image, points: NDArray[np.float64], bits: int | None = None
+) -> SamplingGrid:
     """The image and the fixed-point grid for nodes near `points`, (N, n) world mm.
 
-    If the image is a part of another one, `bits` are those of the other one's grid, which are no more.
+    If the image is a part of another one, `bits` are those of the other one's grid, which are no
+    more.
 
-    Differences of coordinates stay below 2**29 units, so that their products, areas and determinants are exact
-    in 64- and 128-bit integers. On an image of whole numbers whose sums of squares along a row stay below 2**31
-    (8-bit and most 16-bit images), every sum is exact, too; on others sums are as exact as float64 sums along a row.
+    Differences of coordinates stay below 2**29 units, so that their products, areas and
+    determinants are exact in 64- and 128-bit integers. On an image of whole numbers whose sums of
+    squares along a row stay below 2**31 (8-bit and most 16-bit images), every sum is exact, too; on
+    others sums are as exact as float64 sums along a row.
 
     Raises
     ------
@@ -365,39 +413,52 @@ def sampling_grid(image: Image, points: NDArray[np.float64], bits: int | None = 
     bits = grid_bits(image, points) if bits is None else bits
     shape = (1,) * (3 - image.ndim) + image.shape
     (low, high), mean, is_whole = image.range, image.mean, image.is_whole
-    shift = low if low == high else round(mean) if is_whole else mean  # constants become 0, whole numbers stay whole
+    # constants become 0, whole numbers stay whole
+    shift = low if low == high else round(mean) if is_whole else mean
     largest = max(high - shift, shift - low)
-    # Whole numbers whose sums fit take half the memory, whose access limits the sampling of small cells:
+    # Whole numbers whose sums fit take half the memory, whose access limits the sampling of small
+    # cells:
     # 1.4 times faster at 200 k tetrahedra.
     is_short = is_whole and shape[2] * max(largest, largest * largest) < 2**31
     _check_grid(shape, 2)
-    prefix = np.empty((shape[0], shape[1], shape[2] + 1, 2), dtype=np.int32 if is_short else np.float64)
+    prefix = np.empty(
+        (shape[0], shape[1], shape[2] + 1, 2), dtype=np.int32 if is_short else np.float64
+    )
     with few_threads(image.data.size // 50):
         data: Any = image.data.reshape(shape)
         is_single, nothing = data.dtype == np.float32, np.zeros((1, 1, 1))
         single = data if is_single else nothing.astype(np.float32)
-        work = _Filling(_volume(prefix, bits), nothing if is_single else data, single, is_single, float(shift))
+        work = _Filling(
+            _volume(prefix, bits), nothing if is_single else data, single, is_single, float(shift)
+        )
         run(_fill_prefix, shape[0], work)
     return SamplingGrid(prefix, bits, float(shift))
 
 
 def grid_bits(image: Image, points: NDArray[np.float64]) -> int:
-    """The bits of the fixed-point grid for nodes near points, (N, n) world mm; InputError as for `sampling_grid`."""
+    """The bits of the fixed-point grid for nodes near points, (N, n) world mm; InputError as for
+    `sampling_grid`.
+    """
     if points.shape[1] != image.ndim:
         raise InputError(
-            f"mesh and image: expected the same dimension, got a {points.shape[1]}-D mesh and a {image.ndim}-D image"
+            f"mesh and image: expected the same dimension, got a {points.shape[1]}-D mesh and a "
+            f"{image.ndim}-D image"
         )
     reach = max(float(np.abs(image.to_index(points)).max()), float(max(image.shape))) + 1.0
     bits = 28 - ceil(log2(reach))
     if bits < 8:
         raise InputError(
-            f"mesh and image: the mesh reaches {reach:.3g} voxels from the image's origin; are its points in mm?"
+            f"mesh and image: the mesh reaches {reach:.3g} voxels from the image's origin; are "
+            "its points in mm?"
         )
     return bits
 
 
-def channel_grid(content: Content, points: NDArray[np.float64], bits: int | None = None) -> SamplingGrid:
-    """`sampling_grid` of all channels of a content: sums of the first, of all channels' squares, and of the others.
+def channel_grid(
+    content: Content, points: NDArray[np.float64], bits: int | None = None
+) -> SamplingGrid:
+    """`sampling_grid` of all channels of a content: sums of the first, of all channels' squares,
+    and of the others.
 
     With a region, the last sums count 1 for each voxel outside it and -1 for each inside.
 
@@ -416,7 +477,9 @@ def channel_grid(content: Content, points: NDArray[np.float64], bits: int | None
     def channels(first: int, stop: int) -> list[NDArray]:
         """All channels in some planes."""
         part = (slice(first, stop),) if n == 3 else ()
-        return [content.channel(number, part).reshape(-1, *shape[1:]) for number in range(n_channels)]
+        return [
+            content.channel(number, part).reshape(-1, *shape[1:]) for number in range(n_channels)
+        ]
 
     if content.is_plain:
         grid = sampling_grid(content.image, points, bits)
@@ -426,11 +489,15 @@ def channel_grid(content: Content, points: NDArray[np.float64], bits: int | None
         bits = grid_bits(content.image, points) if bits is None else bits
         # No channel's sums are larger than those of the squares of its whole numbers.
         largest = over_slabs(
-            lambda a, b: _squares(channels(a, b)).sum(axis=-1).max(), shape[0], n_channels * prod(shape)
+            lambda a, b: _squares(channels(a, b)).sum(axis=-1).max(),
+            shape[0],
+            n_channels * prod(shape),
         )
         is_short = max(largest) < 2**31
     n_sums = (2 if grid is not None else n_channels + 1) + (inside is not None)
-    prefix = np.zeros((*shape[:2], shape[2] + 1, n_sums), dtype=np.int32 if is_short else np.float64)
+    prefix = np.zeros(
+        (*shape[:2], shape[2] + 1, n_sums), dtype=np.int32 if is_short else np.float64
+    )
 
     def fill(first: int, stop: int) -> None:
         sums = prefix[first:stop]
@@ -452,10 +519,14 @@ def _squares(values: Sequence[NDArray[np.int32]]) -> NDArray[np.float64]:
 
 
 def _check_grid(shape: Sequence[int], n_sums: int) -> None:
-    """Raise InputError if prefix sums do not fit into memory: 64 bits each, and as much while they are computed."""
+    """Raise InputError if prefix sums do not fit into memory: 64 bits each, and as much while
+    they are computed.
+    """
     n_voxels = prod(shape)
     what = f"image: {n_sums} sums of {' x '.join(map(str, shape))} voxels"
-    check_memory(SUM_BYTES * n_sums * n_voxels, what, "crop the image, or resample it to larger voxels")
+    check_memory(
+        SUM_BYTES * n_sums * n_voxels, what, "crop the image, or resample it to larger voxels"
+    )
 
 
 def to_ticks(index: NDArray[np.float64], grid: SamplingGrid) -> NDArray[np.int64]:
@@ -474,8 +545,8 @@ def from_ticks(ticks: NDArray[np.int64], grid: SamplingGrid, n: int) -> NDArray[
 def few_threads(tasks: int) -> Iterator[None]:
     """Use one thread per 2000 `tasks` at most; results do not depend on it.
 
-    Waking a second thread for a mesh of a hundred cells costs more than its work: on a busy machine 61 nodes took
-    20 times as long on two threads as on one.
+    Waking a second thread for a mesh of a hundred cells costs more than its work: on a busy machine
+    61 nodes took 20 times as long on two threads as on one.
     """
     threads = numba.get_num_threads()
     numba.set_num_threads(min(threads, 1 + tasks // 2000))
@@ -486,12 +557,15 @@ def few_threads(tasks: int) -> Iterator[None]:
 
 
 def check_orientations(image: Image, ticks: NDArray[np.int64], cells: NDArray[np.int64]) -> None:
-    """Raise InputError unless every cell, positive in the world, is positive on the fixed-point grid, too."""
+    """Raise InputError unless every cell, positive in the world, is positive on the fixed-point
+    grid, too.
+    """
     hand = 1 if np.linalg.det(image.affine[:-1, :-1]) > 0 else -1
     wrong = np.flatnonzero(orientations(ticks, cells) != hand)
     if len(wrong):
         raise InputError(
-            f"mesh: {len(wrong)} cells are flat or inverted to within a millionth of a voxel, such as "
+            f"mesh: {len(wrong)} cells are flat or inverted to within a millionth of a voxel, "
+            "such as "
             f"{wrong[:5].tolist()}; remove or repair them before sampling"
         )
 
@@ -502,12 +576,16 @@ def orientations(ticks: NDArray[np.int64], cells: NDArray[np.int64]) -> NDArray[
 
 
 def moment_sums(
-    grid: SamplingGrid, ticks: NDArray[np.int64], cells: NDArray[np.int64], sides: Facets | None = None
+    grid: SamplingGrid,
+    ticks: NDArray[np.int64],
+    cells: NDArray[np.int64],
+    sides: Facets | None = None,
 ) -> NDArray[np.float64]:
-    """Voxel count, sum of (h - shift) and of its square over each cell, (M, 3) float64; with more channels, (M, D).
+    """Voxel count, sum of (h - shift) and of its square over each cell, (M, 3) float64; with more
+    channels, (M, D).
 
-    They are additive: the sums of a set of cells are the sum of their rows. Counts are exact whole numbers. `sides` are
-    the cells' facets, if already known.
+    They are additive: the sums of a set of cells are the sum of their rows. Counts are exact whole
+    numbers. `sides` are the cells' facets, if already known.
     """
     sides = facets(cells) if sides is None else sides
     n_sums = grid.prefix.shape[3] + 1
@@ -530,7 +608,9 @@ def _hand(ticks: NDArray[np.int64], cells: NDArray[np.int64]) -> int:
 
 
 class Volume(NamedTuple):
-    """A sampling grid for kernels: prefix sums of 32 or 64 bits, with an empty array for the other kind."""
+    """A sampling grid for kernels: prefix sums of 32 or 64 bits, with an empty array for the
+    other kind.
+    """
 
     long: Floats4
     short: Shorts4
@@ -545,7 +625,12 @@ def volume_of(grid: SamplingGrid) -> Volume:
 
 def _volume(prefix: NDArray, bits: int) -> Volume:
     is_short, nothing = prefix.dtype == np.int32, np.zeros((1, 1, 1, prefix.shape[3]))
-    return Volume(nothing if is_short else prefix, prefix if is_short else nothing.astype(np.int32), is_short, bits)
+    return Volume(
+        nothing if is_short else prefix,
+        prefix if is_short else nothing.astype(np.int32),
+        is_short,
+        bits,
+    )
 
 
 class _Filling(NamedTuple):
@@ -617,7 +702,9 @@ def _orientations(ticks: NDArray, cells: NDArray) -> NDArray:
 
 @njit(cache=True)
 def _exact_edge_threshold(cut: float, p0: int, p1: int, d0: int, d1: int, bits: int, i: int) -> int:
-    """The first voxel along axis 1, on line i of axis 0, on or beyond the edge from p along d; `cut` is near it."""
+    """The first voxel along axis 1, on line i of axis 0, on or beyond the edge from p along d;
+    `cut` is near it.
+    """
     threshold = np.int64(np.rint(cut))
     if ((threshold << bits) - p1) * d0 < ((i << bits) - p0) * d1:
         threshold += 1
@@ -625,8 +712,12 @@ def _exact_edge_threshold(cut: float, p0: int, p1: int, d0: int, d1: int, bits: 
 
 
 @njit(cache=True)
-def _exact_facet_threshold(n: tuple, a: tuple, bits: int, i: int, j: int, low: int, high: int) -> int:
-    """The first voxel in [low, high] of row (i, j) on or above the facet through a with normal n, n[2] > 0."""
+def _exact_facet_threshold(
+    n: tuple, a: tuple, bits: int, i: int, j: int, low: int, high: int
+) -> int:
+    """The first voxel in [low, high] of row (i, j) on or above the facet through a with normal
+    n, n[2] > 0.
+    """
     d0, d1 = (i << bits) - a[0], (j << bits) - a[1]
     while low < high:
         middle = (low + high) >> 1
@@ -670,13 +761,20 @@ def _with_row(more: tuple, prefix: NDArray, i: int, j: int, k: int, n_more: int)
 
 @njit(cache=True)
 def triangle_flux(
-    ticks: NDArray, nodes: tuple, bits: int, prefix: NDArray, scatter: tuple | None, out: NDArray, place: tuple
+    ticks: NDArray,
+    nodes: tuple,
+    bits: int,
+    prefix: NDArray,
+    scatter: tuple | None,
+    out: NDArray,
+    place: tuple,
 ) -> None:
     """Flux of the triangle of three nodes: sums of k and of each P(k) over the rows that cross it.
 
-    It is positive if the triangle, with its nodes as listed, faces up the last axis, and is written to out[p, q, :],
-    where `place` is (p, q), with one entry more than `prefix` has. If `scatter` is an array of steps and a change, the
-    change, signed like the flux, is added to the steps at each crossing instead.
+    It is positive if the triangle, with its nodes as listed, faces up the last axis, and is written
+    to out[p, q, :], where `place` is (p, q), with one entry more than `prefix` has. If `scatter` is
+    an array of steps and a change, the change, signed like the flux, is added to the steps at each
+    crossing instead.
     """
     (node_a, node_b, node_c), (p, q) = nodes, place
     n_more = out.shape[2] - 3
@@ -686,12 +784,14 @@ def triangle_flux(
         return
     sign = 1 if n[2] > 0 else -1
     n = (sign * n[0], sign * n[1], sign * n[2])
-    # With corners in the order of axis 0, each line has one cut on the long edge a-c, the other on a-b, then on b-c.
+    # With corners in the order of axis 0, each line has one cut on the long edge a-c, the other on
+    # a-b, then on b-c.
     a, b, c = _by_first_axis(row(ticks, node_a), row(ticks, node_b), row(ticks, node_c))
     n_i, n_j, n_k, scale = prefix.shape[0], prefix.shape[1], prefix.shape[2] - 1, 2.0**-bits
     first, last = max(-((-a[0]) >> bits), 0), min(-((-c[0]) >> bits), n_i)
     middle = min(max(-((-b[0]) >> bits), first), last)
-    # The facet cuts row (i, j) at a2 + slope0 (i - a0) + slope1 (j - a1), with terms no larger than `size`.
+    # The facet cuts row (i, j) at a2 + slope0 (i - a0) + slope1 (j - a1), with terms no larger than
+    # `size`.
     slope0, slope1 = -(n[0] / n[2]), -(n[1] / n[2])
     at = (a[0] * scale, a[1] * scale, a[2] * scale)
     size = abs(slope0) * (c[0] - a[0]) + abs(slope1) * (abs(b[1] - a[1]) + abs(c[1] - a[1]))
@@ -709,7 +809,10 @@ def triangle_flux(
         slope, base = scale * (d1 / max(d0, 1)), scale * u[1]
         for i in range(begin, end):
             # Computing both cuts first, and exact ones in a call, takes two thirds of the time.
-            cut_1, cut_2 = at[1] + ((i << bits) - a[0]) * long_slope, base + ((i << bits) - u[0]) * slope
+            cut_1, cut_2 = (
+                at[1] + ((i << bits) - a[0]) * long_slope,
+                base + ((i << bits) - u[0]) * slope,
+            )
             up_1, up_2 = np.ceil(cut_1), np.ceil(cut_2)
             one: Any = np.int64(up_1)
             other: Any = np.int64(up_2)
@@ -735,16 +838,28 @@ def triangle_flux(
                         out[p, q, 3 + d] += sign * prefix[i, j, k, 2 + d]
                 else:
                     scatter[0][i, j, k] += sign * scatter[1]
-    out[p, q, 0], out[p, q, 1], out[p, q, 2] = float(sign * count), float(sign * sum_1), float(sign * sum_2)
+    out[p, q, 0], out[p, q, 1], out[p, q, 2] = (
+        float(sign * count),
+        float(sign * sum_1),
+        float(sign * sum_2),
+    )
     for d in range(min(n_more, 6)):
         out[p, q, 3 + d] = float(sign * more[d])
 
 
 @njit(cache=True)
 def segment_flux(
-    ticks: NDArray, nodes: tuple, bits: int, prefix: NDArray, scatter: tuple | None, out: NDArray, place: tuple
+    ticks: NDArray,
+    nodes: tuple,
+    bits: int,
+    prefix: NDArray,
+    scatter: tuple | None,
+    out: NDArray,
+    place: tuple,
 ) -> None:
-    """Flux of the segment of two nodes of a 2-D mesh, which lies along axes 1 and 2; like `triangle_flux`."""
+    """Flux of the segment of two nodes of a 2-D mesh, which lies along axes 1 and 2; like
+    `triangle_flux`.
+    """
     (node_a, node_b), (p, q) = nodes, place
     n_more = out.shape[2] - 3
     for d in range(3 + n_more):
@@ -779,7 +894,14 @@ def segment_flux(
 
 @njit(cache=True)
 def facet_flux(
-    ticks: NDArray, nodes: NDArray, facet: int, bits: int, prefix: NDArray, scatter: tuple | None, out: NDArray, p: int
+    ticks: NDArray,
+    nodes: NDArray,
+    facet: int,
+    bits: int,
+    prefix: NDArray,
+    scatter: tuple | None,
+    out: NDArray,
+    p: int,
 ) -> None:
     """Write the flux of one of the facets `nodes` (F, n) to out[p, 0, :]; see `triangle_flux`."""
     a, b = nodes[facet, 0], nodes[facet, 1]
@@ -799,7 +921,9 @@ class _Fluxes(NamedTuple):
 
 
 @unit
-def put_flux(out: Floats3, p: int, q: int, ticks: Ints2, a: int, b: int, c: int, volume: Volume) -> None:
+def put_flux(
+    out: Floats3, p: int, q: int, ticks: Ints2, a: int, b: int, c: int, volume: Volume
+) -> None:
     """Write the flux of the facet (a, b, c), or (a, b) if c < 0, to out[p, q, :]."""
     if c < 0:
         if volume.is_short:
@@ -817,7 +941,9 @@ def _fill_fluxes(work: _Fluxes, chunk: int) -> None:
     nodes = work.nodes
     for facet in range(chunk * CELLS_PER_CHUNK, min((chunk + 1) * CELLS_PER_CHUNK, len(nodes))):
         c = nodes[facet, 2] if nodes.shape[1] == 3 else -1
-        put_flux(work.fluxes, facet, 0, work.ticks, nodes[facet, 0], nodes[facet, 1], c, work.volume)
+        put_flux(
+            work.fluxes, facet, 0, work.ticks, nodes[facet, 0], nodes[facet, 1], c, work.volume
+        )
 
 
 class _Sums(NamedTuple):
@@ -843,7 +969,9 @@ def _fill_sums(work: _Sums, chunk: int) -> None:
 
 
 @entry
-def _scatter_changes(steps: Ints3, change: Ints1, ticks: Ints2, nodes: Ints2, bits: int, rows: Ints4) -> None:
+def _scatter_changes(
+    steps: Ints3, change: Ints1, ticks: Ints2, nodes: Ints2, bits: int, rows: Ints4
+) -> None:
     unused = np.empty((1, 1, 3))
     for facet in range(len(nodes)):
         facet_flux(ticks, nodes, facet, bits, rows, (steps, change[facet]), unused, 0)
@@ -852,8 +980,9 @@ def _scatter_changes(steps: Ints3, change: Ints1, ticks: Ints2, nodes: Ints2, bi
 @entry
 def _fill_owners(
     owner: Ints3, low: Floats1, high: Floats1, steps: Ints3, volume: Singles3, has_range: bool
-) -> int:  # fmt: skip
-    """Find the cell of each voxel, and each cell's range, from the steps along rows, in half the time of passes.
+) -> int:
+    """Find the cell of each voxel, and each cell's range, from the steps along rows, in half the
+    time of passes.
 
     Also count the voxels in several cells: if there are any, the other results are invalid.
     """
@@ -880,7 +1009,8 @@ class _Cells(NamedTuple):
     cells: Ints2
     nodes: Ints2  # nodes of the facets
     of_cell: Ints2  # its facets
-    signs: Ints2  # change of the number of times a row is in the cell as it passes up through each facet
+    # change of the number of times a row is in the cell as it passes up through each facet
+    signs: Ints2
     bits: int
 
 
@@ -896,8 +1026,15 @@ def _span(mesh: _Cells, cell: int, axis: int, n: int) -> tuple:
 
 @entry
 def _visit_cells(
-    owner: Ints3, low: Floats1, high: Floats1, shared: Ints1, mesh: _Cells, volume: Singles3, steps: Ints3, rows: Ints4
-) -> None:  # fmt: skip
+    owner: Ints3,
+    low: Floats1,
+    high: Floats1,
+    shared: Ints1,
+    mesh: _Cells,
+    volume: Singles3,
+    steps: Ints3,
+    rows: Ints4,
+) -> None:
     """Find the voxels of overlapping cells by each cell's own facets, in four times the time.
 
     `owner` is -1 before, and `steps` is 0 before and after.
@@ -907,7 +1044,9 @@ def _visit_cells(
     for cell in range(len(mesh.cells) - 1, -1, -1):
         for k in range(mesh.cells.shape[1]):
             change = steps, mesh.signs[cell, k]
-            facet_flux(mesh.ticks, mesh.nodes, mesh.of_cell[cell, k], mesh.bits, rows, change, unused, 0)
+            facet_flux(
+                mesh.ticks, mesh.nodes, mesh.of_cell[cell, k], mesh.bits, rows, change, unused, 0
+            )
         first_i, last_i = _span(mesh, cell, 0, n_i)
         first_j, last_j = _span(mesh, cell, 1, n_j)
         first_k, last_k = _span(mesh, cell, 2, n_k)
@@ -920,7 +1059,13 @@ def _visit_cells(
                     if is_in == 0 or k == n_k:
                         continue
                     if owner[i, j, k] >= 0:
-                        shared[1], shared[2], shared[3], shared[4], shared[5] = i, j, k, cell, owner[i, j, k]
+                        shared[1], shared[2], shared[3], shared[4], shared[5] = (
+                            i,
+                            j,
+                            k,
+                            cell,
+                            owner[i, j, k],
+                        )
                     owner[i, j, k] = cell
                     h = float(volume[i, j, k])
                     low[cell], high[cell] = min(low[cell], h), max(high[cell], h)

@@ -1,1 +1,3 @@
-"""Optimisation of node positions and connectivity: the fast engine, the paper's, and their common loop."""
+"""Optimisation of node positions and connectivity: the fast engine, the paper's, and their
+common loop.
+"""

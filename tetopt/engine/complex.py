@@ -1,12 +1,13 @@
 """A cell complex in plain arrays, kept consistent while nodes move and cells are exchanged.
 
-A cell's facet k lies opposite its corner k. For each facet the complex stores the cell across it and the facet's
-outward flux (see `tetopt.energy.sampling`) times the sign of index space, so that a cell's moment sums are the plain
-sum over its facets and the two sides of a facet have opposite numbers. Local operations then only measure new facets.
+A cell's facet k lies opposite its corner k. For each facet the complex stores the cell across it
+and the facet's outward flux (see `tetopt.energy.sampling`) times the sign of index space, so that a
+cell's moment sums are the plain sum over its facets and the two sides of a facet have opposite
+numbers. Local operations then only measure new facets.
 
-The D sums of a cell are the number of its voxels, the sum of the first channel's values, the sum of all channels'
-squares, the sums of the other channels' values and, if the mesh covers only a mask, the voxels outside the mask minus
-those inside.
+The D sums of a cell are the number of its voxels, the sum of the first channel's values, the sum of
+all channels' squares, the sums of the other channels' values and, if the mesh covers only a mask,
+the voxels outside the mask minus those inside.
 """
 
 from __future__ import annotations
@@ -36,22 +37,31 @@ from tetopt.system.kernels import (
     unit,
 )
 
-# A cell's volume over (sum of squared edges)^(n/2), below which it counts as inverted: an angle of 1e-3 degrees.
+# A cell's volume over (sum of squared edges)^(n/2), below which it counts as inverted: an angle of
+# 1e-3 degrees.
 FLAT_FRACTION = 1e-7
-NODE_ROWS = ("ticks", "is_frozen", "meeting", "band", "offset")  # fields of a `Complex` with one row per node
-CELL_ROWS = ("cells", "labels", "across", "fluxes", "sums", "E_shape")  # fields of a `Complex` with one row per cell
+# fields of a `Complex` with one row per node
+NODE_ROWS = ("ticks", "is_frozen", "meeting", "band", "offset")
+# fields of a `Complex` with one row per cell
+CELL_ROWS = ("cells", "labels", "across", "fluxes", "sums", "E_shape")
 
 
 class Complex(NamedTuple):
-    """Nodes, cells, their adjacency, and each cell's sums. Rows from `n_cells` are space for more cells."""
+    """Nodes, cells, their adjacency, and each cell's sums. Rows from `n_cells` are space for
+    more cells.
+    """
 
     ticks: Ints2  # (N, 3) node positions on the sampling grid
-    is_frozen: Bools2  # (N, 4) axes along which each node is fixed; last column: on the mask's surface
+    # (N, 4) axes along which each node is fixed; last column: on the mask's surface
+    is_frozen: Bools2
     meeting: Ints2  # (N, 4) labels of the cells around each node if there are two or more; else -1
-    band: Floats1  # (N,) distance that each node may be off its place at the surface between two labels, voxels
-    offset: Floats1  # (N,) value of each node's first constraint at its place; see `surface.fill_offsets`
+    # (N,) distance that each node may be off its place at the surface between two labels, voxels
+    band: Floats1
+    # (N,) value of each node's first constraint at its place; see `surface.fill_offsets`
+    offset: Floats1
     cells: Ints2  # (C, n+1) corners, positively oriented in the world
-    labels: Ints1  # (C,) each cell's label, a row of the memberships; all 0 until labels are assigned
+    # (C,) each cell's label, a row of the memberships; all 0 until labels are assigned
+    labels: Ints1
     across: Ints2  # (C, n+1) the cell beyond each facet; -1 outside
     fluxes: Floats3  # (C, n+1, D) outward flux of each facet
     sums: Floats2  # (C, D) moment sums: their sum over the facets
@@ -73,13 +83,17 @@ class Objective(NamedTuple):
     power: float  # p of the shape energy
     is_graded: bool  # True if every cell's shape has the same weight, whatever its size
     angle_limit: float  # minus the cosine of the minimum dihedral angle; -1 for none
-    safe: float  # a tetrahedron is above that angle if its S^3 is at most this times its squared determinant
+    # a tetrahedron is above that angle if its S^3 is at most this times its squared determinant
+    safe: float
     rounding: float  # a total sum of squares up to this is only rounding
-    wrong_side: float  # penalty of a voxel on the wrong side of the mask's surface, in squares; see `surface`
-    n_means: int  # leading channels for which a cell has its mean; in the others its label sets the value
+    # penalty of a voxel on the wrong side of the mask's surface, in squares; see `surface`
+    wrong_side: float
+    # leading channels for which a cell has its mean; in the others its label sets the value
+    n_means: int
     own_column: Ints1  # (K,) column of a cell's sums for each label's channel
     own_value: Floats1  # (K,) the label's value there; 0 in the other channels of labels
-    tension: float  # weight of the area between labels a and b, times own_value[a]^2 + own_value[b]^2, per mm^(n-1)
+    # weight of the area between labels a and b, times own_value[a]^2 + own_value[b]^2, per mm^(n-1)
+    tension: float
 
 
 class Sides(NamedTuple):
@@ -105,11 +119,16 @@ class State(NamedTuple):
 
 
 def build(
-    cells: NDArray[np.int64], ticks: NDArray[np.int64], is_frozen: NDArray[np.bool_], objective: Objective, sides: Sides
+    cells: NDArray[np.int64],
+    ticks: NDArray[np.int64],
+    is_frozen: NDArray[np.bool_],
+    objective: Objective,
+    sides: Sides,
 ) -> State:
     """Build the state of a conforming mesh and measure everything.
 
-    `ticks` and `is_frozen` are kept, not copied. At most two cells may share a facet (`check_mesh`).
+    `ticks` and `is_frozen` are kept, not copied. At most two cells may share a facet
+    (`check_mesh`).
     """
     n_cells, n_corners = cells.shape
     room = n_cells + n_cells // 4 + 64
@@ -138,7 +157,10 @@ def build(
 def remeasure(state: State) -> None:
     """Recompute fluxes, sums and shape energies of all cells."""
     with few_threads(int(state.complex.n_cells[0]) * 4):
-        n_chunks, laid_out = (int(state.complex.n_cells[0]) + CELLS_PER_CHUNK - 1) // CELLS_PER_CHUNK, packed(state)
+        n_chunks, laid_out = (
+            (int(state.complex.n_cells[0]) + CELLS_PER_CHUNK - 1) // CELLS_PER_CHUNK,
+            packed(state),
+        )
         run(_measure_cells, n_chunks, laid_out)
         run(_sum_cells, n_chunks, laid_out)
 
@@ -161,14 +183,18 @@ def grown(state: State, least: int = 64) -> State:
 
 
 def without_cells(state: State, is_gone: NDArray[np.bool_]) -> State:
-    """The state without some cells, (M,); nodes stay, and those on the new boundary count as on the mask's surface."""
+    """The state without some cells, (M,); nodes stay, and those on the new boundary count as on
+    the mask's surface.
+    """
     mesh, n_cells = state.complex, len(is_gone)
     kept = np.flatnonzero(~is_gone)
     rows = np.append(kept, np.arange(n_cells, len(mesh.cells)))
     number = np.full(n_cells + 1, -1, dtype=np.int64)  # the last row stands for -1, the outside
     number[kept] = np.arange(len(kept))
     beyond = mesh.cells[:n_cells][is_gone]
-    complex_ = mesh._replace(**{name: getattr(mesh, name)[rows] for name in CELL_ROWS}, n_cells=np.array([len(kept)]))
+    complex_ = mesh._replace(
+        **{name: getattr(mesh, name)[rows] for name in CELL_ROWS}, n_cells=np.array([len(kept)])
+    )
     complex_.across[: len(kept)] = number[complex_.across[: len(kept)]]
     is_frozen = mesh.is_frozen.copy()
     is_frozen[beyond.ravel(), 3] = True
@@ -252,8 +278,12 @@ def has_node(cells: NDArray, cell: int, node: int) -> bool:
 
 
 @helper
-def put_flux(out: Floats3, p: int, q: int, ticks: Ints2, a: int, b: int, c: int, objective: Objective) -> None:
-    """Write the flux of the facet (a, b, c), or (a, b) if c < 0, times the sign of index space, to out[p, q, :]."""
+def put_flux(
+    out: Floats3, p: int, q: int, ticks: Ints2, a: int, b: int, c: int, objective: Objective
+) -> None:
+    """Write the flux of the facet (a, b, c), or (a, b) if c < 0, times the sign of index space,
+    to out[p, q, :].
+    """
     sampled_flux(out, p, q, ticks, a, b, c, objective.volume)
     if objective.hand < 0:
         for d in range(out.shape[2]):
@@ -276,10 +306,11 @@ def outward(cells: NDArray, cell: int, k: int) -> tuple:
 
 @helper
 def image_energy(sums: NDArray, row: int, label: int, objective: Objective) -> float:
-    """Sum of squares around the values of one cell, over all channels, from its moment sums, a row of `sums`.
+    """Sum of squares around the values of one cell, over all channels, from its moment sums, a row
+    of `sums`.
 
-    A cell's value is its mean; in the channels of labels, once cells have labels, it is its label's value, so that
-    voxels of other labels in a cell count as errors however the cell is divided.
+    A cell's value is its mean; in the channels of labels, once cells have labels, it is its label's
+    value, so that voxels of other labels in a cell count as errors however the cell is divided.
     """
     count = sums[row, 0]
     if count <= 0.0:
@@ -297,7 +328,9 @@ def image_energy(sums: NDArray, row: int, label: int, objective: Objective) -> f
 
 @helper
 def cell_value(sums: NDArray, cell: int, label: int, channel: int, objective: Objective) -> float:
-    """Value of a cell with voxels in a channel: its mean, or its label's value; see `image_energy`."""
+    """Value of a cell with voxels in a channel: its mean, or its label's value; see
+    `image_energy`.
+    """
     column = 1 if channel == 0 else 2 + channel
     if channel < objective.n_means:
         return sums[cell, column] / sums[cell, 0]
@@ -306,25 +339,30 @@ def cell_value(sums: NDArray, cell: int, label: int, channel: int, objective: Ob
 
 @helper
 def wrong_side(sums: NDArray, row: int, objective: Objective) -> float:
-    """Weighted voxels outside the mask minus those inside, in one cell; its changes are those of the mask's misfit."""
+    """Weighted voxels outside the mask minus those inside, in one cell; its changes are those of
+    the mask's misfit.
+    """
     return objective.surface * sums[row, sums.shape[1] - 1] if objective.surface > 0.0 else 0.0
 
 
 @helper
 def shape_energy(x: NDArray, n_corners: int, power: float, is_graded: bool) -> float:
-    """E_G of the cell with corners x (4, 3) times eta^(p - 1); infinite for a flat or inverted cell.
+    """E_G of the cell with corners x (4, 3) times eta^(p - 1); infinite for a flat or inverted
+    cell.
 
-    eta = S / (12 (3 v)^(2/3)) in 3-D and S / (4 sqrt(3) v) in 2-D, with S the sum of the squared edges and v the
-    volume: 1 for the regular cell, infinite for a flat one. E_G,j is proportional to v^(5/3) eta, so it vanishes for a
-    sliver. With p = 1 the energy is the paper's; for p > 2.5 it grows without bound as a cell becomes flat.
+    eta = S / (12 (3 v)^(2/3)) in 3-D and S / (4 sqrt(3) v) in 2-D, with S the sum of the squared
+    edges and v the volume: 1 for the regular cell, infinite for a flat one. E_G,j is proportional
+    to v^(5/3) eta, so it vanishes for a sliver. With p = 1 the energy is the paper's; for p > 2.5
+    it grows without bound as a cell becomes flat.
 
-    On a graded mesh v^(5/3) would give all weight to the largest cells: a cell with twice the edge weighs 32 times as
-    much. Section 4 of the paper suggests a weight by the local mesh size. With E_G,j over h^5, and h^3 proportional to
-    the cell's own volume, all sizes cancel and eta^p remains: the same for every cell of that shape, so that the shape
-    term favours no size and E_D alone determines where cells are small.
+    On a graded mesh v^(5/3) would give all weight to the largest cells: a cell with twice the edge
+    weighs 32 times as much. Section 4 of the paper suggests a weight by the local mesh size. With
+    E_G,j over h^5, and h^3 proportional to the cell's own volume, all sizes cancel and eta^p
+    remains: the same for every cell of that shape, so that the shape term favours no size and E_D
+    alone determines where cells are small.
 
-    Corners come from `load`, which subtracts in integers: the rounding error of the signed volume is far below
-    `FLAT_FRACTION`, so that a cell that passes is exactly positively oriented.
+    Corners come from `load`, which subtracts in integers: the rounding error of the signed volume
+    is far below `FLAT_FRACTION`, so that a cell that passes is exactly positively oriented.
     """
     if n_corners == 3:
         u, v = difference(x, 1, 0), difference(x, 2, 0)
@@ -346,7 +384,8 @@ def shape_energy(x: NDArray, n_corners: int, power: float, is_graded: bool) -> f
 def determinant_and_squares(x: NDArray) -> tuple:
     """Six times the signed volume of the tetrahedron x (4, 3), and the sum of its squared edges."""
     u, v, w = difference(x, 1, 0), difference(x, 2, 0), difference(x, 3, 0)
-    # The sum of squares over all pairs of four points is four times that over the points minus the square of their sum.
+    # The sum of squares over all pairs of four points is four times that over the points minus the
+    # square of their sum.
     s = u[0] + v[0] + w[0], u[1] + v[1] + w[1], u[2] + v[2] + w[2]
     S = u[0] * u[0] + u[1] * u[1] + u[2] * u[2] + v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
     S = 4.0 * (S + w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
@@ -355,7 +394,9 @@ def determinant_and_squares(x: NDArray) -> tuple:
 
 @helper
 def tet_energy(determinant: float, S: float, power: float, is_graded: bool) -> float:
-    """`shape_energy` of a tetrahedron from six times its volume and the sum of its squared edges."""
+    """`shape_energy` of a tetrahedron from six times its volume and the sum of its squared
+    edges.
+    """
     volume = determinant / 6.0
     if volume <= 0.0 or volume * volume <= FLAT_FRACTION * FLAT_FRACTION * S * S * S:
         return np.inf
@@ -365,18 +406,24 @@ def tet_energy(determinant: float, S: float, power: float, is_graded: bool) -> f
     E_G = volume * S / 20.0
     if power == 1.0:
         return E_G
-    if power == 3.0:  # the default, without the cube root of a square: eta^2 = S^2 / (144 (3 v)^(4/3))
+    # the default, without the cube root of a square: eta^2 = S^2 / (144 (3 v)^(4/3))
+    if power == 3.0:
         t = 1.0 / np.cbrt(3.0 * volume)
         t *= t
         return E_G * S * S * t * t * (1.0 / 144.0)
     return E_G * (S / (12.0 * np.cbrt(9.0 * volume * volume))) ** (power - 1.0)
 
 
-# Inlined like `cell_energy`: a pass of flips took 70 ms, not 96 (with `tet_energy`, too, which alone gains little).
+# Inlined like `cell_energy`: a pass of flips took 70 ms, not 96 (with `tet_energy`, too, which
+# alone gains little).
 @inlined
 def load(x: NDArray, row: int, ticks: NDArray, node: int, base: int, objective: Objective) -> None:
-    """Write a node's position relative to the node `base`, mm, to a row of x; the subtraction is exact, in integers."""
-    put_row(x, row, times(objective.matrix, scaled(2.0**-objective.bits, difference(ticks, node, base))))
+    """Write a node's position relative to the node `base`, mm, to a row of x; the subtraction is
+    exact, in integers.
+    """
+    put_row(
+        x, row, times(objective.matrix, scaled(2.0**-objective.bits, difference(ticks, node, base)))
+    )
 
 
 @helper
@@ -393,14 +440,18 @@ def load_cell(x: NDArray, ticks: NDArray, cells: NDArray, cell: int, objective: 
 
 
 @helper
-def shape_of_cell(x: NDArray, ticks: NDArray, cells: NDArray, cell: int, objective: Objective) -> float:
+def shape_of_cell(
+    x: NDArray, ticks: NDArray, cells: NDArray, cell: int, objective: Objective
+) -> float:
     """Shape energy of a cell of the complex; its corners are written to `x` (4, 3)."""
     load_cell(x, ticks, cells, cell, objective)
     return shape_energy(x, cells.shape[1], objective.power, objective.is_graded)
 
 
 @unit
-def shape_of_tet(x: Floats2, ticks: Ints2, a: int, b: int, c: int, d: int, objective: Objective) -> float:
+def shape_of_tet(
+    x: Floats2, ticks: Ints2, a: int, b: int, c: int, d: int, objective: Objective
+) -> float:
     """Shape energy of the tetrahedron (a, b, c, d); infinite unless it is positively oriented."""
     load(x, 0, ticks, a, a, objective)
     load(x, 1, ticks, b, a, objective)
@@ -410,7 +461,9 @@ def shape_of_tet(x: Floats2, ticks: Ints2, a: int, b: int, c: int, d: int, objec
 
 
 @helper
-def shape_of_triangle(x: NDArray, ticks: NDArray, a: int, b: int, c: int, objective: Objective) -> float:
+def shape_of_triangle(
+    x: NDArray, ticks: NDArray, a: int, b: int, c: int, objective: Objective
+) -> float:
     """Shape energy of the triangle (a, b, c); infinite unless it is positively oriented."""
     load(x, 0, ticks, a, a, objective)
     load(x, 1, ticks, b, a, objective)
@@ -428,11 +481,17 @@ def signed_volume(x: Floats2, n_corners: int) -> float:
 
 @unit
 def worst_cosine(x: Floats2) -> float:
-    """Minus the cosine of the smallest dihedral angle of the tetrahedron x (4, 3), which grows with it; -1 if flat.
+    """Minus the cosine of the smallest dihedral angle of the tetrahedron x (4, 3), which grows with
+    it; -1 if flat.
 
     Between faces with outward normals p and q the angle's cosine is -p.q / (|p| |q|).
     """
-    n_0, n_1, n_2, n_3 = _face_normal(x, 0), _face_normal(x, 1), _face_normal(x, 2), _face_normal(x, 3)
+    n_0, n_1, n_2, n_3 = (
+        _face_normal(x, 0),
+        _face_normal(x, 1),
+        _face_normal(x, 2),
+        _face_normal(x, 3),
+    )
     size_0, size_1 = np.sqrt(dot(n_0, n_0)), np.sqrt(dot(n_1, n_1))
     size_2, size_3 = np.sqrt(dot(n_2, n_2)), np.sqrt(dot(n_3, n_3))
     if size_0 == 0.0 or size_1 == 0.0 or size_2 == 0.0 or size_3 == 0.0:
@@ -452,7 +511,9 @@ def _face_normal(x: NDArray, k: int) -> tuple:
 
 @entry
 def cosine_up_to_limit(x: Floats2, objective: Objective) -> float:
-    """`worst_cosine`, or the limit for a tetrahedron far above it: most are, and this takes a tenth of the time."""
+    """`worst_cosine`, or the limit for a tetrahedron far above it: most are, and this takes a
+    tenth of the time.
+    """
     determinant, S = determinant_and_squares(x)
     if determinant > 0.0 and S * S * S <= objective.safe * determinant * determinant:
         return objective.angle_limit
@@ -480,7 +541,9 @@ def _measure_cells(state: State, chunk: int) -> None:
     first = chunk * CELLS_PER_CHUNK
     x, cells, across = np.empty((4, 3)), state.complex.cells, state.complex.across
     for cell in range(first, min(first + CELLS_PER_CHUNK, state.complex.n_cells[0])):
-        state.complex.E_shape[cell] = shape_of_cell(x, state.complex.ticks, cells, cell, state.objective)
+        state.complex.E_shape[cell] = shape_of_cell(
+            x, state.complex.ticks, cells, cell, state.objective
+        )
         for k in range(cells.shape[1]):
             if across[cell, k] > cell or across[cell, k] < 0:
                 measure_facet(state, cell, k)
@@ -514,12 +577,15 @@ def sum_up(sums: NDArray, fluxes: NDArray, cell: int) -> None:
         total = 0.0
         for k in range(fluxes.shape[1]):
             total += fluxes[cell, k, d]
-        sums[cell, d] = total if d == 0 or sums[cell, 0] > 0.0 else 0.0  # without voxels no rounding error remains
+        # without voxels no rounding error remains
+        sums[cell, d] = total if d == 0 or sums[cell, 0] > 0.0 else 0.0
 
 
 @unit
 def settle(x: Floats2, state: State, cell: int) -> None:
-    """Compute shape energy and sums of a cell with known corners and fluxes; write its corners to `x` (4, 3)."""
+    """Compute shape energy and sums of a cell with known corners and fluxes; write its corners
+    to `x` (4, 3).
+    """
     mesh = state.complex
     mesh.E_shape[cell] = shape_of_cell(x, mesh.ticks, mesh.cells, cell, state.objective)
     sum_up(mesh.sums, mesh.fluxes, cell)
@@ -534,14 +600,19 @@ def cell_energy(state: State, cell: int) -> float:
 
 
 def cell_squares(state: State, n_means: int | None = None) -> NDArray[np.float64]:
-    """Each cell's sum of squares around its values, (n_cells,), or around means if `n_means` is all channels."""
+    """Each cell's sum of squares around its values, (n_cells,), or around means if `n_means` is
+    all channels.
+    """
     n_cells, objective = int(state.complex.n_cells[0]), state.objective
     n_means = objective.n_means if n_means is None else n_means
     sums, labels = state.complex.sums[:n_cells], state.complex.labels[:n_cells]
     firsts = sums[:, [1, *range(3, 2 + objective.n_channels)]][:, :n_means]
     within = sums[:, 2] - (firsts**2).sum(axis=1) / np.maximum(sums[:, 0], 1.0)
     if n_means < objective.n_channels:
-        value, own = objective.own_value[labels], sums[np.arange(n_cells), objective.own_column[labels]]
+        value, own = (
+            objective.own_value[labels],
+            sums[np.arange(n_cells), objective.own_column[labels]],
+        )
         within += value * (value * sums[:, 0] - 2.0 * own)
     return np.where(sums[:, 0] > 0.0, np.maximum(within, 0.0), 0.0)
 
@@ -585,7 +656,9 @@ def interface_energy(state: State) -> float:
 
 
 def energies(state: State, n_means: int | None = None) -> tuple[float, float]:
-    """Shape energy and sum of squares (`cell_squares`) of the whole complex, summed in the order of the cells."""
+    """Shape energy and sum of squares (`cell_squares`) of the whole complex, summed in the order
+    of the cells.
+    """
     E_shape = state.complex.E_shape[: state.complex.n_cells[0]]
     return float(E_shape.sum()), float(cell_squares(state, n_means).sum())
 
@@ -594,12 +667,15 @@ def energies(state: State, n_means: int | None = None) -> tuple[float, float]:
 
 
 class NodeStars(NamedTuple):
-    """The cells around each node, as compressed rows, and the pairs of their facets that coincide."""
+    """The cells around each node, as compressed rows, and the pairs of their facets that
+    coincide.
+    """
 
     start: Ints1  # (N+1,)
     cells: Ints1  # (C(n+1),)
     corner: Ints1  # (C(n+1),) corner of the cell that is the node
-    twin: Ints2  # (C(n+1), n+1) facet with the node: (entry in the row) (n+1) + its facet there; -1 outside
+    # (C(n+1), n+1) facet with the node: (entry in the row) (n+1) + its facet there; -1 outside
+    twin: Ints2
 
 
 def node_stars(state: State) -> NodeStars:

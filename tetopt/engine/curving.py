@@ -1,7 +1,8 @@
-"""Mid-edge nodes of quadratic cells on smooth levels: on interfaces between labels, and on a mask's surface.
+"""Mid-edge nodes of quadratic cells on smooth levels: on interfaces between labels, and on a mask's
+surface.
 
-The midpoint of an edge moves nearly the shortest way onto the levels on which its ends lie, like nodes in
-`tetopt.engine.surface`. No cell around it may come near to folding.
+The midpoint of an edge moves nearly the shortest way onto the levels on which its ends lie, like
+nodes in `tetopt.engine.surface`. No cell around it may come near to folding.
 """
 
 from __future__ import annotations
@@ -13,7 +14,13 @@ from numpy.typing import NDArray
 
 from tetopt.contents.content import Content
 from tetopt.contents.domain import ON_SURFACE_VOXELS, levels
-from tetopt.engine.surface import ASIDE_VOXELS, CURVE_STEPS, MOST_MEETING, NEAR_CURVE_VOXELS, PARALLEL_FRACTION
+from tetopt.engine.surface import (
+    ASIDE_VOXELS,
+    CURVE_STEPS,
+    MOST_MEETING,
+    NEAR_CURVE_VOXELS,
+    PARALLEL_FRACTION,
+)
 from tetopt.geometry.box import box_sides, facets_on_sides, is_on_sides
 from tetopt.geometry.quadratic import cell_edges, jacobian_bounds, numbered_edges
 from tetopt.geometry.simplex import facet_nodes
@@ -22,9 +29,12 @@ from tetopt.image import Image
 from tetopt.mesh import Mesh
 
 LEAST_JACOBIAN = 0.2  # least ratio of a curved cell's Jacobian determinant to the straight cell's
-MOST_BENT = 0.25  # of an edge's length: a level farther from its middle belongs to another part of the surface
-ENDS_VOXELS = 0.5  # largest difference of levels at an edge's ends, twice an interface's distance, that cells follow
-LEAST_PART = 0.25  # least fraction of the way to the level; an edge that may not go so far stays straight
+# of an edge's length: a level farther from its middle belongs to another part of the surface
+MOST_BENT = 0.25
+# largest difference of levels at an edge's ends, twice an interface's distance, that cells follow
+ENDS_VOXELS = 0.5
+# least fraction of the way to the level; an edge that may not go so far stays straight
+LEAST_PART = 0.25
 
 
 class Curving(NamedTuple):
@@ -37,7 +47,8 @@ class Curving(NamedTuple):
     n_on_level : int
         Edges whose mid-edge node lies on the smooth level.
     n_part_way : int
-        Edges whose mid-edge node goes half or a quarter of the way, as a cell would otherwise come near to folding.
+        Edges whose mid-edge node goes half or a quarter of the way, as a cell would otherwise come
+        near to folding.
     n_straight : int
         Other edges.
     farthest : float
@@ -65,16 +76,21 @@ class _Surfaces(NamedTuple):
     """Levels onto which the midpoints of edges move."""
 
     fields: list[NDArray[np.float32]]  # levels
-    pairs: NDArray[np.int64]  # (K, Q, 2) pairs of levels to be equal; a second -1 stands for 0; -1, -1 for no pair
+    # (K, Q, 2) pairs of levels to be equal; a second -1 stands for 0; -1, -1 for no pair
+    pairs: NDArray[np.int64]
     edges: NDArray[np.int64]  # (K,) whose
 
 
-def curved(mesh: Mesh, content: Content, labels: NDArray[np.int64] | None) -> tuple[Mesh, Curving | None]:
-    """Add midpoints to the mesh; those of edges on interfaces and on the mask's surface lie on the smooth levels.
+def curved(
+    mesh: Mesh, content: Content, labels: NDArray[np.int64] | None
+) -> tuple[Mesh, Curving | None]:
+    """Add midpoints to the mesh; those of edges on interfaces and on the mask's surface lie on the
+    smooth levels.
 
-    An edge stays straight if its ends are more than half a voxel off the mask's surface, or a quarter off an interface;
-    if the level is not found within a quarter of the edge's length; or if a cell's Jacobian determinant could fall
-    below a fifth of the straight cell's: all edges of such a cell go half the way, a quarter, or none of it.
+    An edge stays straight if its ends are more than half a voxel off the mask's surface, or a
+    quarter off an interface; if the level is not found within a quarter of the edge's length; or if
+    a cell's Jacobian determinant could fall below a fifth of the straight cell's: all edges of such
+    a cell go half the way, a quarter, or none of it.
 
     Parameters
     ----------
@@ -88,7 +104,8 @@ def curved(mesh: Mesh, content: Content, labels: NDArray[np.int64] | None) -> tu
     Returns
     -------
     Mesh, Curving or None
-        The curved mesh and its numbers; the mesh itself and None for a content without mask and smooth labels.
+        The curved mesh and its numbers; the mesh itself and None for a content without mask and
+        smooth labels.
     """
     has_labels = content.memberships is not None and labels is not None
     if not has_labels and content.region is None:
@@ -99,7 +116,9 @@ def curved(mesh: Mesh, content: Content, labels: NDArray[np.int64] | None) -> tu
     ends = edges[surfaces.edges]
     is_on = np.any(np.all(is_on_sides(index, box_sides(content.image.shape))[ends], axis=1), axis=2)
     middle = index[ends].mean(axis=1)
-    at, is_found = _brought(surfaces, middle, _ways(content.image)[is_on @ (1 << np.arange(mesh.ndim))])
+    at, is_found = _brought(
+        surfaces, middle, _ways(content.image)[is_on @ (1 << np.arange(mesh.ndim))]
+    )
     for end in ends.T:
         is_found &= (np.abs(_values(surfaces, index[end])) < ENDS_VOXELS).all(axis=1)
     off = (at - middle) @ content.image.affine[:-1, :-1].T
@@ -112,22 +131,30 @@ def curved(mesh: Mesh, content: Content, labels: NDArray[np.int64] | None) -> tu
     midpoints, least = _unfolded(mesh, edges, number, ways, part)
     n_curved, n_on_level = int((part > 0.0).sum()), int((part == 1.0).sum())
     farthest = float(np.linalg.norm(part[:, None] * ways, axis=1).max(initial=0.0))
-    curving = Curving(len(ends), n_on_level, n_curved - n_on_level, len(ends) - n_curved, farthest, least)
+    curving = Curving(
+        len(ends), n_on_level, n_curved - n_on_level, len(ends) - n_curved, farthest, least
+    )
     return (Mesh(mesh.points, mesh.cells, midpoints) if part.any() else mesh), curving
 
 
 def _surfaces(
-    cells: NDArray[np.int64], number: NDArray[np.int64], index: NDArray[np.float64], content: Content,
+    cells: NDArray[np.int64],
+    number: NDArray[np.int64],
+    index: NDArray[np.float64],
+    content: Content,
     labels: NDArray[np.int64] | None,
-) -> _Surfaces:  # fmt: skip
-    """Levels on which the edges of cells, numbered (M, 3 or 6), lie, for labels (M,) and nodes at `index`."""
+) -> _Surfaces:
+    """Levels on which the edges of cells, numbered (M, 3 or 6), lie, for labels (M,) and nodes
+    at `index`.
+    """
     fields: list[NDArray[np.float32]] = []
     n_edges = int(number.max()) + 1
     pairs = np.full((n_edges, MOST_MEETING, 2), -1)
     if labels is not None and (members := content.memberships) is not None:
         fields += list(members.levels)
         rank = np.searchsorted(members.labels, labels)
-        met = np.unique(number * len(members.labels) + rank[:, None])  # ascending: by edge, then by label
+        # ascending: by edge, then by label
+        met = np.unique(number * len(members.labels) + rank[:, None])
         edge, label = np.divmod(met, len(members.labels))
         first = np.searchsorted(edge, edge)
         place = np.arange(len(edge)) - first
@@ -149,7 +176,9 @@ def _surfaces(
 
 
 def _ways(image: Image) -> NDArray[np.float64]:
-    """Maps (2^n, n, n) from the slope of a level, by index, to the shortest way up, for each set of fixed axes."""
+    """Maps (2^n, n, n) from the slope of a level, by index, to the shortest way up, for each set
+    of fixed axes.
+    """
     n = image.ndim
     ways = np.zeros((2**n, n, n))
     for number in range(2**n - 1):
@@ -172,9 +201,13 @@ def _values(surfaces: _Surfaces, at: NDArray[np.float64]) -> NDArray[np.float64]
 def _brought(
     surfaces: _Surfaces, start: NDArray[np.float64], ways: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Places (K, n) moved from `start` to where their pairs of levels are equal, and a mask of those that arrive."""
+    """Places (K, n) moved from `start` to where their pairs of levels are equal, and a mask of
+    those that arrive.
+    """
     at = start.copy()
-    tolerance = np.where((surfaces.pairs[..., 0] >= 0).sum(axis=1) == 1, ON_SURFACE_VOXELS, NEAR_CURVE_VOXELS)
+    tolerance = np.where(
+        (surfaces.pairs[..., 0] >= 0).sum(axis=1) == 1, ON_SURFACE_VOXELS, NEAR_CURVE_VOXELS
+    )
     left = np.arange(len(at))
     for _ in range(CURVE_STEPS):
         here = surfaces._replace(pairs=surfaces.pairs[left])
@@ -184,20 +217,31 @@ def _brought(
         if not len(left):
             break
         aside = ASIDE_VOXELS * np.eye(at.shape[1])
-        slope = np.stack([
-            (_values(here, at[left] + step) - _values(here, at[left] - step)) / (2.0 * ASIDE_VOXELS) for step in aside
-        ], axis=2)  # fmt: skip
+        slope = np.stack(
+            [
+                (_values(here, at[left] + step) - _values(here, at[left] - step))
+                / (2.0 * ASIDE_VOXELS)
+                for step in aside
+            ],
+            axis=2,
+        )
         up = np.einsum("kij,kqj->kqi", ways[left], slope)
-        steep = np.linalg.pinv(np.einsum("kpi,kqi->kpq", slope, up), rcond=PARALLEL_FRACTION, hermitian=True)
+        steep = np.linalg.pinv(
+            np.einsum("kpi,kqi->kpq", slope, up), rcond=PARALLEL_FRACTION, hermitian=True
+        )
         at[left] -= np.einsum("kp,kpq,kqi->ki", value, steep, up)
     return at, np.all(np.abs(_values(surfaces, at)) < tolerance[:, None], axis=1)
 
 
 def _unfolded(
-    mesh: Mesh, edges: NDArray[np.int64], number: NDArray[np.int64], ways: NDArray[np.float64],
+    mesh: Mesh,
+    edges: NDArray[np.int64],
+    number: NDArray[np.int64],
+    ways: NDArray[np.float64],
     part: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], float]:  # fmt: skip
-    """Midpoints (E, n) moved a fraction of each way, and the least bound of a cell's Jacobian determinant.
+) -> tuple[NDArray[np.float64], float]:
+    """Midpoints (E, n) moved a fraction of each way, and the least bound of a cell's Jacobian
+    determinant.
 
     Where that bound is too small, fractions are reduced, in place.
     """
@@ -206,7 +250,9 @@ def _unfolded(
     while len(left):
         midpoints = straight + part[:, None] * ways
         nodes = np.concatenate([mesh.points, midpoints])
-        bounds[left] = jacobian_bounds(nodes, np.column_stack([mesh.cells[left], len(mesh.points) + number[left]]))
+        bounds[left] = jacobian_bounds(
+            nodes, np.column_stack([mesh.cells[left], len(mesh.points) + number[left]])
+        )
         is_changed = np.zeros(len(edges), dtype=bool)
         is_changed[number[bounds < LEAST_JACOBIAN]] = True
         is_changed &= part > 0.0

@@ -1,13 +1,16 @@
-"""Insert and remove nodes where that lowers E: split edges at their middle, or collapse them to one of their ends.
+"""Insert and remove nodes where that lowers E: split edges at their middle, or collapse them to one
+of their ends.
 
-The gain of a split or a collapse is measured with the same energy as every other move. Splits always lower E_D and
-collapses raise it, so a number of nodes is needed to balance them: nodes are exchanged, the cheapest collapses for
-splits with a larger gain, up to a requested number. On a graded mesh (see `tetopt.engine.complex.shape_energy`) the
-cells of a node have the same shape energy everywhere, so that exchanges trade only the error of the image.
+The gain of a split or a collapse is measured with the same energy as every other move. Splits
+always lower E_D and collapses raise it, so a number of nodes is needed to balance them: nodes are
+exchanged, the cheapest collapses for splits with a larger gain, up to a requested number. On a
+graded mesh (see `tetopt.engine.complex.shape_energy`) the cells of a node have the same shape
+energy everywhere, so that exchanges trade only the error of the image.
 
-Each node evaluates the edges to its neighbours and keeps its best split and its best collapse, all nodes in parallel.
-Moves are then made one after the other, the largest gain first, each only if no cell around it has changed. A move
-works on a node's star, so that the same code serves triangles and tetrahedra.
+Each node evaluates the edges to its neighbours and keeps its best split and its best collapse, all
+nodes in parallel. Moves are then made one after the other, the largest gain first, each only if no
+cell around it has changed. A move works on a node's star, so that the same code serves triangles
+and tetrahedra.
 """
 
 from __future__ import annotations
@@ -66,19 +69,35 @@ from tetopt.engine.surface import MOST_MEETING, faces_up, put_on_surface, star_f
 from tetopt.geometry.topology import compact
 from tetopt.geometry.vectors import dot, minus, put_row, row
 from tetopt.start.sizes import LONG_EDGE
-from tetopt.system.kernels import Bools1, Floats1, Floats2, Ints1, Ints2, entry, helper, packed, run, unit
+from tetopt.system.kernels import (
+    Bools1,
+    Floats1,
+    Floats2,
+    Ints1,
+    Ints2,
+    entry,
+    helper,
+    packed,
+    run,
+    unit,
+)
 
-# Of a node's mean part of E: least gain of a split considered. The last one made in a round gains 0.4 to 0.8.
+# Of a node's mean part of E: least gain of a split considered. The last one made in a round gains
+# 0.4 to 0.8.
 LEAST_SPLIT_FRACTION = 0.2
 LEAST_EXCHANGE_FRACTION = 1e-3  # of a node's mean part of E: least gain of an exchange of two nodes
-# Of the noise's variance: the same; about the largest gain by chance among thousands of edges in noise.
+# Of the noise's variance: the same; about the largest gain by chance among thousands of edges in
+# noise.
 LEAST_OVER_NOISE = 20.0
-MIDDLE_SHIFT_FRACTION = 0.25  # of an edge on a mask's surface: the farthest that a node is put from its middle
-SURFACE_VOLUME_FRACTION = 0.1  # of the star's volume: the largest change by a collapse on a mask's surface
+# of an edge on a mask's surface: the farthest that a node is put from its middle
+MIDDLE_SHIFT_FRACTION = 0.25
+# of the star's volume: the largest change by a collapse on a mask's surface
+SURFACE_VOLUME_FRACTION = 0.1
 ROUNDING_FRACTION = 1e-9  # of the star's volume: the same elsewhere, where it is only rounding
 MAX_NEIGHBOURS = 128  # most edges of a node that are evaluated
-# Bonus for splitting an edge that is too long for its target, times the square of its length over the target: E starts
-# at about 1, so that such splits come before all others, and E's digits are kept.
+# Bonus for splitting an edge that is too long for its target, times the square of its length over
+# the target: E starts at about 1, so that such splits come before all others, and E's digits are
+# kept.
 TARGET_CREDIT = 1e4
 LEAST_LIFT_COSINE = 1e-4  # least growth of a worst angle's negative cosine for a move
 
@@ -113,11 +132,12 @@ class EdgeMoves(NamedTuple):
 
 
 def exchange(state: State, n_nodes: int, most: int, limits: Limits) -> Exchanged:
-    """One round of splits and collapses towards `n_nodes` nodes, and of exchanges of a node for another.
+    """One round of splits and collapses towards `n_nodes` nodes, and of exchanges of a node for
+    another.
 
-    Beyond the moves that the number requires, up to `most` nodes are exchanged if each exchange lowers E, or splits an
-    edge that is too long for its target. One round at most doubles the nodes. Afterwards the complex of `state` is out
-    of date.
+    Beyond the moves that the number requires, up to `most` nodes are exchanged if each exchange
+    lowers E, or splits an edge that is too long for its target. One round at most doubles the
+    nodes. Afterwards the complex of `state` is out of date.
     """
     n_before = len(state.complex.ticks)
     more, most = min(max(n_nodes - n_before, -n_before), n_before), min(most, n_before)
@@ -125,22 +145,33 @@ def exchange(state: State, n_nodes: int, most: int, limits: Limits) -> Exchanged
     state = roomy(state, n_before, 16 * (max(more, 0) + most))
     E_G, squares = energies(state)
     E = state.objective.geometry * E_G + state.objective.image * squares + interface_energy(state)
-    # Splits pay where the error is large, collapses where it is small: half of the nodes are evaluated for each, unless
-    # many nodes must be inserted or removed. This raises E_D by no measurable amount, and saves half of the time.
+    # Splits pay where the error is large, collapses where it is small: half of the nodes are
+    # evaluated for each, unless many nodes must be inserted or removed. This raises E_D by no
+    # measurable amount, and saves half of the time.
     error = _star_errors(state, n_before)
     middle = np.median(error)
     may_split = (error >= middle) | (more > n_before // 8) | too_long(state, limits.target)
     least = LEAST_SPLIT_FRACTION * E / n_before if more <= 0 else -np.inf
     splits = best_splits(state, stars, may_split, limits._replace(least=least))
-    is_sized = bool((splits.gain >= TARGET_CREDIT).any())  # edges that are too long are split at any cost
+    # edges that are too long are split at any cost
+    is_sized = bool((splits.gain >= TARGET_CREDIT).any())
     in_ = _best_first(splits)
-    dearest = np.inf if more < 0 or is_sized else float(splits.gain[in_[: max(most // 4, 1)]].min(initial=np.inf))
+    dearest = (
+        np.inf
+        if more < 0 or is_sized
+        else float(splits.gain[in_[: max(most // 4, 1)]].min(initial=np.inf))
+    )
     may_collapse = (error <= middle) | (more < -(n_before // 8)) | is_sized
     collapses = best_collapses(state, stars, groups, may_collapse, limits._replace(dearest=dearest))
-    least = max(LEAST_EXCHANGE_FRACTION * E / n_before, LEAST_OVER_NOISE * state.objective.image * limits.noise)
+    least = max(
+        LEAST_EXCHANGE_FRACTION * E / n_before,
+        LEAST_OVER_NOISE * state.objective.image * limits.noise,
+    )
     is_dirty = np.zeros(len(state.complex.cells), dtype=np.bool_)
     out = _best_first(collapses)
-    n_split, n_collapsed = make_exchanges(state, stars, splits, collapses, in_, out, (more, most, least), is_dirty)
+    n_split, n_collapsed = make_exchanges(
+        state, stars, splits, collapses, in_, out, (more, most, least), is_dirty
+    )
     return compacted(state, is_dirty, n_before, n_split, n_collapsed)
 
 
@@ -165,7 +196,9 @@ def _fill_too_long(is_one: Bools1, state: State, target: Floats1) -> None:
 
 @helper
 def squared_ratio(state: State, a: int, b: int, target: NDArray) -> float:
-    """Square of an edge's length over its target (the mean of both ends' targets); 0 without a target."""
+    """Square of an edge's length over its target (the mean of both ends' targets); 0 without a
+    target.
+    """
     return squared_length(state, a, b) / (0.25 * (target[a] + target[b]) ** 2)
 
 
@@ -183,21 +216,31 @@ def _star_errors(state: State, n_nodes: int) -> NDArray[np.float64]:
 
 
 def roomy(state: State, n_nodes: int, n_cells: int) -> State:
-    """The state with space for more nodes and cells; the additional rows of `ticks` are not nodes yet."""
+    """The state with space for more nodes and cells; the additional rows of `ticks` are not
+    nodes yet.
+    """
     if len(state.complex.cells) - state.complex.n_cells[0] < n_cells:
         state = grown(state, n_cells)
     ticks = np.concatenate([state.complex.ticks, np.zeros((n_nodes, 3), dtype=np.int64)])
     is_frozen = np.concatenate([state.complex.is_frozen, np.zeros((n_nodes, 4), dtype=np.bool_)])
     meeting = np.concatenate([state.complex.meeting, np.full((n_nodes, 4), -1, dtype=np.int64)])
-    band, offset = (np.concatenate([rows, np.zeros(n_nodes)]) for rows in (state.complex.band, state.complex.offset))
-    complex_ = state.complex._replace(ticks=ticks, is_frozen=is_frozen, meeting=meeting, band=band, offset=offset)
+    band, offset = (
+        np.concatenate([rows, np.zeros(n_nodes)])
+        for rows in (state.complex.band, state.complex.offset)
+    )
+    complex_ = state.complex._replace(
+        ticks=ticks, is_frozen=is_frozen, meeting=meeting, band=band, offset=offset
+    )
     return state._replace(complex=complex_)
 
 
 def compacted(
-    state: State, is_dirty: NDArray[np.bool_] | None = None, n_before: int | None = None, n_split: int = 0,
+    state: State,
+    is_dirty: NDArray[np.bool_] | None = None,
+    n_before: int | None = None,
+    n_split: int = 0,
     n_collapsed: int = 0,
-) -> Exchanged:  # fmt: skip
+) -> Exchanged:
     """Remove nodes without cells, and renumber the others in their order."""
     n_cells = int(state.complex.n_cells[0])
     is_dirty = np.zeros(n_cells, dtype=np.bool_) if is_dirty is None else is_dirty
@@ -215,14 +258,21 @@ def compacted(
 
 @entry
 def make_exchanges(
-    state: State, stars: NodeStars, splits: EdgeMoves, collapses: EdgeMoves, in_: Ints1, out: Ints1,
-    quota: tuple[int, int, float], is_dirty: Bools1,
-) -> tuple[int, int]:  # fmt: skip
-    """Split edges of the nodes `in_` or collapse the nodes `out` up to the quota; then do both in pairs.
+    state: State,
+    stars: NodeStars,
+    splits: EdgeMoves,
+    collapses: EdgeMoves,
+    in_: Ints1,
+    out: Ints1,
+    quota: tuple[int, int, float],
+    is_dirty: Bools1,
+) -> tuple[int, int]:
+    """Split edges of the nodes `in_` or collapse the nodes `out` up to the quota; then do both in
+    pairs.
 
-    Moves are made in their order, each only if none of its cells has changed. The quota is the number of additional
-    nodes, the largest number of pairs, and the least reduction of E by each pair. Returns the numbers of splits and
-    collapses.
+    Moves are made in their order, each only if none of its cells has changed. The quota is the
+    number of additional nodes, the largest number of pairs, and the least reduction of E by each
+    pair. Returns the numbers of splits and collapses.
     """
     n_nodes = len(stars.start) - 1
     more, most, least = quota
@@ -231,17 +281,25 @@ def make_exchanges(
         is_pair = n_split - n_collapsed == more
         if is_pair and min(n_split, n_collapsed) >= most:
             break
-        does_split, does_collapse = is_pair or n_split - n_collapsed < more, is_pair or n_split - n_collapsed > more
+        does_split, does_collapse = (
+            is_pair or n_split - n_collapsed < more,
+            is_pair or n_split - n_collapsed > more,
+        )
         if does_split:
             while s < len(in_) and not _can_split(state, stars, in_[s], is_dirty):
                 s += 1
             if s == len(in_):
                 break
-            _mark_edge(state, stars, in_[s], splits.other[in_[s]], is_dirty, True)  # its partner must be elsewhere
+            # its partner must be elsewhere
+            _mark_edge(state, stars, in_[s], splits.other[in_[s]], is_dirty, True)
         if does_collapse:
-            while c < len(out) and not _can_collapse(state, stars, out[c], collapses.other[out[c]], is_dirty):
+            while c < len(out) and not _can_collapse(
+                state, stars, out[c], collapses.other[out[c]], is_dirty
+            ):
                 c += 1
-        if does_collapse and (c == len(out) or (is_pair and splits.gain[in_[s]] + collapses.gain[out[c]] <= least)):
+        if does_collapse and (
+            c == len(out) or (is_pair and splits.gain[in_[s]] + collapses.gain[out[c]] <= least)
+        ):
             if does_split:
                 _mark_edge(state, stars, in_[s], splits.other[in_[s]], is_dirty, False)
             break
@@ -258,7 +316,9 @@ def make_exchanges(
 
 
 @helper
-def _mark_edge(state: State, stars: NodeStars, a: int, b: int, is_dirty: NDArray, value: bool) -> None:
+def _mark_edge(
+    state: State, stars: NodeStars, a: int, b: int, is_dirty: NDArray, value: bool
+) -> None:
     for r in range(stars.start[a], stars.start[a + 1]):
         if has_node(state.complex.cells, stars.cells[r], b):
             is_dirty[stars.cells[r]] = value
@@ -296,14 +356,18 @@ def _can_collapse(state: State, stars: NodeStars, a: int, b: int, is_dirty: Bool
 def _can_split(state: State, stars: NodeStars, a: int, is_dirty: NDArray) -> bool:
     """True if the cells around a are unchanged and there is space for more."""
     size = stars.start[a + 1] - stars.start[a]
-    return state.complex.n_cells[0] + size <= len(state.complex.cells) and _is_clean(stars, a, is_dirty)
+    return state.complex.n_cells[0] + size <= len(state.complex.cells) and _is_clean(
+        stars, a, is_dirty
+    )
 
 
 @unit
 def _sides_of_edge(state: State, stars: NodeStars, a: int, b: int) -> int:
-    """The box's sides in which an edge lies, bit d for axis d, and bit 3 if it is on the boundary elsewhere.
+    """The box's sides in which an edge lies, bit d for axis d, and bit 3 if it is on the boundary
+    elsewhere.
 
-    The boundary's facets at the edge decide, not its ends, which may lie in a side that the edge does not.
+    The boundary's facets at the edge decide, not its ends, which may lie in a side that the edge
+    does not.
     """
     cells, t, sides = state.complex.cells, state.complex.ticks, 0
     for r in range(stars.start[a], stars.start[a + 1]):
@@ -348,7 +412,9 @@ def _put_middle(state: State, stars: NodeStars, a: int, b: int, p: int) -> bool:
     if not put_on_surface(uphill, state, p):
         return False
     shift = minus(place(ticks, p, a, state.objective), middle)
-    if dot(shift, shift) > MIDDLE_SHIFT_FRACTION * MIDDLE_SHIFT_FRACTION * squared_length(state, a, b):
+    if dot(shift, shift) > MIDDLE_SHIFT_FRACTION * MIDDLE_SHIFT_FRACTION * squared_length(
+        state, a, b
+    ):
         return False
     if sides < 8:
         return True
@@ -375,7 +441,9 @@ def is_among(label: int, labels: NDArray) -> bool:
 
 @unit
 def labels_of_edge(meeting: Ints1, state: State, stars: NodeStars, a: int, b: int) -> int:
-    """Write the labels around an edge to `meeting` (4,) if there are 2 to 4, else -1; return their number."""
+    """Write the labels around an edge to `meeting` (4,) if there are 2 to 4, else -1; return
+    their number.
+    """
     count = 0
     for m in range(MOST_MEETING):
         meeting[m] = -1
@@ -394,9 +462,11 @@ def labels_of_edge(meeting: Ints1, state: State, stars: NodeStars, a: int, b: in
 
 
 def mend(state: State, bad: NDArray[np.int64], target: float) -> Exchanged:
-    """For each bad cell make the collapse or split of an edge that leaves the best worst angle, if it improves.
+    """For each bad cell make the collapse or split of an edge that leaves the best worst angle, if
+    it improves.
 
-    The measure is minus the cosine of the smallest dihedral angle, up to `target`. Cells of `bad` come worst first.
+    The measure is minus the cosine of the smallest dihedral angle, up to `target`. Cells of `bad`
+    come worst first.
     """
     n_before = len(state.complex.ticks)
     stars = node_stars(state)
@@ -407,7 +477,9 @@ def mend(state: State, bad: NDArray[np.int64], target: float) -> Exchanged:
 
 
 @entry
-def _mend(state: State, stars: NodeStars, bad: Ints1, target: float, is_dirty: Bools1) -> tuple[int, int]:
+def _mend(
+    state: State, stars: NodeStars, bad: Ints1, target: float, is_dirty: Bools1
+) -> tuple[int, int]:
     cells, x = state.complex.cells, np.empty((4, 3))
     n_split, n_collapsed, n_nodes = 0, 0, len(stars.start) - 1
     for cell in bad:
@@ -442,7 +514,9 @@ def _mend(state: State, stars: NodeStars, bad: Ints1, target: float, is_dirty: B
 
 
 @helper
-def _lift_by_collapse(x: NDArray, state: State, stars: NodeStars, a: int, b: int, target: float) -> float:
+def _lift_by_collapse(
+    x: NDArray, state: State, stars: NodeStars, a: int, b: int, target: float
+) -> float:
     """Growth of the worst cosine around a if a is joined to b."""
     cells, t = state.complex.cells, state.complex.ticks
     if not may_join(state, a, b):
@@ -462,7 +536,9 @@ def _lift_by_collapse(x: NDArray, state: State, stars: NodeStars, a: int, b: int
 
 
 @helper
-def _lift_by_split(x: NDArray, state: State, stars: NodeStars, a: int, b: int, p: int, target: float) -> float:
+def _lift_by_split(
+    x: NDArray, state: State, stars: NodeStars, a: int, b: int, p: int, target: float
+) -> float:
     """Growth of the worst cosine around the edge (a, b) if it is split at p."""
     old, new = target, target
     for r in range(stars.start[a], stars.start[a + 1]):
@@ -479,10 +555,14 @@ def _lift_by_split(x: NDArray, state: State, stars: NodeStars, a: int, b: int, p
 # Splits.
 
 
-def best_splits(state: State, stars: NodeStars, may_split: NDArray[np.bool_], limits: Limits) -> EdgeMoves:
-    """The best allowed split of an edge of each node, above the angle limit and without too short edges.
+def best_splits(
+    state: State, stars: NodeStars, may_split: NDArray[np.bool_], limits: Limits
+) -> EdgeMoves:
+    """The best allowed split of an edge of each node, above the angle limit and without too short
+    edges.
 
-    An edge between two allowed nodes belongs to the lower one. Rows N to 2 N of `ticks` and `is_frozen` are written.
+    An edge between two allowed nodes belongs to the lower one. Rows N to 2 N of `ticks` and
+    `is_frozen` are written.
     """
     n_nodes = len(may_split)
     moves = EdgeMoves(may_split, np.full(n_nodes, -1, dtype=np.int64), np.full(n_nodes, -np.inf))
@@ -514,11 +594,16 @@ def _best_split(a: int, moves: EdgeMoves, state: State, stars: NodeStars, limits
     for number in range(count):
         b = near[number]
         bound[number] = -np.inf
-        if (b > a or not moves.may_move[b]) and squared_length(state, a, b) >= 4.0 * limits.shortest * limits.shortest:
+        if (b > a or not moves.may_move[b]) and squared_length(
+            state, a, b
+        ) >= 4.0 * limits.shortest * limits.shortest:
             ratio = squared_ratio(state, a, b, limits.target)
             bound[number] = TARGET_CREDIT * ratio if ratio > LONG_EDGE * LONG_EDGE else 0.0
-            bound[number] += np.inf if _may_fit(state, a, b) else _energy_of_edge(state, stars, a, b)
-    # Unless it may fit a mask, no edge gains more than its energy; without a mask, less tension is not looked for.
+            bound[number] += (
+                np.inf if _may_fit(state, a, b) else _energy_of_edge(state, stars, a, b)
+            )
+    # Unless it may fit a mask, no edge gains more than its energy; without a mask, less tension is
+    # not looked for.
     for _ in range(count):
         number = int(np.argmax(bound[:count]))
         if not bound[number] > best:
@@ -535,14 +620,18 @@ def _best_split(a: int, moves: EdgeMoves, state: State, stars: NodeStars, limits
 
 @helper
 def _may_fit(state: State, a: int, b: int) -> bool:
-    """True if a split of the edge (a, b) may change the misfit to a mask: on its surface, where both ends lie."""
+    """True if a split of the edge (a, b) may change the misfit to a mask: on its surface, where
+    both ends lie.
+    """
     is_frozen = state.complex.is_frozen
     return state.objective.surface > 0.0 and is_frozen[a, 3] and is_frozen[b, 3]
 
 
 @helper
 def _energy_of_edge(state: State, stars: NodeStars, a: int, b: int) -> float:
-    """Energy of the cells around the edge (a, b) and, within a mask, of the facets between labels at it."""
+    """Energy of the cells around the edge (a, b) and, within a mask, of the facets between
+    labels at it.
+    """
     mesh, energy = state.complex, 0.0
     for r in range(stars.start[a], stars.start[a + 1]):
         cell = stars.cells[r]
@@ -552,14 +641,18 @@ def _energy_of_edge(state: State, stars: NodeStars, a: int, b: int) -> float:
         for k in range(mesh.cells.shape[1] if state.objective.surface > 0.0 else 0):
             if mesh.cells[cell, k] not in (a, b) and is_interface(mesh, cell, k):
                 i, j, m = outward(mesh.cells, cell, k)
-                tension = pair_tension(state.objective, mesh.labels[cell], mesh.labels[mesh.across[cell, k]])
+                tension = pair_tension(
+                    state.objective, mesh.labels[cell], mesh.labels[mesh.across[cell, k]]
+                )
                 energy += 0.5 * tension * facet_area(mesh.ticks, i, j, m, state.objective)
     return energy
 
 
 @helper
 def _is_long(state: State, stars: NodeStars, a: int, b: int, p: int, shortest: float) -> bool:
-    """True if no edge from p to the other corners of the cells around the edge (a, b) is shorter than the limit."""
+    """True if no edge from p to the other corners of the cells around the edge (a, b) is shorter
+    than the limit.
+    """
     cells = state.complex.cells
     if shortest <= 0.0:
         return True
@@ -574,7 +667,9 @@ def _is_long(state: State, stars: NodeStars, a: int, b: int, p: int, shortest: f
 
 @unit
 def _neighbours(near: Ints1, cells: Ints2, stars: NodeStars, node: int) -> int:
-    """Write the nodes that share a cell with `node` to `near`, as many as fit; return their number."""
+    """Write the nodes that share a cell with `node` to `near`, as many as fit; return their
+    number.
+    """
     count = 0
     for r in range(stars.start[node], stars.start[node + 1]):
         for k in range(cells.shape[1]):
@@ -589,8 +684,12 @@ def _neighbours(near: Ints1, cells: Ints2, stars: NodeStars, node: int) -> int:
 
 
 @unit
-def worth_of_split(x: Floats2, state: State, stars: NodeStars, a: int, b: int, p: int, least_gain: float) -> float:
-    """Reduction of E by splitting the edge (a, b) at p; -inf if impossible or less than `least_gain`."""
+def worth_of_split(
+    x: Floats2, state: State, stars: NodeStars, a: int, b: int, p: int, least_gain: float
+) -> float:
+    """Reduction of E by splitting the edge (a, b) at p; -inf if impossible or less than
+    `least_gain`.
+    """
     cells, fluxes, objective = state.complex.cells, state.complex.fluxes, state.objective
     n = cells.shape[1]
     old, shape = 0.0, 0.0
@@ -617,7 +716,8 @@ def worth_of_split(x: Floats2, state: State, stars: NodeStars, a: int, b: int, p
     if objective.image == 0.0:
         return old - shape
     new, misfit, D = shape, 0.0, state.complex.sums.shape[1]
-    # Unless p was moved to a surface, the two halves of a facet of the edge make up all of it: measure one of them.
+    # Unless p was moved to a surface, the two halves of a facet of the edge make up all of it:
+    # measure one of them.
     is_beside = state.complex.is_frozen[p, 3] or state.complex.meeting[p, 1] >= 0
     flux, sums = np.empty((1, 1, D)), np.empty((2, D))
     for r in range(stars.start[a], stars.start[a + 1]):
@@ -639,7 +739,9 @@ def worth_of_split(x: Floats2, state: State, stars: NodeStars, a: int, b: int, p
                         for d in range(D):
                             sums[1, d] += flux[0, 0, d]
             for half in range(2):
-                new += objective.image * image_energy(sums, half, state.complex.labels[cell], objective)
+                new += objective.image * image_energy(
+                    sums, half, state.complex.labels[cell], objective
+                )
                 misfit += wrong_side(sums, half, objective)
             misfit -= wrong_side(state.complex.sums, cell, objective)
             if old - new <= least_gain and not has_misfit:  # otherwise the misfit may still fall
@@ -650,7 +752,9 @@ def worth_of_split(x: Floats2, state: State, stars: NodeStars, a: int, b: int, p
 
 @helper
 def _rise_of_tension(state: State, cell: int, a: int, b: int, p: int) -> float:
-    """Half of the rise of the energy of a cell's facets between labels if the edge (a, b) is split at p."""
+    """Half of the rise of the energy of a cell's facets between labels if the edge (a, b) is
+    split at p.
+    """
     mesh, objective, rise = state.complex, state.objective, 0.0
     for k in range(mesh.cells.shape[1]):
         if mesh.cells[cell, k] in (a, b) or not is_interface(mesh, cell, k):
@@ -659,9 +763,15 @@ def _rise_of_tension(state: State, cell: int, a: int, b: int, p: int) -> float:
         for m in range(mesh.cells.shape[1]):
             if m != k and mesh.cells[cell, m] not in (a, b):
                 c = mesh.cells[cell, m]
-        more = facet_area(mesh.ticks, a, p, c, objective) + facet_area(mesh.ticks, p, b, c, objective)
+        more = facet_area(mesh.ticks, a, p, c, objective) + facet_area(
+            mesh.ticks, p, b, c, objective
+        )
         more -= facet_area(mesh.ticks, a, b, c, objective)
-        rise += 0.5 * pair_tension(objective, mesh.labels[cell], mesh.labels[mesh.across[cell, k]]) * more
+        rise += (
+            0.5
+            * pair_tension(objective, mesh.labels[cell], mesh.labels[mesh.across[cell, k]])
+            * more
+        )
     return rise
 
 
@@ -686,7 +796,9 @@ def _put_flux_with(flux: NDArray, state: State, cell: int, k: int, node: int, p:
 
 @unit
 def split_edge(state: State, stars: NodeStars, a: int, b: int, p: int, is_dirty: Bools1) -> None:
-    """Split each cell of the edge (a, b): it keeps a, with p for b; a new one has b, with p for a."""
+    """Split each cell of the edge (a, b): it keeps a, with p for b; a new one has b, with p for
+    a.
+    """
     cells, across, fluxes = state.complex.cells, state.complex.across, state.complex.fluxes
     n, first, last = cells.shape[1], stars.start[a], stars.start[a + 1]
     x, new = np.empty((4, 3)), np.full(last - first, -1, dtype=np.int64)
@@ -714,7 +826,8 @@ def split_edge(state: State, stars: NodeStars, a: int, b: int, p: int, is_dirty:
                 for s in range(first, last):
                     if stars.cells[s] == across[cell, k]:
                         across[other, k] = new[s - first]
-    for r in range(first, last):  # only now, as the search for new neighbours needed the old corners
+    # only now, as the search for new neighbours needed the old corners
+    for r in range(first, last):
         cell, other = stars.cells[r], new[r - first]
         if other < 0:
             continue
@@ -765,9 +878,18 @@ def _fill_collapses(work: Collapses, number: int) -> None:
 
 
 @unit
-def _best_collapse(a: int, moves: EdgeMoves, state: State, stars: NodeStars, limits: Limits) -> None:
-    """The neighbour to which `a` is best joined; `a` moves there and back, unseen by cells of other groups."""
-    cells, t, is_frozen, objective = state.complex.cells, state.complex.ticks, state.complex.is_frozen, state.objective
+def _best_collapse(
+    a: int, moves: EdgeMoves, state: State, stars: NodeStars, limits: Limits
+) -> None:
+    """The neighbour to which `a` is best joined; `a` moves there and back, unseen by cells of
+    other groups.
+    """
+    cells, t, is_frozen, objective = (
+        state.complex.cells,
+        state.complex.ticks,
+        state.complex.is_frozen,
+        state.objective,
+    )
     if is_frozen[a, 0] and is_frozen[a, 1] and is_frozen[a, 2]:
         return
     n, trial = cells.shape[1], trial_of(state, stars, a)
@@ -785,7 +907,9 @@ def _best_collapse(a: int, moves: EdgeMoves, state: State, stars: NodeStars, lim
         b = near[number]
         if may_join(state, a, b) and _is_short(state, near, count, a, b, limits.longest):
             put_row(t, a, row(t, b))
-            shapes[number] = star_shape(trial, np.inf if has_misfit else best, least, a, state, stars, b)
+            shapes[number] = star_shape(
+                trial, np.inf if has_misfit else best, least, a, state, stars, b
+            )
             if shapes[number] < np.inf and not _keeps_domain(trial.x, state, stars, a, b, size):
                 shapes[number] = np.inf
             put_row(t, a, here)
@@ -812,7 +936,9 @@ def squared_length(state: State, a: int, b: int) -> float:
 
 @unit
 def _is_short(state: State, near: Ints1, count: int, a: int, b: int, longest: Floats1) -> bool:
-    """True if no edge from b to a neighbour of a exceeds the bound at its ends, or the longest edge before."""
+    """True if no edge from b to a neighbour of a exceeds the bound at its ends, or the longest
+    edge before.
+    """
     old = 0.0
     for m in range(count):
         old = max(old, squared_length(state, a, near[m]))
@@ -840,7 +966,9 @@ def may_join(state: State, a: int, b: int) -> bool:
 
 @unit
 def _keeps_domain(x: Floats2, state: State, stars: NodeStars, a: int, b: int, size: float) -> bool:
-    """True if the mesh still covers its domain with a at b; `size` is n! times the star's volume."""
+    """True if the mesh still covers its domain with a at b; `size` is n! times the star's
+    volume.
+    """
     if state.complex.meeting[a, 1] >= 0 and not _stays_between_labels(state, stars, a, b):
         return False
     if not state.complex.is_frozen[a, 3]:
@@ -856,10 +984,10 @@ def _keeps_domain(x: Floats2, state: State, stars: NodeStars, a: int, b: int, si
 def _stays_between_labels(state: State, stars: NodeStars, a: int, b: int) -> bool:
     """True if a node between labels may be joined to b so that all labels keep their topology.
 
-    All labels that meet at it must do so along the whole edge, which therefore lies on the same surface or curve.
-    Facets between labels must fulfil the same condition as the boundary (`_is_linked`), and a curve of three edges is
-    kept. No removed cell may have such facets opposite both ends: they would coincide, and a label's last cell might
-    vanish.
+    All labels that meet at it must do so along the whole edge, which therefore lies on the same
+    surface or curve. Facets between labels must fulfil the same condition as the boundary
+    (`_is_linked`), and a curve of three edges is kept. No removed cell may have such facets
+    opposite both ends: they would coincide, and a label's last cell might vanish.
     """
     cells, labels = state.complex.cells, state.complex.labels
     meeting, other = np.empty(MOST_MEETING, dtype=np.int64), np.empty(MOST_MEETING, dtype=np.int64)
@@ -900,8 +1028,8 @@ def _is_side(state: State, cell: int, node: int) -> bool:
 def _is_linked(state: State, stars: NodeStars, a: int, b: int) -> bool:
     """True if a boundary edge may be collapsed without closing a hole or a gap (Dey et al. 1999).
 
-    It must lie on the boundary, and any common neighbour of its ends must share a cell with both or, on the boundary,
-    a facet.
+    It must lie on the boundary, and any common neighbour of its ends must share a cell with both
+    or, on the boundary, a facet.
     """
     cells = state.complex.cells
     near, n = np.empty(MAX_NEIGHBOURS, dtype=np.int64), cells.shape[1]
@@ -917,7 +1045,9 @@ def _is_linked(state: State, stars: NodeStars, a: int, b: int) -> bool:
             continue
         if not has_both:
             return False
-        are_outer = n == 4 and _is_outer(state, stars, a, c, -1) and _is_outer(state, stars, b, c, -1)
+        are_outer = (
+            n == 4 and _is_outer(state, stars, a, c, -1) and _is_outer(state, stars, b, c, -1)
+        )
         if are_outer and not _is_outer(state, stars, a, b, c):
             return False
     return edge
@@ -925,7 +1055,9 @@ def _is_linked(state: State, stars: NodeStars, a: int, b: int) -> bool:
 
 @helper
 def _is_outer(state: State, stars: NodeStars, a: int, b: int, c: int) -> bool:
-    """True if a facet of the boundary or between labels has the nodes a and b, and c unless that is -1."""
+    """True if a facet of the boundary or between labels has the nodes a and b, and c unless that
+    is -1.
+    """
     cells = state.complex.cells
     for r in range(stars.start[a], stars.start[a + 1]):
         cell = stars.cells[r]
@@ -938,11 +1070,14 @@ def _is_outer(state: State, stars: NodeStars, a: int, b: int, c: int) -> bool:
 
 
 @unit
-def _keeps_size(x: Floats2, state: State, stars: NodeStars, a: int, b: int, size: float, fraction: float) -> bool:
-    """True if the cells around a, moved to b, keep their volume up to a fraction; `size` is n! times the volume.
+def _keeps_size(
+    x: Floats2, state: State, stars: NodeStars, a: int, b: int, size: float, fraction: float
+) -> bool:
+    """True if the cells around a, moved to b, keep their volume up to a fraction; `size` is n!
+    times the volume.
 
-    If all cells are positive, they fan out from b over the star's hull, so this holds unless the domain is not convex
-    there.
+    If all cells are positive, they fan out from b over the star's hull, so this holds unless the
+    domain is not convex there.
     """
     cells = state.complex.cells
     total = 0.0
@@ -955,14 +1090,19 @@ def _keeps_size(x: Floats2, state: State, stars: NodeStars, a: int, b: int, size
 
 @unit
 def collapse_edge(state: State, stars: NodeStars, a: int, b: int, is_dirty: Bools1) -> None:
-    """Replace node a by b: cells with both are removed, and the other cells around a get b instead."""
+    """Replace node a by b: cells with both are removed, and the other cells around a get b
+    instead.
+    """
     cells, across, x = state.complex.cells, state.complex.across, np.empty((4, 3))
     for r in range(stars.start[a], stars.start[a + 1]):
         cell = stars.cells[r]
         is_dirty[cell] = True
         if has_node(cells, cell, b):
             # The cells beyond its facets opposite a and b become neighbours.
-            of_b, of_a = across[cell, corner_of(cells, cell, a)], across[cell, corner_of(cells, cell, b)]
+            of_b, of_a = (
+                across[cell, corner_of(cells, cell, a)],
+                across[cell, corner_of(cells, cell, b)],
+            )
             if of_a >= 0:
                 across[of_a, facet_of(across, of_a, cell)] = of_b
             if of_b >= 0:

@@ -1,11 +1,13 @@
-"""The fast engine: minimise the paper's energy by analytic gradients and energy-driven flips, above a minimum angle.
+"""The fast engine: minimise the paper's energy by analytic gradients and energy-driven flips, above
+a minimum angle.
 
-Each iteration moves the nodes with an expected gain (`smooth`) and then exchanges cells wherever that lowers E
-(`flips`), which replaces Delaunay re-tessellation. No move leaves a dihedral angle below the minimum, and a lattice
-starts far above it, so E falls throughout, unless nodes are moved onto interfaces. Cells of other initial meshes below
-the minimum are repaired at the end (`repair`), if nothing else has lifted them. Keeping the minimum throughout costs as
-much E_D as lifting the worst cells once E has settled (0.3587 of the initial value against 0.3560: MNI152 T1, 4,864
-nodes, k_D = 0.5), and E need not rise for it.
+Each iteration moves the nodes with an expected gain (`smooth`) and then exchanges cells wherever
+that lowers E (`flips`), which replaces Delaunay re-tessellation. No move leaves a dihedral angle
+below the minimum, and a lattice starts far above it, so E falls throughout, unless nodes are moved
+onto interfaces. Cells of other initial meshes below the minimum are repaired at the end (`repair`),
+if nothing else has lifted them. Keeping the minimum throughout costs as much E_D as lifting the
+worst cells once E has settled (0.3587 of the initial value against 0.3560: MNI152 T1, 4,864 nodes,
+k_D = 0.5), and E need not rise for it.
 """
 
 from __future__ import annotations
@@ -21,7 +23,15 @@ from numpy.typing import NDArray
 from tetopt.contents.content import Content, plain
 from tetopt.contents.content import content as make_content
 from tetopt.energy.sampling import cell_of_voxel, channel_grid, from_ticks
-from tetopt.engine.complex import NodeStars, State, copied, interface_energy, node_stars, remeasure, without_cells
+from tetopt.engine.complex import (
+    NodeStars,
+    State,
+    copied,
+    interface_energy,
+    node_stars,
+    remeasure,
+    without_cells,
+)
 from tetopt.engine.density import Limits, compacted, exchange
 from tetopt.engine.flips import _evaluate_cells, _evaluate_triangles, flip
 from tetopt.engine.interfaces import mend_pinches, with_labels
@@ -57,7 +67,8 @@ from tetopt.start.lattice import lattice_mesh
 from tetopt.start.sizes import Sizes
 from tetopt.system.kernels import link, roots
 
-BAND_FRACTION = 0.1  # of the edge: distance that a node may be off its place at the surface between two labels
+# of the edge: distance that a node may be off its place at the surface between two labels
+BAND_FRACTION = 0.1
 MOST_OFFSET_FRACTION = 0.15  # of the edge: most that a node's place is off the surface
 FLIP_EDGES = 0.05  # of an edge: nodes that moved less need no new flips
 HOPE_FRACTION = 0.003  # of E over the number of nodes: least expected gain of a move
@@ -65,12 +76,15 @@ EARLY_HOPE_FRACTION = 0.05  # the same while nodes are exchanged, as cells aroun
 EXCHANGING_FRACTION = 0.7  # of the iterations: the first ones, which exchange nodes
 EXCHANGED_FRACTION = 0.1  # of the requested nodes: most that are exchanged at once
 EXCHANGE_SHAPE_WEIGHT = 0.1  # of the shape energy's weight, in an exchange; see `Run.exchange`
-LABELLED_AT = 3  # iteration from which cells have labels: exchanges have resolved thin parts, but not yet folds
+# iteration from which cells have labels: exchanges have resolved thin parts, but not yet folds
+LABELLED_AT = 3
 LABELLED_EVERY = 2  # iterations: labels are reassigned at this interval, before exchanges
-LEAST_EDGE_VOXELS = 1.0  # shortest edge that an exchange makes with labels, in addition to the limits on sizes
+# shortest edge that an exchange makes with labels, in addition to the limits on sizes
+LEAST_EDGE_VOXELS = 1.0
 # degrees: smallest allowed angle, if `min_dihedral` is no lower, until nodes lie on interfaces
 ATTRACTED_MIN_DIHEDRAL = 4.0
-# Most cells on a mask's boundary that may be removed if nothing lifts them: a fraction of all cells, or this number.
+# Most cells on a mask's boundary that may be removed if nothing lifts them: a fraction of all
+# cells, or this number.
 FLAT_FRACTION, FLAT_CELLS = 0.005, 10
 MEND_ROUNDS = 3  # of lifting and removing cells, at the end
 FAR_TICKS = -(1 << 40)  # a place far from any other
@@ -96,12 +110,14 @@ def optimize(
 ) -> MeshingResult:
     """Move and reconnect the nodes of a mesh to lower E.
 
-    E = (1 - k_D) E_G + k_D E_D is Eq. (4), with each energy relative to its value on the initial mesh.
+    E = (1 - k_D) E_G + k_D E_D is Eq. (4), with each energy relative to its value on the initial
+    mesh.
 
     Parameters
     ----------
     image : Image or Content
-        The intensities h, or a content with several channels, over which E_D is summed, and a mask (`tetopt.content`).
+        The intensities h, or a content with several channels, over which E_D is summed, and a mask
+        (`tetopt.content`).
     mesh : Mesh
         The initial mesh, any conforming mesh; it also normalises the two energies.
     k_D : float
@@ -109,52 +125,59 @@ def optimize(
     iterations : int
         Maximum number of sweeps over all nodes.
     shape_power : float
-        p >= 1: each cell's E_G is weighted by eta^(p - 1), where eta >= 1 is the cell's mean-edge shape measure (see
-        `tetopt.engine.complex.shape_energy`). 1 is the paper's energy, which is blind to slivers; above 2.5 it grows
-        without bound as a cell becomes flat.
+        p >= 1: each cell's E_G is weighted by eta^(p - 1), where eta >= 1 is the cell's mean-edge
+        shape measure (see `tetopt.engine.complex.shape_energy`). 1 is the paper's energy, which is
+        blind to slivers; above 2.5 it grows without bound as a cell becomes flat.
     min_dihedral : float
-        Smallest dihedral angle of a tetrahedron at the end, degrees, from 0 (no bound) to below 70. The caller must
-        count cells below it (`tetopt.quality`). Meshes of triangles have no such bound.
+        Smallest dihedral angle of a tetrahedron at the end, degrees, from 0 (no bound) to below 70.
+        The caller must count cells below it (`tetopt.quality`). Meshes of triangles have no such
+        bound.
     boundary : {"slide", "fixed"}
-        "slide": boundary nodes move within the box's faces and edges; others are fixed or, with a mask, assumed to lie
-        on its surface and slide on it. "fixed": the boundary's nodes and facets stay unchanged to the last bit.
+        "slide": boundary nodes move within the box's faces and edges; others are fixed or, with a
+        mask, assumed to lie on its surface and slide on it. "fixed": the boundary's nodes and
+        facets stay unchanged to the last bit.
     nodes : int, optional
-        Insert nodes where they lower E most, towards this number, on a graded mesh such as `octree_mesh`. Every cell's
-        shape then has the same weight, whatever its size (see `tetopt.engine.complex.shape_energy`), and nodes are
-        exchanged in the first iterations if k_D > 0 or `sizes` has a target. An exchange at most doubles the nodes, so
-        few iterations may miss a number far from that of `mesh`. By default the nodes of `mesh` are kept, and the shape
-        energy is that of Eq. (1).
+        Insert nodes where they lower E most, towards this number, on a graded mesh such as
+        `octree_mesh`. Every cell's shape then has the same weight, whatever its size (see
+        `tetopt.engine.complex.shape_energy`), and nodes are exchanged in the first iterations if
+        k_D > 0 or `sizes` has a target. An exchange at most doubles the nodes, so few iterations
+        may miss a number far from that of `mesh`. By default the nodes of `mesh` are kept, and the
+        shape energy is that of Eq. (1).
     sizes : Sizes, optional
         Targets and limits for the edges that exchanges make, with `nodes`.
     tolerance : float
-        The run ends if E falls by less, relatively, in an iteration; it has converged if E does not rise by more.
+        The run ends if E falls by less, relatively, in an iteration; it has converged if E does not
+        rise by more.
     max_seconds : float, optional
-        Stop at the next colour of nodes after this time; the mesh is valid. Lifting cells above the minimum dihedral
-        angle may take another tenth of the run's time, or half a second; the iteration's flips and labels take more.
+        Stop at the next colour of nodes after this time; the mesh is valid. Lifting cells above the
+        minimum dihedral angle may take another tenth of the run's time, or half a second; the
+        iteration's flips and labels take more.
     callback : callable, optional
-        Called with each `IterationRecord`, with the weighted E_G and with `is_retessellated` True if cells were
-        exchanged. Without a callback, a notebook shows a progress bar.
+        Called with each `IterationRecord`, with the weighted E_G and with `is_retessellated` True
+        if cells were exchanged. Without a callback, a notebook shows a progress bar.
     stop : callable, optional
         Called between colours of nodes; True ends the run.
     keep : callable, optional
-        Called with the mesh and the labels of its cells, if they have any, as soon as the run is cut short: lifting
-        cells and checking the mesh take more time.
+        Called with the mesh and the labels of its cells, if they have any, as soon as the run is
+        cut short: lifting cells and checking the mesh take more time.
 
     Returns
     -------
     MeshingResult
-        Mesh, history, reason for the end, and in `violated` the requirements that the mesh does not meet
-        (`tetopt.engine.requirements`): dihedral angles below the minimum, voxels in two cells, a mask or labels for
-        which cells are too large. The mesh covers the same domain, and every cell is positively oriented. E never rises
-        between records, unless cells had to be lifted above the minimum dihedral angle (which may insert or remove
-        nodes), or nodes were exchanged or moved onto interfaces; once cells have labels, E is defined differently.
-        Results are the same to the last bit on any number of threads.
+        Mesh, history, reason for the end, and in `violated` the requirements that the mesh does not
+        meet (`tetopt.engine.requirements`): dihedral angles below the minimum, voxels in two cells,
+        a mask or labels for which cells are too large. The mesh covers the same domain, and every
+        cell is positively oriented. E never rises between records, unless cells had to be lifted
+        above the minimum dihedral angle (which may insert or remove nodes), or nodes were exchanged
+        or moved onto interfaces; once cells have labels, E is defined differently. Results are the
+        same to the last bit on any number of threads.
 
     Raises
     ------
     InputError
-        An option out of range; a mesh that is invalid for sampling (see `tetopt.cell_moments`), is folded, has a facet
-        in more than two cells, or a cell too flat for a shape energy; or energies that overflow.
+        An option out of range; a mesh that is invalid for sampling (see `tetopt.cell_moments`), is
+        folded, has a facet in more than two cells, or a cell too flat for a shape energy; or
+        energies that overflow.
 
     See Also
     --------
@@ -181,7 +204,15 @@ def optimize(
     # Iterations that may exchange nodes: shape alone does not determine where to add nodes.
     n_early = int(EXCHANGING_FRACTION * iterations) if k_D > 0.0 or sizes.has_target else 0
     course = Course(
-        1, iterations, iterations, n_early, min_dihedral, tolerance, nodes, sizes, carves=boundary != "fixed"
+        1,
+        iterations,
+        iterations,
+        n_early,
+        min_dihedral,
+        tolerance,
+        nodes,
+        sizes,
+        carves=boundary != "fixed",
     )
     history, ended = followed(run, course, is_over, begin, callback, keep)
     if content.memberships is not None and not run.has_labels:  # too few iterations, or k_D is 0
@@ -189,7 +220,9 @@ def optimize(
         run.mend_surfaces(False, min_dihedral)
     if ended == "over":
         ended = "stopped" if stop is not None and stop() else "max_seconds"
-    result = MeshingResult(run.mesh(), history, ended, mesh, labels=run.labels(), n_dropped=run.n_dropped)
+    result = MeshingResult(
+        run.mesh(), history, ended, mesh, labels=run.labels(), n_dropped=run.n_dropped
+    )
     result = result._replace(dropped=dict(run.dropped))
     return checked(result, content, min_dihedral, mesh)
 
@@ -216,7 +249,9 @@ def followed(
     callback: Callable[[IterationRecord], None] | None,
     keep: Callable[[Mesh, NDArray[np.int64] | None], None] | None = None,
 ) -> tuple[list[IterationRecord], str]:
-    """Do the iterations of a course; return the records and "iterations", "converged", "risen" or "over"."""
+    """Do the iterations of a course; return the records and "iterations", "converged", "risen"
+    or "over".
+    """
     history: list[IterationRecord] = []
     min_dihedral, nodes, E = course.min_dihedral, course.nodes, 0.0
 
@@ -239,26 +274,36 @@ def followed(
             run.give_labels()
         stars = None
         if run.has_labels or run.state.sides.has_surface:
-            degrees = min(ATTRACTED_MIN_DIHEDRAL, min_dihedral) if iteration <= course.n_early else min_dihedral
+            degrees = (
+                min(ATTRACTED_MIN_DIHEDRAL, min_dihedral)
+                if iteration <= course.n_early
+                else min_dihedral
+            )
             stars = run.attract(degrees)
         # 1. Move the nodes.
         is_early = nodes is not None and iteration <= course.n_early
         is_finished = run.sweep(is_over, EARLY_HOPE_FRACTION if is_early else HOPE_FRACTION, stars)
-        # 2. Exchange cells: if nodes are exchanged next, only at first, as cells around them change anyway.
+        # 2. Exchange cells: if nodes are exchanged next, only at first, as cells around them change
+        # anyway.
         does_exchange = is_early and is_finished and iteration % 2 == 1
         n_changes = run.flip() if is_finished and (iteration == 1 or not does_exchange) else 0
         movement = run.movement(before)
-        is_new = is_labelled or (has_labels and not run.has_labels)  # E is defined differently: nothing has settled yet
+        # E is defined differently: nothing has settled yet
+        is_new = is_labelled or (has_labels and not run.has_labels)
         fall = np.inf if is_new else 1.0 - run.E() / E if E > 0.0 else 0.0
         # 3. Exchange nodes: in every second of the first iterations.
         if nodes is not None and does_exchange and not is_over():
             n_changes += run.exchange_towards(nodes, course.sizes, is_over)
-        # 4. Lift flat cells and repair places that are not manifold: in the last iteration. Parts do so in
-        # every round, as nodes of flat cells may be fixed in the next one.
+        # 4. Lift flat cells and repair places that are not manifold: in the last iteration. Parts
+        # do so in every round, as nodes of flat cells may be fixed in the next one.
         is_finished = is_finished and (iteration == course.last or not is_over())
         if not is_finished and keep is not None:
             keep(run.mesh(), run.labels())
-        is_last = iteration == course.last or not is_finished or (fall < course.tolerance and not is_early)
+        is_last = (
+            iteration == course.last
+            or not is_finished
+            or (fall < course.tolerance and not is_early)
+        )
         n_lifted, n_gone = run.mend(course.carves, min_dihedral, is_late) if is_last else (0, 0)
         n_changes, fall = n_changes + n_lifted + n_gone, np.inf if n_lifted > 0 else fall
         # 5. Measure.
@@ -271,18 +316,25 @@ def followed(
 
 
 def gives_labels(iteration: int, course: Course) -> bool:
-    """True if cells get labels from the voxels: first in `LABELLED_AT`, and again at intervals, not in the last.
+    """True if cells get labels from the voxels: first in `LABELLED_AT`, and again at intervals, not
+    in the last.
 
-    In between labels keep their topology. Labels assigned only once would keep holes of sheets thinner than the cells.
+    In between labels keep their topology. Labels assigned only once would keep holes of sheets
+    thinner than the cells.
     """
     first = min(LABELLED_AT, course.iterations)
-    return iteration == first or (first < iteration < course.iterations and (iteration - first) % LABELLED_EVERY == 0)
+    return iteration == first or (
+        first < iteration < course.iterations and (iteration - first) % LABELLED_EVERY == 0
+    )
 
 
 def prepare_kernels(
-    image: Image | Content, k_D: float, method: Literal["fast", "paper"] = "fast", is_graded: bool = False,
+    image: Image | Content,
+    k_D: float,
+    method: Literal["fast", "paper"] = "fast",
+    is_graded: bool = False,
     progress: Callable[[str], None] | None = None,
-) -> None:  # fmt: skip
+) -> None:
     """Compile or load the kernels of a method for images of this kind, before a clock starts.
 
     Several processes compile the kernels missing from the cache, and report to `progress` like
@@ -303,7 +355,14 @@ def prepare_kernels(
             "nearest": has_labels or content.region is not None,  # measures the result afterwards
             "paper_moves": False,
         }
-        link([kernel for kernel in roots() if kernel not in unused and purposes.get(kernel.room, True)], progress)
+        link(
+            [
+                kernel
+                for kernel in roots()
+                if kernel not in unused and purposes.get(kernel.room, True)
+            ],
+            progress,
+        )
     step = 1.0 if not content.is_plain or image.is_whole else 0.1
     tiny = Image(np.zeros((3,) * image.ndim) + step * np.arange(3))
     mesh = lattice_mesh(tiny, blocks=(1,) * image.ndim)
@@ -322,23 +381,35 @@ class Run:
     """State and steps of an optimisation."""
 
     def __init__(
-        self, content: Content, mesh: Mesh, k_D: float, power: float = SHAPE_POWER, boundary: Boundary = "slide",
-        is_graded: bool = False, whole: Whole | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        content: Content,
+        mesh: Mesh,
+        k_D: float,
+        power: float = SHAPE_POWER,
+        boundary: Boundary = "slide",
+        is_graded: bool = False,
+        whole: Whole | None = None,
+    ) -> None:
         """Take the arguments of `tetopt.engine.state.state_of`."""
         self.content, self.image, self.n = content, content.image, content.image.ndim
         self.grid = channel_grid(content, mesh.points, None if whole is None else whole.bits)
-        self.state: State = state_of(content, mesh, self.grid, k_D, power, boundary, is_graded, whole)
+        self.state: State = state_of(
+            content, mesh, self.grid, k_D, power, boundary, is_graded, whole
+        )
         ticks = self.state.complex.ticks
         is_kept = self.is_still if boundary == "fixed" else np.zeros(len(ticks), dtype=bool)
-        self.kept = dict(zip(map(tuple, ticks[is_kept].tolist()), mesh.points[is_kept], strict=True))
+        self.kept = dict(
+            zip(map(tuple, ticks[is_kept].tolist()), mesh.points[is_kept], strict=True)
+        )
         self.groups, self.edge = blocks(ticks), _edges(mesh.points, mesh.cells)
         self.has_labels = False
         self.label_voxels: LabelVoxels | None = None  # computed when needed
         # Variance of the noise, estimated when first needed.
         self.image_noise: float | None = None if whole is None else whole.noise
-        self.ticks_flipped = np.full_like(ticks, FAR_TICKS)  # positions at which nodes' flips were last evaluated
-        self.hope = np.full(len(ticks), np.inf)  # expected gain of each node's next move, (N,); see `sweep`
+        # positions at which nodes' flips were last evaluated
+        self.ticks_flipped = np.full_like(ticks, FAR_TICKS)
+        # expected gain of each node's next move, (N,); see `sweep`
+        self.hope = np.full(len(ticks), np.inf)
         self.n_dropped = 0  # removed connected components that the mask does not have
         self.dropped: Counter[int] = Counter()  # their volume by label, mm^n
 
@@ -353,26 +424,38 @@ class Run:
         return int(self.state.complex.n_cells[0])
 
     def E(self) -> float:
-        """The combined energy that moves lower: Eq. (4), or with labels that of their own values, and tension."""
+        """The combined energy that moves lower: Eq. (4), or with labels that of their own
+        values, and tension.
+        """
         E_G, squares = content_energies(self.state, self.content)
         objective = self.state.objective
         return objective.geometry * E_G + objective.image * squares + interface_energy(self.state)
 
     def sweep(
-        self, is_over: Callable[[], bool] = lambda: False, fraction: float = HOPE_FRACTION,
+        self,
+        is_over: Callable[[], bool] = lambda: False,
+        fraction: float = HOPE_FRACTION,
         stars: NodeStars | None = None,
-    ) -> bool:  # fmt: skip
+    ) -> bool:
         """Move the nodes with an expected gain; return False if `is_over` cut the sweep short.
 
-        A node's expected gain is that of its last move plus its neighbours' mean gain in each sweep since. The node is
-        skipped until this reaches a fraction of the mean E per node. It is infinite if the node's cells were exchanged.
+        A node's expected gain is that of its last move plus its neighbours' mean gain in each sweep
+        since. The node is skipped until this reaches a fraction of the mean E per node. It is
+        infinite if the node's cells were exchanged.
         """
         gains = np.zeros(len(self.hope))
         is_active = (self.hope > fraction * self.E() / len(gains)) & ~self.is_still
-        is_finished = sweep(self.state, stars or node_stars(self.state), self.groups, is_active, is_over, gains)
-        around = np.bincount(self.cells.ravel(), np.repeat(gains[self.cells].sum(axis=1), self.n + 1), len(gains))
+        is_finished = sweep(
+            self.state, stars or node_stars(self.state), self.groups, is_active, is_over, gains
+        )
+        around = np.bincount(
+            self.cells.ravel(), np.repeat(gains[self.cells].sum(axis=1), self.n + 1), len(gains)
+        )
         number = np.bincount(self.cells.ravel(), minlength=len(gains))
-        self.hope = np.where(is_active, gains, self.hope) + (around / np.maximum(number, 1) - gains) / self.n
+        self.hope = (
+            np.where(is_active, gains, self.hope)
+            + (around / np.maximum(number, 1) - gains) / self.n
+        )
         return is_finished
 
     def flip(self) -> int:
@@ -387,25 +470,32 @@ class Run:
     def _moved(self, since: NDArray[np.int64], fraction: float) -> NDArray[np.bool_]:
         """Nodes more than a fraction of an edge away from `since`, which is updated for them."""
         matrix = self.state.objective.matrix
-        way = transformed((self.state.complex.ticks - since).astype(np.float64), matrix * 2.0**-self.grid.bits)
+        way = transformed(
+            (self.state.complex.ticks - since).astype(np.float64), matrix * 2.0**-self.grid.bits
+        )
         moved: NDArray[np.bool_] = (way**2).sum(axis=1) > (fraction * self.edge) ** 2
         since[moved] = self.state.complex.ticks[moved]
         return moved
 
     def exchange_towards(self, nodes: int, sizes: Sizes, is_over: Callable[[], bool]) -> int:
-        """Exchange nodes once, or repeatedly towards targets while the number is far off; return the number of changes.
+        """Exchange nodes once, or repeatedly towards targets while the number is far off; return
+        the number of changes.
 
-        Targets can be reached from any mesh, even one with a tenth of the nodes; moving nodes first would be futile.
+        Targets can be reached from any mesh, even one with a tenth of the nodes; moving nodes first
+        would be futile.
         """
         n_changes = n_last = self.exchange(nodes, sizes)
         most = EXCHANGED_FRACTION * nodes
-        while sizes.has_target and n_last > 0 and abs(len(self.edge) - nodes) > most and not is_over():
+        while (
+            sizes.has_target and n_last > 0 and abs(len(self.edge) - nodes) > most and not is_over()
+        ):
             n_last = self.exchange(nodes, sizes)
             n_changes += n_last
         return n_changes
 
     def exchange(self, nodes: int, sizes: Sizes) -> int:
-        """Split and collapse edges towards a number of nodes; return the number of inserted and removed nodes.
+        """Split and collapse edges towards a number of nodes; return the number of inserted and
+        removed nodes.
 
         Shape costs count a tenth, as most of them vanish when the surrounding nodes move again.
         """
@@ -414,28 +504,43 @@ class Run:
             self.image_noise = self.content.noise
         points = self.points()
         target = sizes.around(points, self.cells)
-        longest = sizes.longest_edges(self.image, nodes, points, self.cells, self.edge, target, self.content.volume)
-        # Resolving a voxel's step between labels always pays, although their surfaces have no such fine detail.
-        voxel = self.image.voxel_volume ** (1.0 / self.n) if self.content.memberships is not None else 0.0
+        longest = sizes.longest_edges(
+            self.image, nodes, points, self.cells, self.edge, target, self.content.volume
+        )
+        # Resolving a voxel's step between labels always pays, although their surfaces have no such
+        # fine detail.
+        voxel = (
+            self.image.voxel_volume ** (1.0 / self.n)
+            if self.content.memberships is not None
+            else 0.0
+        )
         shortest = max(float(sizes.smallest), LEAST_EDGE_VOXELS * voxel)
         limits = Limits(shortest, longest, self.image_noise, target)
         eager = objective._replace(geometry=EXCHANGE_SHAPE_WEIGHT * objective.geometry)
-        made = exchange(self.state._replace(objective=eager), nodes, int(EXCHANGED_FRACTION * nodes), limits)
+        made = exchange(
+            self.state._replace(objective=eager), nodes, int(EXCHANGED_FRACTION * nodes), limits
+        )
         self._renumber(made.state._replace(objective=objective), made.source)
         self.hope[made.is_touched] = np.inf
         self.ticks_flipped[made.is_touched] = FAR_TICKS
         return made.n_split + made.n_collapsed
 
     def give_labels(self) -> None:
-        """Assign a label to each cell, if the content has labels; nodes between labels slide from then on."""
+        """Assign a label to each cell, if the content has labels; nodes between labels slide
+        from then on.
+        """
         if self.content.smooth is None:
             return
         members = self.content.smooth.memberships
         if self.label_voxels is None:
             region, rows = self.content.region, members.partition
             rows = rows if region is None else np.where(region.inside, rows, OUTSIDE_LABEL)
-            self.label_voxels = label_voxels(rows, self.image.spacing, len(members.labels), members.parts)
-        self.state = with_labels(self.state, self.content, self.content.smooth, self.mesh(), self.label_voxels)
+            self.label_voxels = label_voxels(
+                rows, self.image.spacing, len(members.labels), members.parts
+            )
+        self.state = with_labels(
+            self.state, self.content, self.content.smooth, self.mesh(), self.label_voxels
+        )
         self.has_labels = True
         self.hope[:] = np.inf
         self.ticks_flipped[:] = FAR_TICKS
@@ -443,8 +548,8 @@ class Run:
     def attract(self, degrees: float) -> NodeStars:
         """Move nodes between labels, and those of a mask's surface, to their places there.
 
-        No angle falls below `degrees`; within a mask, where `lift` may be undone, none falls below the minimum. Returns
-        the stars, whose cells do not change.
+        No angle falls below `degrees`; within a mask, where `lift` may be undone, none falls below
+        the minimum. Returns the stars, whose cells do not change.
         """
         ticks = self.state.complex.ticks.copy()
         stars = node_stars(self.state)
@@ -461,33 +566,44 @@ class Run:
         return stars
 
     def keep_min_dihedral(self, degrees: float) -> None:
-        """Forbid moves that leave a dihedral angle below `degrees`, or lower one that is below it already."""
+        """Forbid moves that leave a dihedral angle below `degrees`, or lower one that is below
+        it already.
+        """
         self.state = with_min_dihedral(self.state, degrees)
 
     def n_below(self, degrees: float) -> int:
         """Number of tetrahedra with an angle below `degrees`."""
         return n_cells_below(self.state, degrees) if degrees > 0.0 else 0
 
-    def mend(self, carves: bool, min_dihedral: float, is_late: Callable[[], bool]) -> tuple[int, int]:
-        """Lift cells above `min_dihedral`, degrees, and mend surfaces; repeat after cells were removed.
+    def mend(
+        self, carves: bool, min_dihedral: float, is_late: Callable[[], bool]
+    ) -> tuple[int, int]:
+        """Lift cells above `min_dihedral`, degrees, and mend surfaces; repeat after cells were
+        removed.
 
-        Once `is_late` returns True, cells are no longer lifted, but surfaces are still mended. Returns the numbers of
-        moves and of removed cells.
+        Once `is_late` returns True, cells are no longer lifted, but surfaces are still mended.
+        Returns the numbers of moves and of removed cells.
         """
         n_lifted = n_gone = 0
         for _ in range(MEND_ROUNDS):
-            n_lifted += self.lift(min_dihedral, carves, is_late) if self.n_below(min_dihedral) > 0 else 0
+            n_lifted += (
+                self.lift(min_dihedral, carves, is_late) if self.n_below(min_dihedral) > 0 else 0
+            )
             n_new = self.mend_surfaces(carves, min_dihedral)
             n_gone += n_new
             if n_new == 0 or self.n_below(min_dihedral) == 0 or is_late():
                 break
         return n_lifted, n_gone
 
-    def lift(self, degrees: float, carves: bool = False, is_late: Callable[[], bool] = lambda: False) -> int:
-        """Lift the worst cells above `degrees`, or as far as possible; return the number of moves. E may rise.
+    def lift(
+        self, degrees: float, carves: bool = False, is_late: Callable[[], bool] = lambda: False
+    ) -> int:
+        """Lift the worst cells above `degrees`, or as far as possible; return the number of moves.
+        E may rise.
 
-        On the surface of a mask with details as small as the cells, it may make more cells overlap than may be removed
-        (none, unless it `carves`). Then it is undone, and cells stay below the minimum dihedral angle.
+        On the surface of a mask with details as small as the cells, it may make more cells overlap
+        than may be removed (none, unless it `carves`). Then it is undone, and cells stay below the
+        minimum dihedral angle.
         """
         before = self.state if self.content.region is None else copied(self.state)
         made = repair(self.state, degrees, is_late)
@@ -501,11 +617,13 @@ class Run:
         return made.n_moves
 
     def mend_surfaces(self, carves: bool, min_dihedral: float = 0.0) -> int:
-        """Mend overlaps and pinches: of a mask's boundary, if it `carves`, by removing cells; then of interfaces.
+        """Mend overlaps and pinches: of a mask's boundary, if it `carves`, by removing cells; then
+        of interfaces.
 
-        Cells overlap where parts of the boundary slid through one another, across a gap of a voxel or two. The octree
-        within a mask has no pinches, but a user's mesh may. A few cells on the boundary that nothing lifted above
-        `min_dihedral`, degrees, are removed, too. Returns the number of removed cells.
+        Cells overlap where parts of the boundary slid through one another, across a gap of a voxel
+        or two. The octree within a mask has no pinches, but a user's mesh may. A few cells on the
+        boundary that nothing lifted above `min_dihedral`, degrees, are removed, too. Returns the
+        number of removed cells.
         """
         n_gone = 0
         if carves and self.content.region is not None:
@@ -517,10 +635,15 @@ class Run:
                     n_gone += self._take_out(is_flat)
             keeps, members = self.content.keeps_components, self.content.memberships
             kept = carved(self.mesh(), self.image, self.content.region, keeps, members)
-            n_gone, self.n_dropped = n_gone + self._take_out(~kept.is_kept), self.n_dropped + kept.n_dropped
+            n_gone, self.n_dropped = (
+                n_gone + self._take_out(~kept.is_kept),
+                self.n_dropped + kept.n_dropped,
+            )
             self.dropped.update(kept.volumes)
         if self.label_voxels is not None and self.content.memberships is not None:
-            mend_pinches(self.state, self.image, self.content.memberships, self.mesh(), self.label_voxels)
+            mend_pinches(
+                self.state, self.image, self.content.memberships, self.mesh(), self.label_voxels
+            )
         return n_gone
 
     @property
@@ -545,7 +668,9 @@ class Run:
         return np.asarray(state.complex.sums[: len(n_owned), 0] > n_owned)
 
     def _renumber(self, state: State, source: NDArray[np.int64]) -> None:
-        """Adopt a state with other nodes; `source` is each node's previous number, -1 for new ones."""
+        """Adopt a state with other nodes; `source` is each node's previous number, -1 for new
+        ones.
+        """
         is_new = (source < 0)[:, None]
         self.state = state
         self.ticks_flipped = np.where(is_new, FAR_TICKS, self.ticks_flipped[source])
@@ -553,18 +678,28 @@ class Run:
         self.groups, self.edge = blocks(state.complex.ticks), _edges(self.points(), self.cells)
 
     def movement(self, before: NDArray[np.int64]) -> float:
-        """Relative movement of the nodes since `before` (N, 3), in ticks; see `relative_movement`."""
-        return relative_movement(before, self.state.complex.ticks, self.image, self.grid, self.state.objective.matrix)
+        """Relative movement of the nodes since `before` (N, 3), in ticks; see
+        `relative_movement`.
+        """
+        return relative_movement(
+            before, self.state.complex.ticks, self.image, self.grid, self.state.objective.matrix
+        )
 
-    def record(self, iteration: int, movement: float, is_changed: bool, seconds: float) -> IterationRecord:
-        """The history's row for the current state; its E has no tension, and is comparable across the whole run."""
+    def record(
+        self, iteration: int, movement: float, is_changed: bool, seconds: float
+    ) -> IterationRecord:
+        """The history's row for the current state; its E has no tension, and is comparable
+        across the whole run.
+        """
         if self.state.objective.image == 0.0:  # the moves have left the sums alone
             remeasure(self.state)
         E_G, squares = content_energies(self.state, self.content, self.content.n_channels)
         n_voxels = int(self.state.complex.sums[: self.n_cells, 0].sum())
         E = self.state.objective.geometry * E_G + self.state.objective.image * squares
         E_D = squares * self.content.unit * self.image.voxel_volume
-        return IterationRecord(iteration, E, E_G, E_D, movement, is_changed, self.n_cells, n_voxels, seconds)
+        return IterationRecord(
+            iteration, E, E_G, E_D, movement, is_changed, self.n_cells, n_voxels, seconds
+        )
 
     def labels(self) -> NDArray[np.int64] | None:
         """The label of each cell, (M,); None without labels."""
@@ -600,7 +735,12 @@ def _edges(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.
 
 
 def check_options(
-    k_D: float, iterations: int, shape_power: float, min_dihedral: float, boundary: str, nodes: int | None = None
+    k_D: float,
+    iterations: int,
+    shape_power: float,
+    min_dihedral: float,
+    boundary: str,
+    nodes: int | None = None,
 ) -> None:
     """Raise InputError for an option of `optimize` out of range."""
     check_common_options(k_D, iterations, boundary)
@@ -608,7 +748,11 @@ def check_options(
         raise InputError(f"shape_power: expected 1 (the paper's) to 10, got {shape_power}")
     if not 0.0 <= min_dihedral < 70.0:
         raise InputError(
-            f"min_dihedral: expected 0 to below 70 degrees, got {min_dihedral}; a regular tetrahedron has 70.5"
+            f"min_dihedral: expected 0 to below 70 degrees, got {min_dihedral}; a regular "
+            "tetrahedron has 70.5"
         )
     if nodes is not None and not (isinstance(nodes, int | np.integer) and nodes > 2):
-        raise InputError(f"nodes: expected a whole number above 2, or None to keep the mesh's nodes, got {nodes!r}")
+        raise InputError(
+            "nodes: expected a whole number above 2, or None to keep the mesh's nodes, got "
+            f"{nodes!r}"
+        )

@@ -1,15 +1,16 @@
 """Exchange cells for others in the same cavity where that lowers the combined energy.
 
-"Accept a tessellation only if it decreases the energy" (Section 4 of the paper), cell by cell. Two moves reach every
-tetrahedralization of a small cavity: the face flip, which replaces the two tetrahedra of a facet by three around a new
-edge (2-3), and the removal of an edge, which replaces the m tetrahedra around it by the 2 (m - 2) of the best
-triangulation of their polygon (3-2, 4-4 and higher), found by dynamic programming over the polygon's diagonals
-(Klincsek 1980; Shewchuk 2002). An edge in a face of the box has an open polygon, closed by a segment in that face. In
-2-D the edge between two triangles is flipped.
+"Accept a tessellation only if it decreases the energy" (Section 4 of the paper), cell by cell. Two
+moves reach every tetrahedralization of a small cavity: the face flip, which replaces the two
+tetrahedra of a facet by three around a new edge (2-3), and the removal of an edge, which replaces
+the m tetrahedra around it by the 2 (m - 2) of the best triangulation of their polygon (3-2, 4-4 and
+higher), found by dynamic programming over the polygon's diagonals (Klincsek 1980; Shewchuk 2002).
+An edge in a face of the box has an open polygon, closed by a segment in that face. In 2-D the edge
+between two triangles is flipped.
 
-Gains of moves are measured for all cells in parallel, each writing only its own row. Moves are then made one after the
-other, the largest gain first, each only if no cell of its cavity has changed, so that the result does not depend on the
-threads, and E falls by the measured gain.
+Gains of moves are measured for all cells in parallel, each writing only its own row. Moves are then
+made one after the other, the largest gain first, each only if no cell of its cavity has changed, so
+that the result does not depend on the threads, and E falls by the measured gain.
 """
 
 from __future__ import annotations
@@ -69,13 +70,17 @@ class Cavity(NamedTuple):
     """Work space for one cavity."""
 
     x: Floats2  # (4, 3) corners of a cell
-    y: Floats2  # (POLYGON_CORNERS + 2, 3) corners of the cavity: the edge's a and b, then the polygon
+    # (POLYGON_CORNERS + 2, 3) corners of the cavity: the edge's a and b, then the polygon
+    y: Floats2
     ring: Ints1  # (POLYGON_CORNERS,) the polygon's nodes
     around: Ints1  # (POLYGON_CORNERS,) the cells around the edge
-    cost: Floats2  # (POLYGON_CORNERS, POLYGON_CORNERS) cost of the best triangulation between two corners
+    # (POLYGON_CORNERS, POLYGON_CORNERS) cost of the best triangulation between two corners
+    cost: Floats2
     apex: Ints2  # (POLYGON_CORNERS, POLYGON_CORNERS) third corner of its triangle on them
-    triangle: Floats3  # (POLYGON_CORNERS, POLYGON_CORNERS, POLYGON_CORNERS) energy of the two cells over each triangle
-    is_measured: Bools3  # (POLYGON_CORNERS, POLYGON_CORNERS, POLYGON_CORNERS) True if it includes the image
+    # (POLYGON_CORNERS, POLYGON_CORNERS, POLYGON_CORNERS) energy of the two cells over each triangle
+    triangle: Floats3
+    # (POLYGON_CORNERS, POLYGON_CORNERS, POLYGON_CORNERS) True if it includes the image
+    is_measured: Bools3
     side_a: Floats3  # (POLYGON_CORNERS, POLYGON_CORNERS, D) fluxes of the facets (v_j, v_i, a)
     side_b: Floats3  # and (v_i, v_j, b)
     flux: Floats3  # (3, 1, D) fluxes of facets inside the cavity
@@ -84,11 +89,14 @@ class Cavity(NamedTuple):
     stack: Ints2  # (2 POLYGON_CORNERS, 3)
     new: Ints1  # (2 POLYGON_CORNERS,) the cells that will fill the cavity
     free: Ints1  # (1 + R,) the number of unused cells, and these
-    arc: Ints1  # (1,) number of leading cells with the first label; 0 if all around the edge have one label
+    # (1,) number of leading cells with the first label; 0 if all around the edge have one label
+    arc: Ints1
 
 
 def cavity(n_free: int, D: int) -> Cavity:
-    """Allocate a cavity, and space for the numbers of `n_free` unused cells; a flux has D numbers."""
+    """Allocate a cavity, and space for the numbers of `n_free` unused cells; a flux has D
+    numbers.
+    """
     return Cavity(
         np.empty((4, 3)),
         np.empty((POLYGON_CORNERS + 2, 3)),
@@ -116,11 +124,12 @@ def flip(
     passes: int = 50,
     is_touched: NDArray[np.bool_] | None = None,
 ) -> tuple[State, int]:
-    """Make every move that lowers E until none remains, or for some passes; return the state and the number of moves.
+    """Make every move that lowers E until none remains, or for some passes; return the state and
+    the number of moves.
 
-    Only cavities with a cell marked in `is_dirty` (C,) are evaluated, by default all. Nodes of new cells are marked in
-    `is_touched` (N,). The complex of the returned state may be a larger copy of the previous one, which is then out of
-    date.
+    Only cavities with a cell marked in `is_dirty` (C,) are evaluated, by default all. Nodes of new
+    cells are marked in `is_touched` (N,). The complex of the returned state may be a larger copy of
+    the previous one, which is then out of date.
     """
     n_cells = int(state.complex.n_cells[0])
     dirty = np.zeros(len(state.complex.cells), dtype=np.bool_)
@@ -129,7 +138,9 @@ def flip(
     for _ in range(passes):
         if len(dirty) - n_cells < n_cells // 8 + 32:
             state = grown(state)
-            dirty = np.concatenate([dirty, np.zeros(len(state.complex.cells) - len(dirty), dtype=np.bool_)])
+            dirty = np.concatenate(
+                [dirty, np.zeros(len(state.complex.cells) - len(dirty), dtype=np.bool_)]
+            )
         near = np.flatnonzero(dirty[:n_cells])
         gain, move = np.zeros(n_cells), np.full(n_cells, -1, dtype=np.int64)
         _evaluate(gain, move, near, dirty, state)
@@ -148,7 +159,8 @@ def flip(
 
 
 def _evaluate(gain: NDArray, move: NDArray, near: NDArray, is_dirty: NDArray, state: State) -> None:
-    """Write the best move of each of the cells `near`, those marked dirty, and its gain to `move` and `gain` (C,).
+    """Write the best move of each of the cells `near`, those marked dirty, and its gain to `move`
+    and `gain` (C,).
 
     The lowest dirty cell of each facet and edge evaluates it.
     """
@@ -173,7 +185,13 @@ class Evaluation(NamedTuple):
 @unit
 def _evaluate_cells(search: Evaluation, chunk: int) -> None:
     """Evaluate moves: 0 to 3 flip that facet, 4 to 9 remove an edge of `TET_EDGES`."""
-    gain, move, near, is_dirty, state = search.gain, search.move, search.near, search.is_dirty, search.state
+    gain, move, near, is_dirty, state = (
+        search.gain,
+        search.move,
+        search.near,
+        search.is_dirty,
+        search.state,
+    )
     work, complex_ = own(search.rooms), state.complex
     first = chunk * CELLS_PER_CHUNK
     for number in range(first, min(first + CELLS_PER_CHUNK, len(near))):
@@ -186,33 +204,48 @@ def _evaluate_cells(search: Evaluation, chunk: int) -> None:
                 if worth > gain[cell]:
                     gain[cell], move[cell] = worth, k
         for e in range(6):
-            i, j = TET_EDGES[5 - e, 0], TET_EDGES[5 - e, 1]  # the other two corners, opposite the edge's two facets
+            # the other two corners, opposite the edge's two facets
+            i, j = TET_EDGES[5 - e, 0], TET_EDGES[5 - e, 1]
             one, other = complex_.across[cell, i], complex_.across[cell, j]
             if (0 <= one < cell and is_dirty[one]) or (0 <= other < cell and is_dirty[other]):
                 continue  # a lower cell has the edge, too, and evaluates it
             i, j = TET_EDGES[e, 0], TET_EDGES[e, 1]
-            m, is_open = ring_of_edge(work.ring, work.around, complex_.cells, complex_.across, cell, i, j, is_dirty)
+            m, is_open = ring_of_edge(
+                work.ring, work.around, complex_.cells, complex_.across, cell, i, j, is_dirty
+            )
             if m == 0:
                 continue
-            worth = _worth_of_edge(work, state, complex_.cells[cell, i], complex_.cells[cell, j], m, is_open)
+            worth = _worth_of_edge(
+                work, state, complex_.cells[cell, i], complex_.cells[cell, j], m, is_open
+            )
             if worth > gain[cell]:
                 gain[cell], move[cell] = worth, 4 + e
 
 
 @unit
 def _worth_of_face(work: Cavity, state: State, cell: int, k: int) -> float:
-    """Reduction of E if the facet's two cells become three; 0 or less, or -inf, if it does not fall."""
+    """Reduction of E if the facet's two cells become three; 0 or less, or -inf, if it does not
+    fall.
+    """
     x, y = work.x, work.y
     other = state.complex.across[cell, k]
     u, v, w = outward(state.complex.cells, cell, k)
-    p, q = (state.complex.cells[cell, k], state.complex.cells[other, facet_of(state.complex.across, other, cell)])
+    p, q = (
+        state.complex.cells[cell, k],
+        state.complex.cells[other, facet_of(state.complex.across, other, cell)],
+    )
     load(y, 0, state.complex.ticks, q, p, state.objective)
     load(y, 1, state.complex.ticks, u, p, state.objective)
     load(y, 2, state.complex.ticks, v, p, state.objective)
     load(y, 3, state.complex.ticks, w, p, state.objective)
-    # Six times the volumes of the three cells (p, q, a, b): most facets fail here, before any root is computed.
+    # Six times the volumes of the three cells (p, q, a, b): most facets fail here, before any root
+    # is computed.
     at_q, at_u, at_v, at_w = row(y, 0), row(y, 1), row(y, 2), row(y, 3)
-    V_uv, V_vw, V_wu = dot(at_q, cross(at_u, at_v)), dot(at_q, cross(at_v, at_w)), dot(at_q, cross(at_w, at_u))
+    V_uv, V_vw, V_wu = (
+        dot(at_q, cross(at_u, at_v)),
+        dot(at_q, cross(at_v, at_w)),
+        dot(at_q, cross(at_w, at_u)),
+    )
     if V_uv <= 0.0 or V_vw <= 0.0 or V_wu <= 0.0:
         return -np.inf
     old = cell_energy(state, cell) + cell_energy(state, other)
@@ -225,7 +258,9 @@ def _worth_of_face(work: Cavity, state: State, cell: int, k: int) -> float:
         if not new < limit:
             return -np.inf
     if state.objective.angle_limit > -1.0:
-        least = min(state.objective.angle_limit, cell_cosine(x, state, cell), cell_cosine(x, state, other))
+        least = min(
+            state.objective.angle_limit, cell_cosine(x, state, cell), cell_cosine(x, state, other)
+        )
         for a, b in ((u, v), (v, w), (w, u)):
             if tet_cosine(x, state, p, q, a, b) < least:
                 return -np.inf
@@ -236,11 +271,16 @@ def _worth_of_face(work: Cavity, state: State, cell: int, k: int) -> float:
         put_flux(spoke, r, 0, state.complex.ticks, p, q, corner[r], state.objective)
     for r in range(3):
         s, a = (r + 1) % 3, corner[(r + 2) % 3]  # a: the remaining corner of the facet
-        below, above = corner_of(state.complex.cells, cell, a), corner_of(state.complex.cells, other, a)
+        below, above = (
+            corner_of(state.complex.cells, cell, a),
+            corner_of(state.complex.cells, other, a),
+        )
         for d in range(sums.shape[1]):
             outer = state.complex.fluxes[cell, below, d] + state.complex.fluxes[other, above, d]
             sums[0, d] = outer + spoke[s, 0, d] - spoke[r, 0, d]
-        new += state.objective.image * image_energy(sums, 0, state.complex.labels[cell], state.objective)
+        new += state.objective.image * image_energy(
+            sums, 0, state.complex.labels[cell], state.objective
+        )
         if not new < limit:
             return -np.inf
     return old - new
@@ -248,7 +288,9 @@ def _worth_of_face(work: Cavity, state: State, cell: int, k: int) -> float:
 
 @inlined
 def _squares_by_axis(y: NDArray, a: int, b: int, c: int) -> float:
-    """Sum of the six squared edges of the tetrahedron of the origin and three rows, axis by axis."""
+    """Sum of the six squared edges of the tetrahedron of the origin and three rows, axis by
+    axis.
+    """
     S = 0.0
     for d in range(3):
         total = y[a, d] + y[b, d] + y[c, d]
@@ -258,14 +300,22 @@ def _squares_by_axis(y: NDArray, a: int, b: int, c: int) -> float:
 
 @unit
 def ring_of_edge(
-    ring: Ints1, around: Ints1, cells: Ints2, across: Ints2, cell: int, i: int, j: int, looks: Bools1
+    ring: Ints1,
+    around: Ints1,
+    cells: Ints2,
+    across: Ints2,
+    cell: int,
+    i: int,
+    j: int,
+    looks: Bools1,
 ) -> tuple[int, int]:
-    """The cells around the edge of a cell between its corners i and j, and the polygon of their other corners.
+    """The cells around the edge of a cell between its corners i and j, and the polygon of their
+    other corners.
 
-    The polygon turns to the right about a to b: cell r has a, b, ring[r] and ring[r + 1]. Returns the polygon's number
-    of corners, and 1 if it is open, that is, if the edge is on the boundary, with one cell fewer than corners. The
-    number is 0 if it exceeds `POLYGON_CORNERS`, or if a lower cell marked in `looks` (C,) evaluates the edge; with (0,)
-    none does.
+    The polygon turns to the right about a to b: cell r has a, b, ring[r] and ring[r + 1]. Returns
+    the polygon's number of corners, and 1 if it is open, that is, if the edge is on the boundary,
+    with one cell fewer than corners. The number is 0 if it exceeds `POLYGON_CORNERS`, or if a lower
+    cell marked in `looks` (C,) evaluates the edge; with (0,) none does.
     """
     a, b = cells[cell, i], cells[cell, j]
     # The other two corners, so that (a, b, v, w) is positively oriented.
@@ -329,8 +379,8 @@ def _fourth_node(cells: NDArray, cell: int, a: int, b: int, c: int) -> int:
 def in_one_face(state: State, a: int, b: int, c: int, d: int) -> bool:
     """True if four boundary nodes lie in one face of the box.
 
-    False if the boundary is fixed, as its facets must stay, and for coplanar facets off the box's faces, which a part
-    of a mesh may share with another part.
+    False if the boundary is fixed, as its facets must stay, and for coplanar facets off the box's
+    faces, which a part of a mesh may share with another part.
     """
     t, low, high = state.complex.ticks, state.sides.low, state.sides.high
     for axis in range(3):
@@ -343,11 +393,13 @@ def in_one_face(state: State, a: int, b: int, c: int, d: int) -> bool:
 
 @unit
 def turn_to_arcs(work: Cavity, labels: Ints1, m: int, is_open: int) -> bool:
-    """True if the edge whose cells are in `work` may be removed without changing the topology of labels.
+    """True if the edge whose cells are in `work` may be removed without changing the topology of
+    labels.
 
-    Either all of its cells have one label, or two or more cells of one label are followed by two or more of another.
-    Then the polygon is rotated so that the first label's cells come first, `work.arc` of them, and the two facets
-    between the labels are exchanged for those on the polygon's diagonal from its corner 0 to `work.arc`.
+    Either all of its cells have one label, or two or more cells of one label are followed by two or
+    more of another. Then the polygon is rotated so that the first label's cells come first,
+    `work.arc` of them, and the two facets between the labels are exchanged for those on the
+    polygon's diagonal from its corner 0 to `work.arc`.
     """
     ring, around, n_cells = work.ring, work.around, m - is_open
     n_changes, first = 0, 0
@@ -379,7 +431,9 @@ def joins_arcs(work: Cavity, i: int, k: int, j: int) -> bool:
 
 @inlined
 def _arc_of(work: Cavity, j: int) -> int:
-    """The first cell around the edge with the label of the polygon's triangle whose last corner is j."""
+    """The first cell around the edge with the label of the polygon's triangle whose last corner
+    is j.
+    """
     return work.arc[0] if 0 < work.arc[0] < j else 0
 
 
@@ -397,10 +451,11 @@ def _fall_of_tension(work: Cavity, state: State, a: int, b: int) -> float:
 
 @unit
 def _worth_of_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: int) -> float:
-    """Reduction of E by removing the edge (a, b), -inf if impossible; `work.apex` then holds the diagonals.
+    """Reduction of E by removing the edge (a, b), -inf if impossible; `work.apex` then holds the
+    diagonals.
 
-    `ring_of_edge` has filled `work.ring` and `work.around`. apex[i, j] is the corner between i and j of the best
-    triangulation's triangle on the diagonal (i, j).
+    `ring_of_edge` has filled `work.ring` and `work.around`. apex[i, j] is the corner between i and
+    j of the best triangulation's triangle on the diagonal (i, j).
     """
     y, ring, around = work.y, work.ring, work.around
     cost, apex, triangle = work.cost, work.apex, work.triangle
@@ -417,8 +472,8 @@ def _worth_of_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: 
     load(y, 1, state.complex.ticks, b, a, state.objective)
     for r in range(m):
         load(y, 2 + r, state.complex.ticks, ring[r], a, state.objective)
-    # A triangulation's shape energy alone is a cheap lower bound, and so is that of its two ears, triangles of three
-    # successive corners: few edges pass them.
+    # A triangulation's shape energy alone is a cheap lower bound, and so is that of its two ears,
+    # triangles of three successive corners: few edges pass them.
     if m > 4:
         low, lower = np.inf, np.inf  # the two cheapest ears
         for k in range(m):
@@ -438,7 +493,8 @@ def _worth_of_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: 
                     triangle[i, k, j] = _pair_shape(y, 2 + i, 2 + k, 2 + j, limit, state.objective)
     if not best_triangulation(cost, apex, triangle, m) < limit:
         return -np.inf
-    # Angles come last: few edges get here, and angles take more time than energies (half of a pass, if first).
+    # Angles come last: few edges get here, and angles take more time than energies (half of a pass,
+    # if first).
     if state.objective.angle_limit > -1.0:
         least = state.objective.angle_limit
         for r in range(m - is_open):
@@ -446,14 +502,18 @@ def _worth_of_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: 
         for i in range(m - 2):
             for k in range(i + 1, m - 1):
                 for j in range(k + 1, m):
-                    if triangle[i, k, j] < limit and _pair_cosine(work.x, y, 2 + i, 2 + k, 2 + j) < least:
+                    if (
+                        triangle[i, k, j] < limit
+                        and _pair_cosine(work.x, y, 2 + i, 2 + k, 2 + j) < least
+                    ):
                         triangle[i, k, j] = np.inf
         if not best_triangulation(cost, apex, triangle, m) < limit:
             return -np.inf
     if state.objective.image == 0.0:
         return old - cost[0, m - 1]
-    # Then the image, only for the triangles of the best triangulation, until it remains the best: a triangle that is
-    # not measured has its least possible energy, so no better triangulation is missed.
+    # Then the image, only for the triangles of the best triangulation, until it remains the best: a
+    # triangle that is not measured has its least possible energy, so no better triangulation is
+    # missed.
     for i in range(m):
         for k in range(m):
             work.is_side[i, k] = False
@@ -467,7 +527,9 @@ def _worth_of_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: 
 
 @unit
 def _measure_triangles(work: Cavity, state: State, a: int, b: int, m: int, is_open: int) -> bool:
-    """Add the image energy to the triangles of the triangulation in `apex`; return True if any lacked it."""
+    """Add the image energy to the triangles of the triangulation in `apex`; return True if any
+    lacked it.
+    """
     stack, side_a, side_b, ring = work.stack, work.side_a, work.side_b, work.ring
     stack[0, 0], stack[0, 1] = 0, m - 1
     height = 1
@@ -493,26 +555,38 @@ def _measure_triangles(work: Cavity, state: State, a: int, b: int, m: int, is_op
             work.sums[1, d] = side_a[i, k, d] + side_a[k, j, d] - side_a[i, j, d] + u
         label = state.complex.labels[work.around[_arc_of(work, j)]]
         work.triangle[i, k, j] += state.objective.image * (
-            image_energy(work.sums, 0, label, state.objective) + image_energy(work.sums, 1, label, state.objective)
+            image_energy(work.sums, 0, label, state.objective)
+            + image_energy(work.sums, 1, label, state.objective)
         )
     return is_new
 
 
 @helper
 def _pair_shape(y: NDArray, i: int, k: int, j: int, limit: float, objective: Objective) -> float:
-    """Weighted shape energy of the tetrahedra (i, k, j, b) and (i, j, k, a) over a triangle of the polygon.
+    """Weighted shape energy of the tetrahedra (i, k, j, b) and (i, j, k, a) over a triangle of the
+    polygon.
 
-    Rows of `y`: a, b, then the polygon's corners. Infinite if one is inverted or flat or has more than `limit`.
+    Rows of `y`: a, b, then the polygon's corners. Infinite if one is inverted or flat or has more
+    than `limit`.
     """
-    u, v, to_a, to_b = difference(y, k, i), difference(y, j, i), difference(y, 0, i), difference(y, 1, i)
+    u, v, to_a, to_b = (
+        difference(y, k, i),
+        difference(y, j, i),
+        difference(y, 0, i),
+        difference(y, 1, i),
+    )
     n = cross(u, v)
     above, below = dot(n, to_b), -dot(n, to_a)
     if above <= 0.0 or below <= 0.0:
         return np.inf
-    energy = objective.geometry * tet_energy(above, _edge_squares(u, v, to_b), objective.power, objective.is_graded)
+    energy = objective.geometry * tet_energy(
+        above, _edge_squares(u, v, to_b), objective.power, objective.is_graded
+    )
     if not energy < limit:
         return np.inf
-    energy += objective.geometry * tet_energy(below, _edge_squares(u, v, to_a), objective.power, objective.is_graded)
+    energy += objective.geometry * tet_energy(
+        below, _edge_squares(u, v, to_a), objective.power, objective.is_graded
+    )
     return energy if energy < limit else np.inf
 
 
@@ -537,7 +611,9 @@ def _pair_cosine(x: NDArray, y: NDArray, i: int, k: int, j: int) -> float:
 
 @unit
 def best_triangulation(cost: Floats2, apex: Ints2, triangle: Floats3, m: int) -> float:
-    """Least sum of `triangle[i, k, j]` over the triangulations of a polygon of m corners; `apex` is filled."""
+    """Least sum of `triangle[i, k, j]` over the triangulations of a polygon of m corners; `apex`
+    is filled.
+    """
     for i in range(m - 1):
         cost[i, i + 1] = 0.0
     for length in range(2, m):
@@ -554,8 +630,12 @@ def best_triangulation(cost: Floats2, apex: Ints2, triangle: Floats3, m: int) ->
 
 
 @unit
-def fill_side(work: Cavity, state: State, a: int, b: int, i: int, j: int, m: int, is_open: int) -> None:
-    """Fill in unknown fluxes of the facets (v_i, v_j, b) and (v_j, v_i, a): the old cells' on the polygon's sides."""
+def fill_side(
+    work: Cavity, state: State, a: int, b: int, i: int, j: int, m: int, is_open: int
+) -> None:
+    """Fill in unknown fluxes of the facets (v_i, v_j, b) and (v_j, v_i, a): the old cells' on
+    the polygon's sides.
+    """
     if work.is_side[i, j]:
         return
     work.is_side[i, j] = True
@@ -563,11 +643,17 @@ def fill_side(work: Cavity, state: State, a: int, b: int, i: int, j: int, m: int
         r, sign = (i, 1.0) if j == i + 1 else (m - 1, -1.0)
         cell = work.around[r]
         for d in range(state.complex.fluxes.shape[2]):
-            work.side_b[i, j, d] = sign * state.complex.fluxes[cell, corner_of(state.complex.cells, cell, a), d]
-            work.side_a[i, j, d] = sign * state.complex.fluxes[cell, corner_of(state.complex.cells, cell, b), d]
+            work.side_b[i, j, d] = (
+                sign * state.complex.fluxes[cell, corner_of(state.complex.cells, cell, a), d]
+            )
+            work.side_a[i, j, d] = (
+                sign * state.complex.fluxes[cell, corner_of(state.complex.cells, cell, b), d]
+            )
         return
     for which in range(2):  # a single call that measures fluxes halves the code to compile
-        p, q, end = (work.ring[i], work.ring[j], b) if which == 0 else (work.ring[j], work.ring[i], a)
+        p, q, end = (
+            (work.ring[i], work.ring[j], b) if which == 0 else (work.ring[j], work.ring[i], a)
+        )
         side = work.side_b if which == 0 else work.side_a
         put_flux(side, i, j, state.complex.ticks, p, q, end, state.objective)
 
@@ -598,7 +684,9 @@ def make_moves(order: Ints1, move: Ints1, is_dirty: Bools1, state: State, work: 
             flip_face(work, state, cell, move[cell], is_dirty)
         else:
             i, j = TET_EDGES[move[cell] - 4]
-            m, is_open = ring_of_edge(work.ring, work.around, cells, across, cell, i, j, is_dirty[:0])
+            m, is_open = ring_of_edge(
+                work.ring, work.around, cells, across, cell, i, j, is_dirty[:0]
+            )
             clean = m > 0
             for r in range(m - is_open):
                 clean = clean and not is_dirty[work.around[r]]
@@ -614,10 +702,11 @@ def make_moves(order: Ints1, move: Ints1, is_dirty: Bools1, state: State, work: 
 
 @unit
 def take_cells(work: Cavity, state: State, n_old: int, n_new: int, is_dirty: Bools1) -> None:
-    """Write the numbers of the cells that fill a cavity to `work.new`: first its `n_old` cells in `work.around`.
+    """Write the numbers of the cells that fill a cavity to `work.new`: first its `n_old` cells in
+    `work.around`.
 
-    Further numbers are those of unused cells, or from the end; cells that become unused are marked by a corner of -1.
-    All are marked dirty.
+    Further numbers are those of unused cells, or from the end; cells that become unused are marked
+    by a corner of -1. All are marked dirty.
     """
     for r in range(max(n_old, n_new)):
         if r < n_old:
@@ -639,8 +728,15 @@ def take_cells(work: Cavity, state: State, n_old: int, n_new: int, is_dirty: Boo
 
 @unit
 def flip_face(work: Cavity, state: State, cell: int, k: int, is_dirty: Bools1) -> None:
-    """Replace two cells by three around the edge (p, q) between the corners opposite their facet (u, v, w)."""
-    cells, across, fluxes, objective = state.complex.cells, state.complex.across, state.complex.fluxes, state.objective
+    """Replace two cells by three around the edge (p, q) between the corners opposite their facet
+    (u, v, w).
+    """
+    cells, across, fluxes, objective = (
+        state.complex.cells,
+        state.complex.across,
+        state.complex.fluxes,
+        state.objective,
+    )
     other = across[cell, k]
     u, v, w = outward(cells, cell, k)
     p, q = (cells[cell, k], cells[other, facet_of(across, other, cell)])
@@ -676,7 +772,12 @@ def flip_face(work: Cavity, state: State, cell: int, k: int, is_dirty: Bools1) -
         c = new[r]
         cells[c, 0], cells[c, 1], cells[c, 2], cells[c, 3] = (p, q, corner[r], corner[s])
         state.complex.labels[c] = label
-        (across[c, 0], across[c, 1], across[c, 2], across[c, 3]) = (over[t], under[t], new[s], new[t])
+        (across[c, 0], across[c, 1], across[c, 2], across[c, 3]) = (
+            over[t],
+            under[t],
+            new[s],
+            new[t],
+        )
         for d in range(D):
             fluxes[c, 0, d], fluxes[c, 1, d] = above[t, d], below[t, d]
             fluxes[c, 2, d], fluxes[c, 3, d] = spoke[s, 0, d], -spoke[r, 0, d]
@@ -695,7 +796,8 @@ def join(across: NDArray, cell: int, k: int, other: int, m: int) -> None:
 
 @helper
 def _beyond_polygon(work: Cavity, state: State, node: int, n_cells: int) -> NDArray:
-    """The cells beyond the sides of the polygon in `work`, over the node: row r (cell, its facet that leads here).
+    """The cells beyond the sides of the polygon in `work`, over the node: row r (cell, its facet
+    that leads here).
 
     Rows are -1 outside the mesh, and in the last row of an open polygon.
     """
@@ -712,8 +814,11 @@ def _beyond_polygon(work: Cavity, state: State, node: int, n_cells: int) -> NDAr
 
 
 @unit
-def remove_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: int, is_dirty: Bools1) -> None:
-    """Replace the cells around (a, b) by pairs over the triangles of the polygon in `work.apex`; see `_worth_of_edge`.
+def remove_edge(
+    work: Cavity, state: State, a: int, b: int, m: int, is_open: int, is_dirty: Bools1
+) -> None:
+    """Replace the cells around (a, b) by pairs over the triangles of the polygon in `work.apex`;
+    see `_worth_of_edge`.
 
     The sides of its triangles have known fluxes, if the image has weight.
     Over the triangle (i, k, j), i < k < j: (v_i, v_k, v_j, b) and (v_i, v_j, v_k, a).
@@ -721,10 +826,12 @@ def remove_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: int
     cells, across, ring, new = state.complex.cells, state.complex.across, work.ring, work.new
     labels = state.complex.labels
     one, other = labels[work.around[0]], labels[work.around[work.arc[0]]]
-    beyond_a = _beyond_polygon(work, state, b, m - is_open)  # beyond the facets opposite b, on the side of a
+    # beyond the facets opposite b, on the side of a
+    beyond_a = _beyond_polygon(work, state, b, m - is_open)
     beyond_b = _beyond_polygon(work, state, a, m - is_open)
     take_cells(work, state, m - is_open, 2 * (m - 2), is_dirty)
-    # The triangle under each diagonal (i, j), numbered; its two cells are new[2 t] and new[2 t + 1].
+    # The triangle under each diagonal (i, j), numbered; its two cells are new[2 t] and new[2 t +
+    # 1].
     stack = work.stack  # rows of i, j and (triangle above) * 4 + its facet towards this one
     stack[0, 0], stack[0, 1], stack[0, 2] = 0, m - 1, -1
     height, count = 1, 0
@@ -762,8 +869,12 @@ def remove_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: int
 
 
 @helper
-def _put_pair_fluxes(work: Cavity, state: State, top: int, low: int, i: int, k: int, j: int) -> None:
-    """Write the fluxes of the two cells over the triangle (i, k, j); 0 inside the cavity if the image has no weight."""
+def _put_pair_fluxes(
+    work: Cavity, state: State, top: int, low: int, i: int, k: int, j: int
+) -> None:
+    """Write the fluxes of the two cells over the triangle (i, k, j); 0 inside the cavity if the
+    image has no weight.
+    """
     fluxes, side_a, side_b, ring = state.complex.fluxes, work.side_a, work.side_b, work.ring
     has_image = state.objective.image > 0.0
     for d in range(fluxes.shape[2]):
@@ -781,7 +892,12 @@ def _put_pair_fluxes(work: Cavity, state: State, top: int, low: int, i: int, k: 
 @unit
 def close_gaps(state: State, is_dirty: Bools1) -> None:
     """Move the last cells into the places of removed ones."""
-    cells, across, fluxes, sums = state.complex.cells, state.complex.across, state.complex.fluxes, state.complex.sums
+    cells, across, fluxes, sums = (
+        state.complex.cells,
+        state.complex.across,
+        state.complex.fluxes,
+        state.complex.sums,
+    )
     E_shape = state.complex.E_shape
     n = cells.shape[1]
     last = state.complex.n_cells[0] - 1
@@ -819,14 +935,21 @@ def close_gaps(state: State, is_dirty: Bools1) -> None:
 @unit
 def _evaluate_triangles(search: Evaluation, chunk: int) -> None:
     """Evaluate moves 0 to 2, which flip that edge."""
-    gain, move, near, is_dirty, state = search.gain, search.move, search.near, search.is_dirty, search.state
+    gain, move, near, is_dirty, state = (
+        search.gain,
+        search.move,
+        search.near,
+        search.is_dirty,
+        search.state,
+    )
     x, sums, complex_ = np.empty((4, 3)), np.empty((2, state.complex.sums.shape[1])), state.complex
     first = chunk * CELLS_PER_CHUNK
     for number in range(first, min(first + CELLS_PER_CHUNK, len(near))):
         cell = near[number]
         for k in range(3):
             other = complex_.across[cell, k]
-            is_others = 0 <= other < cell and is_dirty[other]  # the triangle beyond evaluates the edge
+            # the triangle beyond evaluates the edge
+            is_others = 0 <= other < cell and is_dirty[other]
             if other >= 0 and not is_others and not is_interface(complex_, cell, k):
                 worth = _worth_of_turn(x, sums, state, cell, k)
                 if worth > gain[cell]:
@@ -835,8 +958,15 @@ def _evaluate_triangles(search: Evaluation, chunk: int) -> None:
 
 @unit
 def _worth_of_turn(x: Floats2, sums: Floats2, state: State, cell: int, k: int) -> float:
-    """Reduction of E by flipping the edge (u, v) between two triangles to (p, q); -inf if impossible."""
-    ticks, cells, across, fluxes = state.complex.ticks, state.complex.cells, state.complex.across, state.complex.fluxes
+    """Reduction of E by flipping the edge (u, v) between two triangles to (p, q); -inf if
+    impossible.
+    """
+    ticks, cells, across, fluxes = (
+        state.complex.ticks,
+        state.complex.cells,
+        state.complex.across,
+        state.complex.fluxes,
+    )
     objective = state.objective
     other = across[cell, k]
     m = facet_of(across, other, cell)
@@ -853,17 +983,28 @@ def _worth_of_turn(x: Floats2, sums: Floats2, state: State, cell: int, k: int) -
         flux = np.empty((1, 1, sums.shape[1]))
         put_flux(flux, 0, 0, ticks, p, q, -1, objective)
         for d in range(sums.shape[1]):  # over the edges (p, u), (u, q), and (q, v), (v, p)
-            sums[0, d] = fluxes[cell, (k + 2) % 3, d] + fluxes[other, (m + 1) % 3, d] - flux[0, 0, d]
-            sums[1, d] = fluxes[other, (m + 2) % 3, d] + fluxes[cell, (k + 1) % 3, d] + flux[0, 0, d]
+            sums[0, d] = (
+                fluxes[cell, (k + 2) % 3, d] + fluxes[other, (m + 1) % 3, d] - flux[0, 0, d]
+            )
+            sums[1, d] = (
+                fluxes[other, (m + 2) % 3, d] + fluxes[cell, (k + 1) % 3, d] + flux[0, 0, d]
+            )
         label = state.complex.labels[cell]
-        new += objective.image * (image_energy(sums, 0, label, objective) + image_energy(sums, 1, label, objective))
+        new += objective.image * (
+            image_energy(sums, 0, label, objective) + image_energy(sums, 1, label, objective)
+        )
     return old - new if new < limit else -np.inf
 
 
 @unit
 def _turn_edge(state: State, cell: int, k: int) -> None:
     """Replace triangles (p, u, v) and (q, v, u) by (p, u, q) and (p, q, v)."""
-    ticks, cells, across, fluxes = state.complex.ticks, state.complex.cells, state.complex.across, state.complex.fluxes
+    ticks, cells, across, fluxes = (
+        state.complex.ticks,
+        state.complex.cells,
+        state.complex.across,
+        state.complex.fluxes,
+    )
     objective = state.objective
     other = across[cell, k]
     m = facet_of(across, other, cell)
@@ -888,7 +1029,11 @@ def _turn_edge(state: State, cell: int, k: int) -> None:
     across[other, 0], across[other, 1], across[other, 2] = n_qv, n_vp, cell
     for d in range(fluxes.shape[2]):
         fluxes[cell, 0, d], fluxes[cell, 1, d], fluxes[cell, 2, d] = (f_uq[d], -f[0, 0, d], f_pu[d])
-        fluxes[other, 0, d], fluxes[other, 1, d], fluxes[other, 2, d] = (f_qv[d], f_vp[d], f[0, 0, d])
+        fluxes[other, 0, d], fluxes[other, 1, d], fluxes[other, 2, d] = (
+            f_qv[d],
+            f_vp[d],
+            f[0, 0, d],
+        )
     x = np.empty((4, 3))
     for c in (cell, other):
         settle(x, state, c)

@@ -17,7 +17,15 @@ from tetopt.contents.content import Content, SmoothLabels
 from tetopt.contents.memberships import Memberships, labels_at
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.engine.complex import NodeStars, State, node_stars
-from tetopt.engine.labelling import Contacts, Contents, LabelVoxels, label_voxels, labelled, unfit_labels, unpinched
+from tetopt.engine.labelling import (
+    Contacts,
+    Contents,
+    LabelVoxels,
+    label_voxels,
+    labelled,
+    unfit_labels,
+    unpinched,
+)
 from tetopt.engine.surface import MOST_MEETING
 from tetopt.geometry.manifold import OUTSIDE_LABEL, pinches
 from tetopt.geometry.simplex import volumes
@@ -28,20 +36,28 @@ from tetopt.system.kernel_cache import njit
 from tetopt.system.kernels import entry, unit
 from tetopt.system.slabs import over_slabs
 
-FEWEST_CENTRES = 20  # of voxels that determine a cell's labels; in cells with fewer, levels are sampled
+# of voxels that determine a cell's labels; in cells with fewer, levels are sampled
+FEWEST_CENTRES = 20
 SAMPLED_FRACTION = 0.5  # of a label's voxels: if samples show less, its centres are counted, too
 SAMPLED_AT_ONCE = 20_000  # cells per thread
 
 
 def with_labels(
-    state: State, content: Content, smooth: SmoothLabels, mesh: Mesh, voxels: LabelVoxels | None = None
+    state: State,
+    content: Content,
+    smooth: SmoothLabels,
+    mesh: Mesh,
+    voxels: LabelVoxels | None = None,
 ) -> State:
-    """The state with one of the content's labels for each cell, and an objective that penalises other labels' voxels.
+    """The state with one of the content's labels for each cell, and an objective that penalises
+    other labels' voxels.
 
     `voxels` is the information on the labels' voxels (`label_voxels`), if known.
     """
     members, tension, own_channel, own_value, keeps_volumes = smooth
-    voxels = voxels or label_voxels(members.partition, content.image.spacing, len(members.labels), members.parts)
+    voxels = voxels or label_voxels(
+        members.partition, content.image.spacing, len(members.labels), members.parts
+    )
     n_cells, image = len(mesh.cells), content.image
     across = state.complex.across[:n_cells]
     contents = cell_contents(image, members, mesh, voxels)
@@ -56,36 +72,49 @@ def with_labels(
         tension=float(state.objective.image * tension * step / image.voxel_volume),
     )
     levels = members.levels.reshape(len(members.levels), *(1,) * (3 - image.ndim), *image.shape)
-    state = state._replace(objective=objective, sides=state.sides._replace(levels=levels, channel=members.channel))
+    state = state._replace(
+        objective=objective, sides=state.sides._replace(levels=levels, channel=members.channel)
+    )
     _meet_everywhere(state, node_stars(state))
     return state
 
 
-def mend_pinches(state: State, image: Image, members: Memberships, mesh: Mesh, voxels: LabelVoxels) -> None:
-    """Give cells other labels where an interface of two labels is no manifold, or cells are next to nothing of theirs.
+def mend_pinches(
+    state: State, image: Image, members: Memberships, mesh: Mesh, voxels: LabelVoxels
+) -> None:
+    """Give cells other labels where an interface of two labels is no manifold, or cells are next to
+    nothing of theirs.
 
     No node moves.
     """
-    labels, across = (array[: len(mesh.cells)] for array in (state.complex.labels, state.complex.across))
+    labels, across = (
+        array[: len(mesh.cells)] for array in (state.complex.labels, state.complex.across)
+    )
     of_ridges, of_nodes = pinches(facets(mesh.cells), labels)
     aim = image.voxel_volume * np.array([sizes.sum() for sizes in voxels.components])
     is_unfit = unfit_labels(labels, mesh.cell_volumes, aim)
-    if is_unfit.any() or any((places.labels[:, 0] != OUTSIDE_LABEL).any() for places in (of_ridges, of_nodes)):
+    if is_unfit.any() or any(
+        (places.labels[:, 0] != OUTSIDE_LABEL).any() for places in (of_ridges, of_nodes)
+    ):
         contents = cell_contents(image, members, mesh, voxels)
         labels[:] = unpinched(mesh.points, mesh.cells, across, contents, labels, aim)
         _meet_everywhere(state, node_stars(state))
 
 
 def cell_contents(image: Image, members: Memberships, mesh: Mesh, voxels: LabelVoxels) -> Contents:
-    """Voxels of each label in each cell, contacts of labels, and their pieces; cells with few centres are sampled.
+    """Voxels of each label in each cell, contacts of labels, and their pieces; cells with few
+    centres are sampled.
 
-    A cell of a thin sheet may contain one centre, or none. Levels are sampled at the centres of equal parts.
+    A cell of a thin sheet may contain one centre, or none. Levels are sampled at the centres of
+    equal parts.
     """
     n_cells, n_labels, inner = len(mesh.cells), len(members.labels), PART_CENTRES[image.ndim]
     owner, partition = cell_of_voxel(image, mesh).ravel(), members.partition.ravel()
 
     def count(first: int, stop: int) -> _Counted:
-        counted = _Counted(first, stop, np.zeros(n_cells, dtype=np.int64), np.zeros(n_labels, dtype=np.int64))
+        counted = _Counted(
+            first, stop, np.zeros(n_cells, dtype=np.int64), np.zeros(n_labels, dtype=np.int64)
+        )
         _count_centres(counted.n_owned, counted.n_of, owner[first:stop], partition[first:stop])
         return counted
 
@@ -99,24 +128,41 @@ def cell_contents(image: Image, members: Memberships, mesh: Mesh, voxels: LabelV
 
     def place(first: int, stop: int) -> None:
         for each, at in zip(counted[first:stop], places[first:stop], strict=True):
-            _place_centres(entries, at, owner[each.first : each.stop], partition[each.first : each.stop], is_sampled)
+            _place_centres(
+                entries,
+                at,
+                owner[each.first : each.stop],
+                partition[each.first : each.stop],
+                is_sampled,
+            )
 
     over_slabs(place, len(counted), len(owner))
     sampled, index = np.flatnonzero(is_sampled), image.to_index(mesh.points)
 
     def sample(first: int, stop: int) -> None:
         part = sampled[first:stop]
-        entries[start[part, None] + np.arange(len(inner))] = labels_at(members, index, mesh.cells[part], inner)
+        entries[start[part, None] + np.arange(len(inner))] = labels_at(
+            members, index, mesh.cells[part], inner
+        )
 
     over_slabs(sample, len(sampled), len(inner) * len(sampled), 1 + len(sampled) // SAMPLED_AT_ONCE)
-    # Not 1 per centre: among cells of about `FEWEST_CENTRES`, those with more centres than their volume are counted.
-    each = np.abs(volumes(mesh.points, mesh.cells)) / image.voxel_volume / np.where(is_sampled, len(inner), n_owned)
+    # Not 1 per centre: among cells of about `FEWEST_CENTRES`, those with more centres than their
+    # volume are counted.
+    each = (
+        np.abs(volumes(mesh.points, mesh.cells))
+        / image.voxel_volume
+        / np.where(is_sampled, len(inner), n_owned)
+    )
     first = np.zeros(n_cells + 1, dtype=np.int64)
-    over_slabs(lambda a, b: _count_kinds(first, entries, start, n_labels, (a, b)), n_cells, len(entries))
+    over_slabs(
+        lambda a, b: _count_kinds(first, entries, start, n_labels, (a, b)), n_cells, len(entries)
+    )
     np.cumsum(first, out=first)
     row, volume = np.empty(first[-1], dtype=np.int64), np.empty(first[-1])
     over_slabs(
-        lambda a, b: _sum_kinds(row, volume, first, entries, start, each, n_labels, (a, b)), n_cells, len(entries)
+        lambda a, b: _sum_kinds(row, volume, first, entries, start, each, n_labels, (a, b)),
+        n_cells,
+        len(entries),
     )
     counts = scipy.sparse.csr_array((volume, row, first), shape=(n_cells, n_labels))
     # Samples may miss a label of a voxel or two, so its centres count.
@@ -130,7 +176,9 @@ def cell_contents(image: Image, members: Memberships, mesh: Mesh, voxels: LabelV
     is_place[owner[voxels.places]] = True
     pieces, holder = voxels.pieces, owner[voxels.pieces.voxels]
     piece, cell = pieces.piece[holder >= 0], holder[holder >= 0]
-    in_cells = scipy.sparse.csr_array((np.ones(len(cell)), (piece, cell)), shape=(len(pieces.label), n_cells))
+    in_cells = scipy.sparse.csr_array(
+        (np.ones(len(cell)), (piece, cell)), shape=(len(pieces.label), n_cells)
+    )
     return Contents(counts, Contacts(voxels.is_apart, is_place[:-1].copy()), in_cells, pieces.label)
 
 
@@ -153,7 +201,9 @@ def _count_centres(n_owned: NDArray, n_of: NDArray, owner: NDArray, partition: N
 
 
 @njit(cache=True, nogil=True)
-def _place_centres(entries: NDArray, end: NDArray, owner: NDArray, partition: NDArray, is_sampled: NDArray) -> None:
+def _place_centres(
+    entries: NDArray, end: NDArray, owner: NDArray, partition: NDArray, is_sampled: NDArray
+) -> None:
     for v in range(len(owner)):
         cell = owner[v]
         if cell >= 0 and not is_sampled[cell]:
@@ -164,7 +214,7 @@ def _place_centres(entries: NDArray, end: NDArray, owner: NDArray, partition: ND
 @njit(cache=True, nogil=True)
 def _count_kinds(
     first: NDArray, entries: NDArray, start: NDArray, n_labels: int, ends: tuple[int, int]
-) -> None:  # fmt: skip
+) -> None:
     """Count the labels present in each of some cells."""
     last = np.full(n_labels, -1, dtype=np.int64)
     for cell in range(*ends):
@@ -176,9 +226,15 @@ def _count_kinds(
 
 @njit(cache=True, nogil=True)
 def _sum_kinds(
-    row: NDArray, volume: NDArray, first: NDArray, entries: NDArray, start: NDArray, each: NDArray, n_labels: int,
+    row: NDArray,
+    volume: NDArray,
+    first: NDArray,
+    entries: NDArray,
+    start: NDArray,
+    each: NDArray,
+    n_labels: int,
     ends: tuple[int, int],
-) -> None:  # fmt: skip
+) -> None:
     total, last = np.zeros(n_labels), np.full(n_labels, -1, dtype=np.int64)
     for cell in range(*ends):
         end = first[cell]
@@ -198,16 +254,23 @@ def _sum_kinds(
 
 
 def _samples(n: int, parts: int) -> NDArray[np.float64]:
-    """Barycentric places (S, n+1): the points that divide a simplex's edges into parts, moved inside."""
-    whole = np.array([each for each in itertools.product(range(parts + 1), repeat=n + 1) if sum(each) == parts])
+    """Barycentric places (S, n+1): the points that divide a simplex's edges into parts, moved
+    inside.
+    """
+    whole = np.array(
+        [each for each in itertools.product(range(parts + 1), repeat=n + 1) if sum(each) == parts]
+    )
     return (whole + 0.5) / (parts + 0.5 * (n + 1))
 
 
-PART_CENTRES = {2: _samples(2, 4), 3: _samples(3, 3)}  # 15 and 20 barycentric places in a cell, by dimension
+# 15 and 20 barycentric places in a cell, by dimension
+PART_CENTRES = {2: _samples(2, 4), 3: _samples(3, 3)}
 
 
 def crowded_nodes(cells: NDArray[np.int64], of_cell: NDArray[np.int64]) -> int:
-    """Nodes with more labels than they can be moved onto (`MOST_MEETING`); cells (M, n+1), their labels (M,)."""
+    """Nodes with more labels than they can be moved onto (`MOST_MEETING`); cells (M, n+1), their
+    labels (M,).
+    """
     pairs = np.unique(np.column_stack([cells.ravel(), np.repeat(of_cell, cells.shape[1])]), axis=0)
     return int((np.bincount(pairs[:, 0]) > MOST_MEETING).sum())
 

@@ -6,17 +6,19 @@ The labels minimise a Potts energy on the dual graph of a fixed mesh (Boykov, Ve
     - sum over cells of the bias of the cell's label x its volume
     + sum over facets between cells of different labels of tension x area,
 
-where the tension, in mm, is the distance that a surface would move to reduce its area. A ball with a radius below three
-tensions, or a sheet thinner than two, costs more than it gains. A label that is thinner than cells has most of the
-voxels in few of them: its bias, one number, is in proportion to the volume that its cells lack, up to a bound. The
-tension is higher between labels that touch nowhere in the voxels, or only at a few places: cells between them get the
-label of the sheet that separates them, which would tear otherwise. Starting from the label of most voxels in each
-cell, cells take the label of a neighbour, the best move first, as long as the energy falls. Then components of cells
-that no component of voxels justifies go to their neighbours, and places that are not manifold are mended by the
-cheapest cells around them.
+where the tension, in mm, is the distance that a surface would move to reduce its area. A ball with
+a radius below three tensions, or a sheet thinner than two, costs more than it gains. A label that
+is thinner than cells has most of the voxels in few of them: its bias, one number, is in proportion
+to the volume that its cells lack, up to a bound. The tension is higher between labels that touch
+nowhere in the voxels, or only at a few places: cells between them get the label of the sheet that
+separates them, which would tear otherwise. Starting from the label of most voxels in each cell,
+cells take the label of a neighbour, the best move first, as long as the energy falls. Then
+components of cells that no component of voxels justifies go to their neighbours, and places that
+are not manifold are mended by the cheapest cells around them.
 
-An interface is manifold at an edge or a node if, for each label there, its cells around it form one fan, and all other
-cells including the outside form one fan, too: linked by facets that contain the edge or the node.
+An interface is manifold at an edge or a node if, for each label there, its cells around it form one
+fan, and all other cells including the outside form one fan, too: linked by facets that contain the
+edge or the node.
 """
 
 from __future__ import annotations
@@ -31,46 +33,69 @@ from numpy.typing import NDArray
 from tetopt.engine.complex import has_node
 from tetopt.geometry.simplex import facet_areas, regular_edge, volumes
 from tetopt.geometry.topology import linked, stars
-from tetopt.system.kernels import Bools1, Bools2, Floats1, Floats2, Ints1, Ints2, entry, helper, unit
+from tetopt.system.kernels import (
+    Bools1,
+    Bools2,
+    Floats1,
+    Floats2,
+    Ints1,
+    Ints2,
+    entry,
+    helper,
+    unit,
+)
 from tetopt.system.slabs import over_slabs, sum_over_slabs
 
-TENSION_FRACTION = 0.05  # of the local edge; with 0.1, white matter keeps .83, not .87, of its area (MNI152, 5,000)
-# of a label's volume near its surface, the most that tension and mending may take, and that mending may add: with a
-# tenth and a fifth of the whole volume, Dice of white matter is .866, not .884 (MNI152, 5,000 nodes), and ribs of a CT
-# have .57 of their volume, not .68
+# of the local edge; with 0.1, white matter keeps .83, not .87, of its area (MNI152, 5,000)
+TENSION_FRACTION = 0.05
+# of a label's volume near its surface, the most that tension and mending may take, and that mending
+# may add: with a tenth and a fifth of the whole volume, Dice of white matter is .866, not .884
+# (MNI152, 5,000 nodes), and ribs of a CT have .57 of their volume, not .68
 LARGEST_LOSS, LARGEST_GAIN = 0.1, 0.05
 FRAGMENT_FRACTION = 0.1  # of a label's volume: larger components of cells are not given away
-# of a label's volume, at least and at most, at the end, while two labels have pinches: with the last pair alone, a ball
-# of 46 cells loses a third
+# of a label's volume, at least and at most, at the end, while two labels have pinches: with the
+# last pair alone, a ball of 46 cells loses a third
 LAST_FRACTIONS = (0.9, 1.2), (0.65, 1.5), (0.05, 3.0)
-UNFIT_FRACTION = 0.3  # of the volume of a label, or of a mean cell if that is less: with no more, it is dropped
-# least voxels of a component of voxels, relative to those of a component of cells, to justify the latter
+# of the volume of a label, or of a mean cell if that is less: with no more, it is dropped
+UNFIT_FRACTION = 0.3
+# least voxels of a component of voxels, relative to those of a component of cells, to justify the
+# latter
 COMPONENT_FRACTION = 0.5
-BRIDGE_RATIO = 3.0  # cost of a bridge relative to the voxels lost otherwise; with 1 a coarse mesh loses half a rib
+# cost of a bridge relative to the voxels lost otherwise; with 1 a coarse mesh loses half a rib
+BRIDGE_RATIO = 3.0
 MENDING_ROUNDS = 6  # of fragments and mending, at most; the second usually has nothing left to do
-TWO_LABELS_WEIGHT = 20.0  # volumes of the cells around: pinches between two labels are removed at any cost
+# volumes of the cells around: pinches between two labels are removed at any cost
+TWO_LABELS_WEIGHT = 20.0
 MORE_LABELS_WEIGHT = 2.0  # where more labels meet; with .3, fluid has twice as many pinches
 APART_TENSION = 10.0  # times the usual, between labels that are separate in the voxels
 PLACE_TENSION = 3.0  # the same, at places where they touch
-APART_WEIGHT = 10.0  # where such labels meet only at a node or an edge: a sheet between them is pierced
-LEAST_CONTACT_FRACTION = 0.1  # of the surface of two labels: pairs with less contact touch only at places
+# where such labels meet only at a node or an edge: a sheet between them is pierced
+APART_WEIGHT = 10.0
+# of the surface of two labels: pairs with less contact touch only at places
+LEAST_CONTACT_FRACTION = 0.1
 BALANCE_ROUNDS = 10  # of labelling and balancing; more hardly change it
 FIRST_BALANCE_STEP = 0.2  # longest change of a bias in one of them, at first
-BIAS_PER_LOSS = 3.0  # bias of a label over the fraction of its volume that it lacks, in cells labelled so far,
+# bias of a label over the fraction of its volume that it lacks, in cells labelled so far,
+BIAS_PER_LOSS = 3.0
 MOST_BIAS = 0.4  # of a cell's volume, at most, which bounds the overlap that volume costs, unless
-SPARED_LOSS = 0.1  # the loss but for a tenth is more: a label that would lose half of its volume or more gets it back
+# the loss but for a tenth is more: a label that would lose half of its volume or more gets it back
+SPARED_LOSS = 0.1
 LEAST_SHARE = 0.05  # of a cell's volume: a label with less of it does not get the cell
 COMPONENT_VOXELS = 50  # a face-connected component of a label or mask of as many must have a cell
 TRIED_CELLS = 5  # cells for a piece, the best first, tried for one that leaves interfaces manifold
-PIECE_SHARE = 0.3  # of the cell that it gets; with .2, fluid has a Dice of .634, not .639 (MNI152, 5,000 nodes)
-MOST_FILLED = 1.5  # of a label's volume, or a component's: a larger cell does not become its only one
+# of the cell that it gets; with .2, fluid has a Dice of .634, not .639 (MNI152, 5,000 nodes)
+PIECE_SHARE = 0.3
+# of a label's volume, or a component's: a larger cell does not become its only one
+MOST_FILLED = 1.5
 LEAST_GAIN = 1e-9  # of a cell's volume: smaller gains are rounding
 DOUBTFUL_STEPS = 8  # see `_count_steps`
 STAR_CELLS = 100  # work per node in a search for faults, in the unit of `over_slabs`
 
 
 class Pieces(NamedTuple):
-    """Components of voxels that are to have a cell: of `COMPONENT_VOXELS` or more, but not the largest of a label."""
+    """Components of voxels that are to have a cell: of `COMPONENT_VOXELS` or more, but not the
+    largest of a label.
+    """
 
     label: Ints1  # (P,)
     voxels: Ints1  # (V,) flat indices of their voxels
@@ -90,13 +115,15 @@ class LabelVoxels(NamedTuple):
     components: list[NDArray[np.int64]]  # voxels in each component of each label, descending
     pieces: Pieces
     is_apart: NDArray[np.bool_]  # (K, K) as in `Contacts`
-    places: NDArray[np.int64]  # flat indices of voxels next to one of a label that is apart from theirs
+    # flat indices of voxels next to one of a label that is apart from theirs
+    places: NDArray[np.int64]
 
 
 class Contents(NamedTuple):
     """Information on the voxels in a mesh's cells; made by `interfaces.cell_contents`."""
 
-    counts: scipy.sparse.csr_array  # (M, K) voxels of each label, with fractions of a voxel; no row is empty
+    # (M, K) voxels of each label, with fractions of a voxel; no row is empty
+    counts: scipy.sparse.csr_array
     contacts: Contacts | None = None
     pieces: scipy.sparse.csr_array | None = None  # (P, M) voxels of each of `Pieces`
     label_of_piece: NDArray[np.int64] = np.empty(0, dtype=np.int64)  # (P,)
@@ -111,7 +138,8 @@ class Dual(NamedTuple):
     star_cells: Ints1  # (M (n+1),) the cells around each node, ascending
     size: Floats1  # (M,) volumes, mm^n
     scale: Floats1  # (N,) mean volume of the cells around each node
-    tension: Floats2  # (M, n+1) cost of each facet between different labels, mm^n; 0 on the boundary
+    # (M, n+1) cost of each facet between different labels, mm^n; 0 on the boundary
+    tension: Floats2
     first: Ints1  # (M+1,) start of each cell's row of voxels
     row: Ints1  # labels in it
     volume: Floats1  # of their voxels in it, mm^n
@@ -120,15 +148,22 @@ class Dual(NamedTuple):
 
 
 def labelled(
-    points: NDArray[np.float64], cells: NDArray[np.int64], across: NDArray[np.int64], contents: Contents,
-    components: list[NDArray], keeps_volumes: bool = True, weight: float | None = None,
-) -> NDArray[np.int64]:  # fmt: skip
-    """Label each cell of a mesh close to its voxels, with short, manifold interfaces and without fragments.
+    points: NDArray[np.float64],
+    cells: NDArray[np.int64],
+    across: NDArray[np.int64],
+    contents: Contents,
+    components: list[NDArray],
+    keeps_volumes: bool = True,
+    weight: float | None = None,
+) -> NDArray[np.int64]:
+    """Label each cell of a mesh close to its voxels, with short, manifold interfaces and without
+    fragments.
 
-    The iteration ends, since every move except that of fragments lowers an energy, and fragments are moved at most
-    `MENDING_ROUNDS` times. A label that is the most frequent in some cell keeps at least one cell, unless
-    its cells have next to nothing of it and of a mean cell (`UNFIT_FRACTION`). So does a large component of voxels that
-    fills a good part of some cell of about its volume (`PIECE_SHARE`).
+    The iteration ends, since every move except that of fragments lowers an energy, and fragments
+    are moved at most `MENDING_ROUNDS` times. A label that is the most frequent in some cell keeps
+    at least one cell, unless its cells have next to nothing of it and of a mean cell
+    (`UNFIT_FRACTION`). So does a large component of voxels that fills a good part of some cell of
+    about its volume (`PIECE_SHARE`).
 
     Parameters
     ----------
@@ -141,13 +176,15 @@ def labelled(
     contents : Contents
         Voxels of each label, and of pieces of labels, in each cell.
     components : list of K arrays
-        Voxels in each component of each label, descending: `label_voxels`. As many components of cells may stay.
+        Voxels in each component of each label, descending: `label_voxels`. As many components of
+        cells may stay.
     keeps_volumes : bool
-        Give a bonus to labels that lack volume: a label that is thinner than cells has most of the voxels in few of
-        them. The bonus is in proportion to the loss, so that the overlap that it costs is bounded (`MOST_BIAS`).
-        Large components of voxels keep a cell, too.
+        Give a bonus to labels that lack volume: a label that is thinner than cells has most of the
+        voxels in few of them. The bonus is in proportion to the loss, so that the overlap that it
+        costs is bounded (`MOST_BIAS`). Large components of voxels keep a cell, too.
     weight : float, optional
-        Surface tension, mm; by default `TENSION_FRACTION` of the mean edge of the two cells at each facet.
+        Surface tension, mm; by default `TENSION_FRACTION` of the mean edge of the two cells at each
+        facet.
 
     Returns
     -------
@@ -173,8 +210,8 @@ def labelled(
 def _bounds(dual: Dual, aim: NDArray[np.float64]) -> NDArray[np.float64]:
     """Least and largest volumes of labels, (2, K) mm^n, that tension and mending must keep to.
 
-    The volume near a label's surface is that of its voxels but for those in cells that, like all cells beside them,
-    have most of it.
+    The volume near a label's surface is that of its voxels but for those in cells that, like all
+    cells beside them, have most of it.
     """
     labels, cell = _majority(dual), np.repeat(np.arange(len(dual.cells)), np.diff(dual.first))
     beside = np.where(dual.across >= 0, labels[dual.across], labels[:, None])
@@ -184,14 +221,23 @@ def _bounds(dual: Dual, aim: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _given(
-    dual: Dual, aim: NDArray[np.float64], bounds: NDArray[np.float64], voxel: float, components: list[NDArray]
+    dual: Dual,
+    aim: NDArray[np.float64],
+    bounds: NDArray[np.float64],
+    voxel: float,
+    components: list[NDArray],
 ) -> NDArray[np.int64]:
-    """Labels of cells, (M,), by the dual's bias: settled, and without fragments and pinches where that is cheap."""
+    """Labels of cells, (M,), by the dual's bias: settled, and without fragments and pinches
+    where that is cheap.
+    """
     labels = _majority(dual)
     if dual.bias.any():
         _keep_each(dual, labels, aim)
     _settle(dual, labels, bounds[0], False)
-    is_bridge, marks = np.zeros(len(labels), dtype=bool), _Marks(*np.ones((3, len(dual.scale)), dtype=bool))
+    is_bridge, marks = (
+        np.zeros(len(labels), dtype=bool),
+        _Marks(*np.ones((3, len(dual.scale)), dtype=bool)),
+    )
     mended = np.full(len(labels), -1)
     for _ in range(MENDING_ROUNDS):
         before = labels.copy(), is_bridge.copy()
@@ -203,31 +249,50 @@ def _given(
         _mend_near(dual, labels, is_bridge, bounds, marks)
         mended = labels.copy()
         _settle(dual, labels, bounds[0], True)
-        if all(map(np.array_equal, before, (labels, is_bridge))):  # what one step of a round changed, another undid
+        # what one step of a round changed, another undid
+        if all(map(np.array_equal, before, (labels, is_bridge))):
             break
     return labels
 
 
 def unpinched(
-    points: NDArray[np.float64], cells: NDArray[np.int64], across: NDArray[np.int64], contents: Contents,
-    labels: NDArray[np.int64], aim: NDArray[np.float64],
-) -> NDArray[np.int64]:  # fmt: skip
-    """Labels of cells, (M,), with the fewest changes that make interfaces of two labels manifold, at any cost.
+    points: NDArray[np.float64],
+    cells: NDArray[np.int64],
+    across: NDArray[np.int64],
+    contents: Contents,
+    labels: NDArray[np.int64],
+    aim: NDArray[np.float64],
+) -> NDArray[np.int64]:
+    """Labels of cells, (M,), with the fewest changes that make interfaces of two labels manifold,
+    at any cost.
 
-    Arguments as for `labelled`, and the volume `aim`, (K,) mm^n, of each label's voxels. Labels that moves have left
-    without a fit cell are dropped; no other becomes unfit. Pinches that cannot be mended remain.
+    Arguments as for `labelled`, and the volume `aim`, (K,) mm^n, of each label's voxels. Labels
+    that moves have left without a fit cell are dropped; no other becomes unfit. Pinches that cannot
+    be mended remain.
     """
     labels, dual = labels.copy(), _dual(points, cells, across, contents, None)
-    bounds = np.stack([np.maximum(_least_fit(dual.size, aim), dual.size.min()), np.full(len(aim), np.inf)])
+    bounds = np.stack(
+        [np.maximum(_least_fit(dual.size, aim), dual.size.min()), np.full(len(aim), np.inf)]
+    )
     nowhere = _no_contacts(len(cells), len(aim))
     _without_unfit(dual, labels, aim)
     for each in (dual.contacts, nowhere):  # false contact may forbid all moves that are left
-        _mend_pairs(dual._replace(contacts=each), labels, bounds, np.zeros(len(labels), dtype=bool), has_pairs=True)
+        _mend_pairs(
+            dual._replace(contacts=each),
+            labels,
+            bounds,
+            np.zeros(len(labels), dtype=bool),
+            has_pairs=True,
+        )
     return labels
 
 
-def unfit_labels(labels: NDArray[np.int64], size: NDArray[np.float64], aim: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Mask of labels, (K,), whose cells are next to nothing of their volume `aim`, (K,) mm^n, and of a mean cell."""
+def unfit_labels(
+    labels: NDArray[np.int64], size: NDArray[np.float64], aim: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Mask of labels, (K,), whose cells are next to nothing of their volume `aim`, (K,) mm^n,
+    and of a mean cell.
+    """
     volume = np.bincount(labels, size, len(aim))
     return (volume > 0.0) & (volume < _least_fit(size, aim))
 
@@ -241,26 +306,35 @@ def _without_unfit(dual: Dual, labels: NDArray[np.int64], aim: NDArray[np.float6
 
 
 def _keep_each(dual: Dual, labels: NDArray[np.int64], aim: NDArray[np.float64]) -> None:
-    """Give each label without cells the cell with most of it, unless that is too large or has far more of others."""
+    """Give each label without cells the cell with most of it, unless that is too large or has
+    far more of others.
+    """
     cell = np.repeat(np.arange(len(labels)), np.diff(dual.first))
     n_of, most = np.bincount(labels, minlength=len(aim)), MOST_FILLED * aim
     for label in np.setdiff1d(dual.row, labels):
         place = np.flatnonzero(dual.row == label)
         place = place[np.argmax(dual.volume[place])]
         best = cell[place]
-        is_fit = dual.volume[place] > LEAST_SHARE * dual.size[best] and dual.size[best] <= most[label]
+        is_fit = (
+            dual.volume[place] > LEAST_SHARE * dual.size[best] and dual.size[best] <= most[label]
+        )
         if is_fit and n_of[labels[best]] > 1:
             n_of[labels[best]] -= 1
             labels[best] = label
 
 
 def _keep_pieces(
-    dual: Dual, labels: NDArray[np.int64], is_kept: NDArray[np.bool_], contents: Contents, voxel: float
+    dual: Dual,
+    labels: NDArray[np.int64],
+    is_kept: NDArray[np.bool_],
+    contents: Contents,
+    voxel: float,
 ) -> None:
-    """Give each piece without a cell of its label the cell that it fits best, if one does; `voxel` in mm^n.
+    """Give each piece without a cell of its label the cell that it fits best, if one does; `voxel`
+    in mm^n.
 
-    Cells with which interfaces remain manifold go first. These cells are marked in `is_kept`, (M,), as mending would
-    give most others away again.
+    Cells with which interfaces remain manifold go first. These cells are marked in `is_kept`, (M,),
+    as mending would give most others away again.
     """
     if (pieces := contents.pieces) is None:
         return
@@ -276,25 +350,35 @@ def _keep_pieces(
         if not is_fit.any():
             continue
         fit = cells[is_fit][np.argsort(-(2.0 * volume - size)[is_fit], kind="stable")]
-        best = next((cell for cell in fit[:TRIED_CELLS] if _is_manifold(dual, labels, cell, label)), fit[0])
+        best = next(
+            (cell for cell in fit[:TRIED_CELLS] if _is_manifold(dual, labels, cell, label)), fit[0]
+        )
         n_of[[labels[best], label]] += -1, 1
         labels[best], is_kept[best] = label, True
 
 
 def _is_manifold(dual: Dual, labels: NDArray[np.int64], cell: int, label: int) -> bool:
-    """True if interfaces of two labels are manifold at a cell's nodes and edges once it has this label."""
+    """True if interfaces of two labels are manifold at a cell's nodes and edges once it has this
+    label.
+    """
     tried, is_near = labels.copy(), np.zeros(len(dual.scale), dtype=bool)
     tried[cell], is_near[dual.cells[cell]] = label, True
     return not _nonmanifold(dual, tried, is_near)[1].any()
 
 
 def _balance(dual: Dual, aim: NDArray[np.float64], least: NDArray[np.float64]) -> None:
-    """Set the bias of each label in proportion to the fraction of its volume `aim`, (K,) mm^n, that its cells lack.
+    """Set the bias of each label in proportion to the fraction of its volume `aim`, (K,) mm^n, that
+    its cells lack.
 
-    Steps towards it are halved if they go too far. The bias that gave labels nearly their volumes is kept. Tension
-    leaves each label its `least` volume.
+    Steps towards it are halved if they go too far. The bias that gave labels nearly their volumes
+    is kept. Tension leaves each label its `least` volume.
     """
-    longest, before, least_wrong, best = np.full(len(aim), FIRST_BALANCE_STEP), np.zeros(len(aim)), np.inf, dual.bias
+    longest, before, least_wrong, best = (
+        np.full(len(aim), FIRST_BALANCE_STEP),
+        np.zeros(len(aim)),
+        np.inf,
+        dual.bias,
+    )
     for _ in range(BALANCE_ROUNDS):
         labels = _majority(dual)
         _settle(dual, labels, least, False)
@@ -303,15 +387,21 @@ def _balance(dual: Dual, aim: NDArray[np.float64], least: NDArray[np.float64]) -
         if wrong < least_wrong:
             least_wrong, best = wrong, dual.bias.copy()
         loss = 1.0 - volume / np.where(aim > 0.0, aim, np.inf)
-        bias = np.maximum(np.clip(BIAS_PER_LOSS * loss, 0.0, MOST_BIAS), loss - SPARED_LOSS) * (aim > 0.0)
+        bias = np.maximum(np.clip(BIAS_PER_LOSS * loss, 0.0, MOST_BIAS), loss - SPARED_LOSS) * (
+            aim > 0.0
+        )
         longest = np.where((bias - dual.bias) * before < 0.0, 0.5 * longest, longest)
         before = np.clip(bias - dual.bias, -longest, longest)
         dual.bias[:] += before
     dual.bias[:] = best
 
 
-def _components(partition: NDArray[np.integer], n_labels: int, least: int) -> tuple[list[NDArray[np.int64]], Pieces]:
-    """Number of voxels in each face-connected component of each label, descending; and pieces of `least` or more."""
+def _components(
+    partition: NDArray[np.integer], n_labels: int, least: int
+) -> tuple[list[NDArray[np.int64]], Pieces]:
+    """Number of voxels in each face-connected component of each label, descending; and pieces of
+    `least` or more.
+    """
     sizes = [np.empty(0, dtype=np.int64)] * n_labels
     label_of: list[int] = []
     voxels, piece = [np.empty(0, dtype=np.int64)], [np.empty(0, dtype=np.int64)]
@@ -326,19 +416,24 @@ def _components(partition: NDArray[np.integer], n_labels: int, least: int) -> tu
         place = np.nonzero(is_piece[number])
         piece.append((len(label_of) - 1 + np.cumsum(is_piece))[number[place]])
         voxels.append(
-            np.ravel_multi_index([i + side.start for i, side in zip(place, box, strict=True)], partition.shape)
+            np.ravel_multi_index(
+                [i + side.start for i, side in zip(place, box, strict=True)], partition.shape
+            )
         )
         label_of += [label] * int(is_piece.sum())
-    return sizes, Pieces(np.array(label_of, dtype=np.int64), np.concatenate(voxels), np.concatenate(piece))
+    return sizes, Pieces(
+        np.array(label_of, dtype=np.int64), np.concatenate(voxels), np.concatenate(piece)
+    )
 
 
 def label_voxels(
     partition: NDArray[np.integer], spacing: NDArray[np.float64], n_labels: int, parts: int = 1
 ) -> LabelVoxels:
-    """Components of labels in the voxels of a grid, pairs that share hardly any area, and places where these touch.
+    """Components of labels in the voxels of a grid, pairs that share hardly any area, and places
+    where these touch.
 
-    `partition` has -1 at voxels outside a mask, which neither link components nor touch a label. Voxels of the labels
-    are divided into `parts` of its own.
+    `partition` has -1 at voxels outside a mask, which neither link components nor touch a label.
+    Voxels of the labels are divided into `parts` of its own.
     """
     n_rows, n_voxels = n_labels + 1, partition.size  # the last row: outside
 
@@ -378,8 +473,12 @@ def label_voxels(
     return LabelVoxels(sizes, pieces, is_apart[:-1, :-1].copy(), np.flatnonzero(is_place))
 
 
-def components_of(across: NDArray[np.int64], labels: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The component of each cell, (M,), linked by facets between cells of one label; and each component's label."""
+def components_of(
+    across: NDArray[np.int64], labels: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The component of each cell, (M,), linked by facets between cells of one label; and each
+    component's label.
+    """
     one = np.repeat(np.arange(len(labels)), across.shape[1])
     other = across.ravel()
     is_link = (other > one) & (labels[one] == labels[other])
@@ -390,11 +489,16 @@ def components_of(across: NDArray[np.int64], labels: NDArray[np.int64]) -> tuple
 
 
 def _dual(
-    points: NDArray[np.float64], cells: NDArray[np.int64], across: NDArray[np.int64], contents: Contents,
+    points: NDArray[np.float64],
+    cells: NDArray[np.int64],
+    across: NDArray[np.int64],
+    contents: Contents,
     weight: float | None,
-) -> Dual:  # fmt: skip
+) -> Dual:
     counts = contents.counts
-    assert (np.diff(counts.indptr) > 0).all(), "labelled: a cell without voxels has no fraction of any label"
+    assert (np.diff(counts.indptr) > 0).all(), (
+        "labelled: a cell without voxels has no fraction of any label"
+    )
     n, n_labels = points.shape[1], counts.shape[1]
     size, around = np.abs(volumes(points, cells)), stars(cells, len(points))
     scale = np.add.reduceat(np.append(size[around.cells], 0.0), around.start[:-1]) / np.maximum(
@@ -402,7 +506,8 @@ def _dual(
     )
     tension = np.full(across.shape, weight)
     if weight is None:
-        # The edge of a regular cell of that volume, so that thin cells do not make a surface expensive.
+        # The edge of a regular cell of that volume, so that thin cells do not make a surface
+        # expensive.
         edge = regular_edge(size, n)
         tension = TENSION_FRACTION * 0.5 * (edge[:, None] + edge[across])
     tension = np.where(across >= 0, tension * facet_areas(points, cells), 0.0)
@@ -444,16 +549,21 @@ def _fill_majority(labels: Ints1, dual: Dual) -> None:
                 labels[cell], most = dual.row[p], worth
 
 
-def _settle(dual: Dual, labels: NDArray[np.int64], least: NDArray[np.float64], is_careful: bool) -> int:
-    """Let cells take a neighbour's label while the energy falls, the best moves first; return their number.
+def _settle(
+    dual: Dual, labels: NDArray[np.int64], least: NDArray[np.float64], is_careful: bool
+) -> int:
+    """Let cells take a neighbour's label while the energy falls, the best moves first; return their
+    number.
 
-    Tension alone lowers no label below its volume `least`. If `is_careful`, no label's topology changes.
+    Tension alone lowers no label below its volume `least`. If `is_careful`, no label's topology
+    changes.
     """
     room = np.bincount(labels, dual.size, len(least)) - least
     n_of = np.bincount(labels, minlength=len(least))
     total, gains, is_stale = 0, np.zeros(len(labels)), np.ones(len(labels), dtype=bool)
     while True:
-        # Only changed cells and their neighbours: for a head's 720,000 cells a fifth of the time of all.
+        # Only changed cells and their neighbours: for a head's 720,000 cells a fifth of the time of
+        # all.
         _fill_gains(gains, dual, labels, np.flatnonzero(is_stale))
         is_stale[:] = False
         active = np.flatnonzero(gains > LEAST_GAIN * dual.size)
@@ -475,7 +585,9 @@ def _voxels(dual: Dual, cell: int, label: int) -> float:
 
 @unit
 def _price(dual: Dual, labels: Ints1, cell: int, label: int) -> float:
-    """The part of the energy that depends on a cell's label, for this label, minus its least possible value."""
+    """The part of the energy that depends on a cell's label, for this label, minus its least
+    possible value.
+    """
     price = -_voxels(dual, cell, label) - dual.bias[label] * dual.size[cell]
     for k in range(dual.across.shape[1]):
         other = dual.across[cell, k]
@@ -489,7 +601,9 @@ def _price(dual: Dual, labels: Ints1, cell: int, label: int) -> float:
 
 @helper
 def _best_label(dual: Dual, labels: NDArray, cell: int) -> tuple:
-    """The cheapest label among a cell's neighbours, and its gain; the cell's own label if nothing is gained."""
+    """The cheapest label among a cell's neighbours, and its gain; the cell's own label if
+    nothing is gained.
+    """
     own = _price(dual, labels, cell, labels[cell])
     best, gain = labels[cell], 0.0
     for k in range(dual.across.shape[1]):
@@ -509,9 +623,16 @@ def _fill_gains(gains: Floats1, dual: Dual, labels: Ints1, stale: Ints1) -> None
 
 @entry
 def _settle_once(
-    dual: Dual, labels: Ints1, order: Ints1, room: Floats1, n_of: Ints1, is_stale: Bools1, is_careful: bool
+    dual: Dual,
+    labels: Ints1,
+    order: Ints1,
+    room: Floats1,
+    n_of: Ints1,
+    is_stale: Bools1,
+    is_careful: bool,
 ) -> int:
-    """Let the cells of `order` take the best label of a neighbour one after the other, if that still gains.
+    """Let the cells of `order` take the best label of a neighbour one after the other, if that
+    still gains.
 
     Changed cells and their neighbours are marked in `is_stale`.
     """
@@ -542,12 +663,20 @@ def _settle_once(
 
 @unit
 def keeps_topology(
-    cells: Ints2, across: Ints2, labels: Ints1, star_start: Ints1, star_cells: Ints1, cell: int, label: int
+    cells: Ints2,
+    across: Ints2,
+    labels: Ints1,
+    star_start: Ints1,
+    star_cells: Ints1,
+    cell: int,
+    label: int,
 ) -> bool:
-    """True if a cell may get another label without changing the topology of its own label or the new one.
+    """True if a cell may get another label without changing the topology of its own label or the
+    new one.
 
-    This is a simple point in a complex of simplices: for either label, the cell's contacts with the label's other cells
-    and with everything else including the outside are discs. Pinches are topology, too.
+    This is a simple point in a complex of simplices: for either label, the cell's contacts with the
+    label's other cells and with everything else including the outside are discs. Pinches are
+    topology, too.
     """
     rest = (cells, across, labels, star_start, star_cells, cell)
     old = labels[cell]
@@ -561,13 +690,21 @@ def keeps_topology(
 
 @unit
 def _is_disc(
-    cells: Ints2, across: Ints2, labels: Ints1, star_start: Ints1, star_cells: Ints1, cell: int,
-    label: int, is_of: bool,
-) -> bool:  # fmt: skip
-    """True if a cell's contact with the other cells of a label, or with other labels and the outside, is a disc.
+    cells: Ints2,
+    across: Ints2,
+    labels: Ints1,
+    star_start: Ints1,
+    star_cells: Ints1,
+    cell: int,
+    label: int,
+    is_of: bool,
+) -> bool:
+    """True if a cell's contact with the other cells of a label, or with other labels and the
+    outside, is a disc.
 
-    It is a disc of facets if some but not all facets are shared, and nothing else is. Facets opposite the corners S
-    cover the cell's surface except the faces that contain all of S: only cells around the simplex S share more.
+    It is a disc of facets if some but not all facets are shared, and nothing else is. Facets
+    opposite the corners S cover the cell's surface except the faces that contain all of S: only
+    cells around the simplex S share more.
     """
     n, first, n_shared = cells.shape[1], -1, 0
     is_shared = np.zeros(4, dtype=np.bool_)
@@ -586,7 +723,11 @@ def _is_disc(
         if (labels[other] == label) == is_of:
             return False
         for k in range(n):  # also the outside, beyond a facet that contains all of S
-            if not is_of and across[other, k] < 0 and not _is_opposite(cells, other, k, cell, is_shared):
+            if (
+                not is_of
+                and across[other, k] < 0
+                and not _is_opposite(cells, other, k, cell, is_shared)
+            ):
                 return False
     # The cell's own boundary facets are shared already: none of them contains all of S.
     return True
@@ -611,15 +752,21 @@ def _is_opposite(cells: NDArray, other: int, k: int, cell: int, is_one: NDArray)
 
 
 def _without_fragments(
-    dual: Dual, labels: NDArray[np.int64], is_bridge: NDArray[np.bool_], aim: NDArray[np.float64], voxel: float,
+    dual: Dual,
+    labels: NDArray[np.int64],
+    is_bridge: NDArray[np.bool_],
+    aim: NDArray[np.float64],
+    voxel: float,
     components: list[NDArray],
-) -> int:  # fmt: skip
-    """Bridge or relabel components of cells that no component of voxels justifies; return the number of changed cells.
+) -> int:
+    """Bridge or relabel components of cells that no component of voxels justifies; return the
+    number of changed cells.
 
-    A label's components are ranked by the number of its voxels that they contain. The first stays, and each further one
-    if the component of voxels of the same rank is not far smaller. The others are linked to a component of the same
-    label or, if that costs more than `BRIDGE_RATIO` of the voxels lost otherwise, go to their neighbours cell by cell;
-    those with more than `FRAGMENT_FRACTION` of a label stay apart.
+    A label's components are ranked by the number of its voxels that they contain. The first stays,
+    and each further one if the component of voxels of the same rank is not far smaller. The others
+    are linked to a component of the same label or, if that costs more than `BRIDGE_RATIO` of the
+    voxels lost otherwise, go to their neighbours cell by cell; those with more than
+    `FRAGMENT_FRACTION` of a label stay apart.
     """
     number, of_component = components_of(dual.across, labels)
     cell = np.repeat(np.arange(len(labels)), np.diff(dual.first))
@@ -630,14 +777,20 @@ def _without_fragments(
     most = BRIDGE_RATIO * (content - np.bincount(number, others, len(of_component)))
     order = np.lexsort((np.arange(len(of_component)), -content, of_component))
     rank = np.empty(len(of_component), dtype=np.int64)
-    rank[order] = np.arange(len(of_component)) - np.searchsorted(of_component[order], of_component[order])
+    rank[order] = np.arange(len(of_component)) - np.searchsorted(
+        of_component[order], of_component[order]
+    )
     ranked = zip(of_component, rank, content, strict=True)
     stays = [
-        k == 0 or (k < len(components[p]) and voxel * components[p][k] >= COMPONENT_FRACTION * c) for p, k, c in ranked
+        k == 0 or (k < len(components[p]) and voxel * components[p][k] >= COMPONENT_FRACTION * c)
+        for p, k, c in ranked
     ]
     is_loose, moved = ~np.array(stays)[number], 0
     way, before, bridge = np.full(len(labels), np.inf), np.empty_like(labels), np.empty_like(labels)
-    sorted_cells, n_of = np.argsort(number, kind="stable"), np.bincount(labels, minlength=len(components))
+    sorted_cells, n_of = (
+        np.argsort(number, kind="stable"),
+        np.bincount(labels, minlength=len(components)),
+    )
     start = np.searchsorted(number[sorted_cells], np.arange(len(of_component) + 1))
     for component in order[~np.array(stays)[order]]:
         own = sorted_cells[start[component] : start[component + 1]]
@@ -659,12 +812,19 @@ def _without_fragments(
 
 @entry
 def _bridge(
-    bridge: Ints1, way: Floats1, before: Ints1, dual: Dual, labels: Ints1, component: Ints1, most: float
+    bridge: Ints1,
+    way: Floats1,
+    before: Ints1,
+    dual: Dual,
+    labels: Ints1,
+    component: Ints1,
+    most: float,
 ) -> int:
-    """The cells that link a component to another one of its label at least cost, below `most`, and their number.
+    """The cells that link a component to another one of its label at least cost, below `most`, and
+    their number.
 
-    Dijkstra's shortest path: the cost of a step is that of giving its cell the label, with all others unchanged. `way`
-    is infinite before and after.
+    Dijkstra's shortest path: the cost of a step is that of giving its cell the label, with all
+    others unchanged. `way` is infinite before and after.
     """
     label, end, count = labels[component[0]], -1, 0
     heap = [(0.0, component[0])]
@@ -685,7 +845,9 @@ def _bridge(
             if other < 0:
                 continue
             price = _price(dual, labels, other, label) - _price(dual, labels, other, labels[other])
-            there = so_far + (0.0 if labels[other] == label else max(price, LEAST_GAIN * dual.size[other]))
+            there = so_far + (
+                0.0 if labels[other] == label else max(price, LEAST_GAIN * dual.size[other])
+            )
             if there < way[other] and there < most:
                 way[other], before[other] = there, cell
                 done.append(other)
@@ -703,7 +865,9 @@ def _bridge(
 
 @entry
 def _give_away(dual: Dual, labels: Ints1, is_loose: Bools1) -> int:
-    """Give loose cells the cheapest label among neighbours that are not loose, from the outside in."""
+    """Give loose cells the cheapest label among neighbours that are not loose, from the outside
+    in.
+    """
     total, moved = 0, 1
     while moved > 0:
         moved = 0
@@ -733,13 +897,15 @@ class _Work(NamedTuple):
     star: Ints1  # the cells around one node or edge
     label: Ints1  # the distinct labels of these
     own: Ints1  # index of each cell's label among those
-    beside: Ints2  # positions in the star of the cells beyond facets: its length for the outside, -1 if not in it
+    # positions in the star of the cells beyond facets: its length for the outside, -1 if not in it
+    beside: Ints2
     root: Ints1  # root of each cell in its fan, or of each fan among linked ones
     fan: Ints1  # the fan of each cell, and the outside's
     fan_label: Ints1  # index of each fan's label; -1 for the outside
     is_linked: Bools2  # fans with a common facet
     place: Ints1  # (M,) position of a cell in the star; -1 between calls
-    steps: Ints1  # (N,) steps between labels at facets around the edge from one node to another; 0 between calls
+    # (N,) steps between labels at facets around the edge from one node to another; 0 between calls
+    steps: Ints1
 
 
 class _Marks(NamedTuple):
@@ -754,16 +920,29 @@ def _work(dual: Dual) -> _Work:
     widest = int(np.diff(dual.star_start).max())
     star, label, own, root, fan, fan_label = np.empty((6, widest + 1), dtype=np.int64)
     is_linked = np.empty((widest + 1, widest + 1), dtype=bool)
-    beside, place = np.empty((widest, dual.cells.shape[1]), dtype=np.int64), np.full(len(dual.cells), -1)
+    beside, place = (
+        np.empty((widest, dual.cells.shape[1]), dtype=np.int64),
+        np.full(len(dual.cells), -1),
+    )
     return _Work(
-        star, label, own, beside, root, fan, fan_label, is_linked, place, np.zeros(len(dual.scale), dtype=np.int64)
+        star,
+        label,
+        own,
+        beside,
+        root,
+        fan,
+        fan_label,
+        is_linked,
+        place,
+        np.zeros(len(dual.scale), dtype=np.int64),
     )
 
 
 def _nonmanifold(
     dual: Dual, labels: NDArray[np.int64], is_near: NDArray[np.bool_] | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Edges (a, b) and nodes (a, -1) where a label's interface is not manifold, (F, 2), and a mask of two-label ones.
+    """Edges (a, b) and nodes (a, -1) where a label's interface is not manifold, (F, 2), and a mask
+    of two-label ones.
 
     All of them, or those with a node marked near.
     """
@@ -774,7 +953,9 @@ def _nonmanifold(
         # The largest possible number; unwritten pages take no memory.
         most = stop - first + dual.cells.shape[1] * (dual.star_start[stop] - dual.star_start[first])
         faces = np.empty((most, 3), dtype=np.int64)
-        count = _find_nonmanifold(faces, dual, labels, is_near, is_around[first:stop], first, _work(dual))
+        count = _find_nonmanifold(
+            faces, dual, labels, is_near, is_around[first:stop], first, _work(dual)
+        )
         return faces[:count].copy()
 
     faces = np.concatenate(over_slabs(find, len(is_near), STAR_CELLS * int(is_around.sum())))
@@ -782,13 +963,18 @@ def _nonmanifold(
 
 
 def _mend_near(
-    dual: Dual, labels: NDArray[np.int64], is_bridge: NDArray[np.bool_], bounds: NDArray[np.float64], marks: _Marks
+    dual: Dual,
+    labels: NDArray[np.int64],
+    is_bridge: NDArray[np.bool_],
+    bounds: NDArray[np.float64],
+    marks: _Marks,
 ) -> None:
-    """Mend places that are not manifold and have a node marked near, if that lowers the energy, and those near changes.
+    """Mend places that are not manifold and have a node marked near, if that lowers the energy, and
+    those near changes.
 
-    Bridges stay, and labels keep within the `bounds` of their volumes, (2, K). Afterwards no node is marked near; those
-    with a fault there or at an edge, or near a change, are no longer marked sound; and those remain due where mending
-    may succeed.
+    Bridges stay, and labels keep within the `bounds` of their volumes, (2, K). Afterwards no node
+    is marked near; those with a fault there or at an edge, or near a change, are no longer marked
+    sound; and those remain due where mending may succeed.
     """
     room = _room(dual, labels, bounds)
     while marks.is_near.any():
@@ -800,16 +986,21 @@ def _mend_near(
         _mend(dual, labels, room, is_bridge, faces, False, marks, _work(dual))
 
 
-def _room(dual: Dual, labels: NDArray[np.int64], bounds: NDArray[np.float64]) -> NDArray[np.float64]:
+def _room(
+    dual: Dual, labels: NDArray[np.int64], bounds: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Volumes that labels may lose and gain, (2, K), within the `bounds` of theirs."""
     volume = np.bincount(labels, dual.size, bounds.shape[1])
     return np.stack([volume - bounds[0], bounds[1] - volume])
 
 
 def _mend_pairs(
-    dual: Dual, labels: NDArray[np.int64], bounds: NDArray[np.float64], is_bridge: NDArray[np.bool_],
+    dual: Dual,
+    labels: NDArray[np.int64],
+    bounds: NDArray[np.float64],
+    is_bridge: NDArray[np.bool_],
     has_pairs: bool = False,
-) -> None:  # fmt: skip
+) -> None:
     """Mend the remaining places between two labels, but for bridges; `has_pairs` as of `_mend`."""
     marks = _Marks(*np.zeros((3, len(dual.scale)), dtype=bool))
     for _ in range(MENDING_ROUNDS):
@@ -822,9 +1013,16 @@ def _mend_pairs(
 
 @entry
 def _find_nonmanifold(
-    faces: Ints2, dual: Dual, labels: Ints1, is_near: Bools1, is_around: Bools1, start: int, work: _Work
-) -> int:  # fmt: skip
-    """Write the rows of `_nonmanifold` at nodes from `start`, and the number of labels that meet there, (F, 3).
+    faces: Ints2,
+    dual: Dual,
+    labels: Ints1,
+    is_near: Bools1,
+    is_around: Bools1,
+    start: int,
+    work: _Work,
+) -> int:
+    """Write the rows of `_nonmanifold` at nodes from `start`, and the number of labels that meet
+    there, (F, 3).
 
     Of these nodes, those that `is_around` marks are searched. Return the number of rows.
     """
@@ -869,10 +1067,12 @@ def _around(dual: Dual, is_near: Bools1) -> Bools1:
 
 @helper
 def _count_steps(dual: Dual, labels: NDArray, a: int, steps: NDArray) -> None:
-    """Add to `steps` of each node b the number of facets around the edge (a, b) between labels, from either side.
+    """Add to `steps` of each node b the number of facets around the edge (a, b) between labels,
+    from either side.
 
-    A boundary facet counts once more, a facet between labels that are apart as many as are doubtful. With fewer than
-    `DOUBTFUL_STEPS`, labels are one fan each and need no `_fault`, so that finding faults takes a fifth of the time.
+    A boundary facet counts once more, a facet between labels that are apart as many as are
+    doubtful. With fewer than `DOUBTFUL_STEPS`, labels are one fan each and need no `_fault`, so
+    that finding faults takes a fifth of the time.
     """
     for r in range(dual.star_start[a], dual.star_start[a + 1] if dual.cells.shape[1] == 4 else 0):
         cell = dual.star_cells[r]
@@ -883,12 +1083,16 @@ def _count_steps(dual: Dual, labels: NDArray, a: int, steps: NDArray) -> None:
             is_apart = other >= 0 and dual.contacts.is_apart[labels[cell], labels[other]]
             for m in range(4):
                 if m != k:
-                    steps[dual.cells[cell, m]] += DOUBTFUL_STEPS if is_apart else 2 if other < 0 else 1
+                    steps[dual.cells[cell, m]] += (
+                        DOUBTFUL_STEPS if is_apart else 2 if other < 0 else 1
+                    )
 
 
 @helper
 def _gather(dual: Dual, a: int, b: int, star: NDArray) -> int:
-    """Write the cells around a node, or around an edge if b >= 0, to `star`; return their number."""
+    """Write the cells around a node, or around an edge if b >= 0, to `star`; return their
+    number.
+    """
     count = 0
     for r in range(dual.star_start[a], dual.star_start[a + 1]):
         if b < 0 or has_node(dual.cells, dual.star_cells[r], b):
@@ -899,9 +1103,11 @@ def _gather(dual: Dual, a: int, b: int, star: NDArray) -> int:
 
 @unit
 def _fault(dual: Dual, labels: Ints1, a: int, b: int, work: _Work) -> tuple[float, int]:
-    """Penalty for pinches and false contact at a node or an edge, in volumes of the cells around it.
+    """Penalty for pinches and false contact at a node or an edge, in volumes of the cells around
+    it.
 
-    Also returns the number of labels there; three or more with false contact, which is not a question of manifolds.
+    Also returns the number of labels there; three or more with false contact, which is not a
+    question of manifolds.
     """
     count = _gather(dual, a, b, work.star)
     n_labels = _tell_apart(labels, count, work)
@@ -917,7 +1123,9 @@ def _fault(dual: Dual, labels: Ints1, a: int, b: int, work: _Work) -> tuple[floa
 
 @helper
 def _tell_apart(labels: NDArray, count: int, work: _Work) -> int:
-    """Number of labels of the cells of a star; also store these labels, and the label of each cell."""
+    """Number of labels of the cells of a star; also store these labels, and the label of each
+    cell.
+    """
     n_labels, own = 0, 0
     for i in range(count):
         label = labels[work.star[i]]
@@ -933,10 +1141,13 @@ def _tell_apart(labels: NDArray, count: int, work: _Work) -> int:
 
 
 @helper
-def _excess(dual: Dual, labels: NDArray, a: int, b: int, count: int, n_labels: int, work: _Work) -> int:
+def _excess(
+    dual: Dual, labels: NDArray, a: int, b: int, count: int, n_labels: int, work: _Work
+) -> int:
     """Number of excess fans around a node or an edge, over all labels there.
 
-    For each label, the fans of its cells minus one, plus those of all others including the outside minus one.
+    For each label, the fans of its cells minus one, plus those of all others including the outside
+    minus one.
     """
     steps, n_outer = 0, 0
     for i in range(count if b >= 0 else 0):
@@ -945,7 +1156,8 @@ def _excess(dual: Dual, labels: NDArray, a: int, b: int, count: int, n_labels: i
                 other = dual.across[work.star[i], k]
                 n_outer += other < 0
                 steps += other >= 0 and labels[other] != labels[work.star[i]]
-    if b >= 0 and n_outer <= 2:  # a ring of cells, possibly closed by the outside: each of its arcs is a fan
+    # a ring of cells, possibly closed by the outside: each of its arcs is a fan
+    if b >= 0 and n_outer <= 2:
         return steps + n_outer - 2 * n_labels
     is_open = _link(dual, a, b, count, work)
     n_fans = _join_fans(dual, count, is_open, work)
@@ -959,7 +1171,9 @@ def _excess(dual: Dual, labels: NDArray, a: int, b: int, count: int, n_labels: i
 
 @helper
 def _link(dual: Dual, a: int, b: int, count: int, work: _Work) -> bool:
-    """Store the positions in a star of the cells beyond its facets; return True if one is outside."""
+    """Store the positions in a star of the cells beyond its facets; return True if one is
+    outside.
+    """
     is_open = False
     for i in range(count):
         work.place[work.star[i]] = i
@@ -989,7 +1203,8 @@ def _has_false_contact(dual: Dual, count: int, n_labels: int, work: _Work) -> bo
 
 @helper
 def _join_fans(dual: Dual, count: int, is_open: bool, work: _Work) -> int:
-    """Number of fans of single labels in a star; also store the label of each, and which of them are linked.
+    """Number of fans of single labels in a star; also store the label of each, and which of them
+    are linked.
 
     The outside follows as a further one, without a label.
     """
@@ -1028,7 +1243,9 @@ def _root(root: NDArray, i: int) -> int:
 
 @helper
 def _rest_fans(n_fans: int, own: int, is_open: bool, work: _Work) -> int:
-    """Fans of all that has not a label, including the outside; of the fans that `_join_fans` stored."""
+    """Fans of all that has not a label, including the outside; of the fans that `_join_fans`
+    stored.
+    """
     root, n_linked = work.root, n_fans + 1 if is_open else n_fans
     count = 0
     for p in range(n_linked):
@@ -1044,14 +1261,22 @@ def _rest_fans(n_fans: int, own: int, is_open: bool, work: _Work) -> int:
 
 @entry
 def _mend(
-    dual: Dual, labels: Ints1, room: Floats2, is_bridge: Bools1, faces: Ints2, has_pairs: bool, marks: _Marks,
+    dual: Dual,
+    labels: Ints1,
+    room: Floats2,
+    is_bridge: Bools1,
+    faces: Ints2,
+    has_pairs: bool,
+    marks: _Marks,
     work: _Work,
-) -> None:  # fmt: skip
-    """At each place that is not manifold, make the move that most lowers the energy including pinches.
+) -> None:
+    """At each place that is not manifold, make the move that most lowers the energy including
+    pinches.
 
-    Moves are those of a cell or of a fan and, where none lowers the energy and if `has_pairs`, of two cells.
-    Nodes of changed cells are marked near, and no longer sound. Nodes are marked due whose places may be mended later:
-    those with a cell that has a node of a changed one, or that a label's room kept.
+    Moves are those of a cell or of a fan and, where none lowers the energy and if `has_pairs`, of
+    two cells. Nodes of changed cells are marked near, and no longer sound. Nodes are marked due
+    whose places may be mended later: those with a cell that has a node of a changed one, or that a
+    label's room kept.
     """
     star, group = np.empty_like(work.star), np.empty_like(work.star)
     for f in range(len(faces)):
@@ -1073,7 +1298,9 @@ def _mend(
             can_grow = room[1] >= volume
             for cell in star[:count]:
                 marks.is_due[a] = marks.is_due[a] or not can_grow[labels[cell]]
-            new, change = _best_of_group(dual, labels, group[:size], star[:count], best, can_grow, marks, work)
+            new, change = _best_of_group(
+                dual, labels, group[:size], star[:count], best, can_grow, marks, work
+            )
             if new >= 0:
                 best, best_from, best_label = change, i, new
         if best_from >= 0:
@@ -1094,7 +1321,9 @@ def _mend(
 
 @unit
 def _group(dual: Dual, labels: Ints1, a: int, b: int, star: Ints1, i: int, group: Ints1) -> int:
-    """Cells that may change together: cell i of a star, for larger i the fan of one label that starts there, or two."""
+    """Cells that may change together: cell i of a star, for larger i the fan of one label that
+    starts there, or two.
+    """
     if i < len(star):
         group[0] = star[i]
         return 1
@@ -1124,7 +1353,14 @@ def _group(dual: Dual, labels: Ints1, a: int, b: int, star: Ints1, i: int, group
 
 @unit
 def _best_of_group(
-    dual: Dual, labels: Ints1, group: Ints1, star: Ints1, least: float, can_grow: Bools1, marks: _Marks, work: _Work
+    dual: Dual,
+    labels: Ints1,
+    group: Ints1,
+    star: Ints1,
+    least: float,
+    can_grow: Bools1,
+    marks: _Marks,
+    work: _Work,
 ) -> tuple[int, float]:
     """The label in the star that may grow and lowers the energy most for the group, and the change.
 
@@ -1143,7 +1379,10 @@ def _best_of_group(
             faces = _closure(dual, group)
             before, pinches = _prices(dual, labels, group), 0.0
             for f in range(len(faces)):
-                if not (marks.is_sound[faces[f, 0]] or (faces[f, 1] >= 0 and marks.is_sound[faces[f, 1]])):
+                if not (
+                    marks.is_sound[faces[f, 0]]
+                    or (faces[f, 1] >= 0 and marks.is_sound[faces[f, 1]])
+                ):
                     pinches += _pinches(dual, labels, faces[f : f + 1], 0.0, np.inf, work)
         for cell in group:
             labels[cell] = new
@@ -1196,8 +1435,12 @@ def _prices(dual: Dual, labels: NDArray, group: NDArray) -> float:
 
 
 @unit
-def _pinches(dual: Dual, labels: Ints1, faces: Ints2, others: float, most: float, work: _Work) -> float:
-    """Penalty of these nodes and edges if not manifold; a lower bound once it and the others' reach `most`."""
+def _pinches(
+    dual: Dual, labels: Ints1, faces: Ints2, others: float, most: float, work: _Work
+) -> float:
+    """Penalty of these nodes and edges if not manifold; a lower bound once it and the others'
+    reach `most`.
+    """
     total = 0.0
     for f in range(len(faces)):
         total += _fault(dual, labels, faces[f, 0], faces[f, 1], work)[0] * dual.scale[faces[f, 0]]

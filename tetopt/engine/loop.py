@@ -1,4 +1,6 @@
-"""Common parts of both engines: history and clock of a run, and the freedom and movement of nodes."""
+"""Common parts of both engines: history and clock of a run, and the freedom and movement of
+nodes.
+"""
 
 from __future__ import annotations
 
@@ -20,25 +22,32 @@ from tetopt.image import Image, transformed
 from tetopt.interop import notebook
 from tetopt.mesh import Mesh
 
-# The defaults of all entry points, with their evidence (docs/measured/sizes.md, docs/understand/k_d.md).
+# The defaults of all entry points, with their evidence (docs/measured/sizes.md,
+# docs/understand/k_d.md).
 DEFAULT_NODES = {2: 500, 3: 5000}  # by dimension; a graded mesh of a small image has fewer
-CUT_SHORT = ("stopped", "max_seconds", "max_gb")  # runs that ended before their last iteration, not converged
+# runs that ended before their last iteration, not converged
+CUT_SHORT = ("stopped", "max_seconds", "max_gb")
 TARGET_NODES_MAX = 50_000  # for a target error, by default
-UNIFORM_K_D = 0.2  # nearly all of the image's benefit for the displacement, at hardly any cost in shape
+# nearly all of the image's benefit for the displacement, at hardly any cost in shape
+UNIFORM_K_D = 0.2
 UNIFORM_ITERATIONS = 20  # sweeps over all nodes, as in the paper's figures
-GRADED_K_D = 0.85  # on the MNI152 T1 with 15,000 nodes: a third of the uniform mesh's E_D, mean rho 0.255
+# on the MNI152 T1 with 15,000 nodes: a third of the uniform mesh's E_D, mean rho 0.255
+GRADED_K_D = 0.85
 GRADED_ITERATIONS = 16  # sweeps; four more would lower E_D by 2 % there
-# A mesh that follows the image already has a small initial E_D. With 0.02 pytetwild's meshes of MNI152 and of a CT
-# improve in E_D, mean and 1st percentile of rho and smallest angle; with 0.05 MNI152's 165 slivers become 552.
+# A mesh that follows the image already has a small initial E_D. With 0.02 pytetwild's meshes of
+# MNI152 and of a CT improve in E_D, mean and 1st percentile of rho and smallest angle; with 0.05
+# MNI152's 165 slivers become 552.
 START_K_D = 0.02
 SHAPE_POWER = 3.0  # p: from 3 the energy itself keeps angles above the minimum at the uniform k_D
 MIN_DIHEDRAL = 12.0  # degrees: the smallest dihedral angle of a cell
-# Longest edge over a uniform mesh's for cells of order 2 (docs/understand/order.md): there are seven times fewer cells,
-# and the displacement suffers sooner from large ones where the image is uniform.
+# Longest edge over a uniform mesh's for cells of order 2 (docs/understand/order.md): there are
+# seven times fewer cells, and the displacement suffers sooner from large ones where the image is
+# uniform.
 QUADRATIC_RATIO = 1.15
-QUADRATIC_GRADATION = 0.5  # of sizes, also for order 2: gentler changes lower errors of displacement and interfaces
-# Time for lifting flat cells after the time limit: a fraction of the run's time, and at least this. Without the bound
-# slabs of 575 voxels took 27 to 200 s for a limit of one.
+# of sizes, also for order 2: gentler changes lower errors of displacement and interfaces
+QUADRATIC_GRADATION = 0.5
+# Time for lifting flat cells after the time limit: a fraction of the run's time, and at least this.
+# Without the bound slabs of 575 voxels took 27 to 200 s for a limit of one.
 GRACE_FRACTION, GRACE_SECONDS = 0.1, 0.5
 E_D_ROUNDING = 1e-12  # of the image's variance x volume: a smaller E_D is rounding
 
@@ -90,7 +99,9 @@ class IterationRecord(NamedTuple):
 
 
 class Whole(NamedTuple):
-    """Properties of the whole mesh for a part: the part's position, and the whole's normalisation."""
+    """Properties of the whole mesh for a part: the part's position, and the whole's
+    normalisation.
+    """
 
     start: tuple[int, ...]  # first voxel of the part's image in the whole image, by axis
     shape: tuple[int, ...]  # shape of the whole image
@@ -122,13 +133,16 @@ class MeshingResult(NamedTuple):
     labels : (M,) int64, optional
         Label of each cell, for a content with memberships.
     violated : mapping of str to str
-        Requirements that the mesh violates, by name, one sentence each (`tetopt.engine.requirements`); empty if none.
+        Requirements that the mesh violates, by name, one sentence each
+        (`tetopt.engine.requirements`); empty if none.
     fraction : float, optional
-        Unexplained fraction of the content's variance: E_D over variance times volume. Only from `mesh_image`.
+        Unexplained fraction of the content's variance: E_D over variance times volume. Only from
+        `mesh_image`.
     n_dropped : int
         Connected components that were dropped, since the mask does not have them.
     curving : Curving, optional
-        For order 2 with a mask or smooth labels: numbers of edges with their mid-edge node on the smooth level.
+        For order 2 with a mask or smooth labels: numbers of edges with their mid-edge node on the
+        smooth level.
     dropped : mapping of int to float
         Volume of the dropped components by label, mm^n; all of label 0 without labels.
     content : Content, optional
@@ -163,10 +177,11 @@ class MeshingResult(NamedTuple):
     order: int = 1
 
     def plot(self, values: ArrayLike | None = None, **options: Any) -> Any:
-        """Show the mesh in 3-D with pyvista, like `Mesh.plot`; by default in the colours of its labels, if any.
+        """Show the mesh in 3-D with pyvista, like `Mesh.plot`; by default in the colours of its
+        labels, if any.
 
-        A label has the colour of its number, as in all pictures and files; ``plot(result.labels, cmap="tab20")`` uses a
-        colour map instead.
+        A label has the colour of its number, as in all pictures and files; ``plot(result.labels,
+        cmap="tab20")`` uses a colour map instead.
 
         Parameters
         ----------
@@ -198,19 +213,29 @@ class MeshingResult(NamedTuple):
     def _repr_html_(self) -> str:
         """Numbers of the run and of its mesh, with the middle section, for a notebook."""
         last, mesh = self.history[-1], self.mesh
-        fraction = "" if self.fraction is None else f", {self.fraction:.4g} of the variance is unexplained"
+        fraction = (
+            "" if self.fraction is None else f", {self.fraction:.4g} of the variance is unexplained"
+        )
         rows = [
-            ("E", f"{last.E:.4g} of the initial mesh's, after {last.iteration} iterations ({self.ended})"),
+            (
+                "E",
+                f"{last.E:.4g} of the initial mesh's, after {last.iteration} iterations "
+                f"({self.ended})",
+            ),
             ("E_D", f"{last.E_D:.4g} intensity^2 mm^{mesh.ndim}{fraction}"),
             ("time", f"{self.seconds_start + (self.seconds_run or last.seconds):.1f} s"),
             *notebook.mesh_rows(mesh.points, mesh.cells),
             *(("violates", f"{name}: {words}") for name, words in self.violated.items()),
         ]
         pieces = mesh.straight_pieces()[0]
-        return notebook.card_html("MeshingResult", rows, notebook.section_html(pieces.points, pieces.cells))
+        return notebook.card_html(
+            "MeshingResult", rows, notebook.section_html(pieces.points, pieces.cells)
+        )
 
 
-def deadline(begin: float, max_seconds: float | None, stop: Callable[[], bool] | None) -> Callable[[], bool]:
+def deadline(
+    begin: float, max_seconds: float | None, stop: Callable[[], bool] | None
+) -> Callable[[], bool]:
     """Make a function that returns True once the time is over or `stop` returns True."""
 
     def is_over() -> bool:
@@ -222,28 +247,36 @@ def deadline(begin: float, max_seconds: float | None, stop: Callable[[], bool] |
 
 
 def grace(begin: float, is_over: Callable[[], bool]) -> Callable[[], bool]:
-    """Make a function that returns True a tenth of a run's time, or half a second, after the run was over."""
+    """Make a function that returns True a tenth of a run's time, or half a second, after the run
+    was over.
+    """
     ended: list[float] = []
 
     def is_late() -> bool:
         now = time.perf_counter()
         if not ended and is_over():
             ended.append(now)
-        return bool(ended) and now - ended[0] > max(GRACE_SECONDS, GRACE_FRACTION * (ended[0] - begin))
+        return bool(ended) and now - ended[0] > max(
+            GRACE_SECONDS, GRACE_FRACTION * (ended[0] - begin)
+        )
 
     return is_late
 
 
 def frozen_axes(
-    ticks: NDArray[np.int64], facets_out: NDArray[np.int64], sides: NDArray[np.int64], boundary: Boundary,
+    ticks: NDArray[np.int64],
+    facets_out: NDArray[np.int64],
+    sides: NDArray[np.int64],
+    boundary: Boundary,
     has_surface: bool,
-) -> NDArray[np.bool_]:  # fmt: skip
-    """Index axes along which each node must stay, (N, 4) bool; the leading axis of a 2-D image counts as free.
+) -> NDArray[np.bool_]:
+    """Index axes along which each node must stay, (N, 4) bool; the leading axis of a 2-D image
+    counts as free.
 
-    A node on a face of the box, index -0.5 or shape - 0.5, keeps its coordinate across it. A node of a boundary
-    facet off the box's faces keeps all coordinates, like every boundary node with "fixed"; with a surface on which such
-    nodes slide, it is marked in the last column instead. `facets_out` (B, n) are the boundary's facets, `sides` (3, 2)
-    the box's sides, in ticks.
+    A node on a face of the box, index -0.5 or shape - 0.5, keeps its coordinate across it. A node
+    of a boundary facet off the box's faces keeps all coordinates, like every boundary node with
+    "fixed"; with a surface on which such nodes slide, it is marked in the last column instead.
+    `facets_out` (B, n) are the boundary's facets, `sides` (3, 2) the box's sides, in ticks.
     """
     is_frozen = np.zeros((len(ticks), 4), dtype=bool)
     if boundary == "fixed":
@@ -268,15 +301,20 @@ def check_common_options(k_D: float, iterations: int, boundary: str) -> None:
 
 
 def side_ticks(grid: SamplingGrid, whole: Whole | None = None) -> NDArray[np.int64]:
-    """`tetopt.geometry.box.box_sides` in ticks, (3, 2), which are whole numbers; a slice is one voxel thick.
+    """`tetopt.geometry.box.box_sides` in ticks, (3, 2), which are whole numbers; a slice is one
+    voxel thick.
 
     With `whole`, the sides of its box in the part's ticks.
     """
     half = 1 << (grid.bits - 1)
     if whole is None:
-        return np.array([(-half, (size << grid.bits) - half) for size in grid.shape], dtype=np.int64)
+        return np.array(
+            [(-half, (size << grid.bits) - half) for size in grid.shape], dtype=np.int64
+        )
     low = -np.array(whole.start, dtype=np.int64) << grid.bits
-    sides = np.column_stack([low - half, low + (np.array(whole.shape, dtype=np.int64) << grid.bits) - half])
+    sides = np.column_stack(
+        [low - half, low + (np.array(whole.shape, dtype=np.int64) << grid.bits) - half]
+    )
     return sides if len(sides) == 3 else np.vstack([[(-half, half)], sides])
 
 
@@ -287,7 +325,9 @@ def relative_movement(
     grid: SamplingGrid,
     matrix: NDArray[np.float64],
 ) -> float:
-    """|x^t - x^(t-1)| / |x^(t-1)| over all nodes, in mm, with x from the box's centre; Fig. 1(c)."""
+    """|x^t - x^(t-1)| / |x^(t-1)| over all nodes, in mm, with x from the box's centre; Fig.
+    1(c).
+    """
     centre = np.array([(s - 1) * 0.5 for s in grid.shape]) * 2.0**grid.bits
     moved = transformed((after - before).astype(np.float64), matrix)
     place = transformed(before - centre, matrix)

@@ -56,13 +56,21 @@ from tetopt.start.carve import carved, part_of
 from tetopt.start.clip import lattice_within
 from tetopt.start.label_sizes import SizesByLabel, sizes_by_label
 from tetopt.start.memory import LABEL_BYTES, PROCESS_BYTES, READ_BYTES, REGION_BYTES, bytes_of
-from tetopt.start.octree import is_near, nearest_octree, nodes_for_walls, nodes_of_sizes, octree_mesh
+from tetopt.start.octree import (
+    is_near,
+    nearest_octree,
+    nodes_for_walls,
+    nodes_of_sizes,
+    octree_mesh,
+)
 from tetopt.start.sizes import Sizes
 from tetopt.system.budget import at_most, check_memory
 
 Mode = Literal["graded", "uniform", "paper", "start"]
-EarlierRuns = list[tuple[NDArray, int, int]]  # points of the initial mesh, and nodes requested and reached
-Run = Callable[..., MeshingResult]  # an optimisation ready to start; takes further options of `optimize`
+# points of the initial mesh, and nodes requested and reached
+EarlierRuns = list[tuple[NDArray, int, int]]
+# an optimisation ready to start; takes further options of `optimize`
+Run = Callable[..., MeshingResult]
 
 
 class ModeDefaults(NamedTuple):
@@ -87,11 +95,14 @@ MODE_ARGUMENTS: dict[Mode, tuple[str, ...]] = {  # arguments that determine the 
 }
 # In the order in which they are checked.
 AIM_NAMES = ("nodes", "target_error", "nodes_max", "spacing", "kind", "start", "sizes")
-QUADRATIC_NODES = {2: 3.9, 3: 7.2}  # nodes of order 2 per corner, by dimension, in graded meshes of the MNI152 T1
+# nodes of order 2 per corner, by dimension, in graded meshes of the MNI152 T1
+QUADRATIC_NODES = {2: 3.9, 3: 7.2}
 NODES_NEAR = 0.01  # of the number of nodes of order 2: a run this near is accepted
 NODE_RUNS = 3  # towards a number of nodes of order 2, at most; the second usually meets it
-FIRST_NODES = {2: 200, 3: 1500}  # in the first run towards an error, by dimension: few enough to take hardly any time
-SIZES_MET = 0.9  # of the nodes of equilateral cells: targets are met down to these (docs/understand/sizes.md)
+# in the first run towards an error, by dimension: few enough to take hardly any time
+FIRST_NODES = {2: 200, 3: 1500}
+# of the nodes of equilateral cells: targets are met down to these (docs/understand/sizes.md)
+SIZES_MET = 0.9
 RATE_LIMITS = (0.3, 1.0)  # of a measured `ERROR_RATE`
 ERROR_RUNS = 6  # towards an error, at most
 SHORTEST_SECONDS = 1e-9  # of a run for which the initial mesh leaves no time
@@ -115,37 +126,44 @@ def mesh_image(
     iterations: int | None = None,
     **options: Any,
 ) -> MeshingResult:
-    """Mesh an image's box with nodes where the image has detail; or make a uniform mesh, or improve yours.
+    """Mesh an image's box with nodes where the image has detail; or make a uniform mesh, or improve
+    yours.
 
     Parameters
     ----------
     image : Image or Content
-        The intensities h; or a content with several contrasts, weights, labels and a mask (`tetopt.content`).
+        The intensities h; or a content with several contrasts, weights, labels and a mask
+        (`tetopt.content`).
     nodes : int
-        Number of nodes, for order 2 including mid-edge nodes; by default as for `tetopt mesh`: what `sizes` require, or
-        5000 (500 in 2-D), fewer for a small image. A graded mesh meets it (to 1 % for order 2) unless the run is cut
-        short, k_D is 0, cells must be lifted above the minimum dihedral angle, or no more nodes can be removed.
+        Number of nodes, for order 2 including mid-edge nodes; by default as for `tetopt mesh`: what
+        `sizes` require, or 5000 (500 in 2-D), fewer for a small image. A graded mesh meets it (to 1
+        % for order 2) unless the run is cut short, k_D is 0, cells must be lifted above the minimum
+        dihedral angle, or no more nodes can be removed.
     labels : Image
         Whole numbers from 0 on the same voxels: each cell gets one. 0 is a label like the others.
     mask : Image
         0 to 1 on the same voxels: the region to mesh.
     target_error : float
-        Instead of `nodes`, for a graded mesh: the unexplained fraction of the image's variance, 0 to 1. A few runs find
-        the required number of nodes. `violated` reports a run that ends above the target.
+        Instead of `nodes`, for a graded mesh: the unexplained fraction of the image's variance, 0
+        to 1. A few runs find the required number of nodes. `violated` reports a run that ends above
+        the target.
     nodes_max : int
-        With `target_error`, the most nodes to request, for order 2 including mid-edge nodes; by default 50,000. If the
-        target takes more, the mesh has these, and `violated` states the error that they reach.
+        With `target_error`, the most nodes to request, for order 2 including mid-edge nodes; by
+        default 50,000. If the target takes more, the mesh has these, and `violated` states the
+        error that they reach.
     sizes : Sizes
-        Targets and limits for the edges of a graded mesh's cells; by default up to 1.4 times a uniform mesh's, with
-        order 2 up to 1.15 times with a gradation of 0.5.
+        Targets and limits for the edges of a graded mesh's cells; by default up to 1.4 times a
+        uniform mesh's, with order 2 up to 1.15 times with a gradation of 0.5.
     order : {1, 2}
-        Intended order of the cells (`tetopt.geometry.quadratic`). With 2, `nodes` includes mid-edge nodes: about a
-        seventh of the nodes are corners (a quarter in 2-D), whose number takes up to three runs to find. With a mask or
-        smooth labels, the result's mesh has `midpoints`: mid-edge nodes on the smooth surfaces (see `curving`).
+        Intended order of the cells (`tetopt.geometry.quadratic`). With 2, `nodes` includes mid-edge
+        nodes: about a seventh of the nodes are corners (a quarter in 2-D), whose number takes up to
+        three runs to find. With a mask or smooth labels, the result's mesh has `midpoints`:
+        mid-edge nodes on the smooth surfaces (see `curving`).
     mode : {"graded", "uniform", "paper", "start"}
-        "graded", the default: `octree_mesh`, then `optimize` with exchanges of nodes. "uniform": `lattice_mesh`,
-        clipped at a mask, then `optimize`. "paper": `lattice_mesh`, then `optimize_paper`, for a single image without
-        labels or mask. "start", the default if `start` is given: `optimize` on that mesh.
+        "graded", the default: `octree_mesh`, then `optimize` with exchanges of nodes. "uniform":
+        `lattice_mesh`, clipped at a mask, then `optimize`. "paper": `lattice_mesh`, then
+        `optimize_paper`, for a single image without labels or mask. "start", the default if `start`
+        is given: `optimize` on that mesh.
     start : Mesh
         The mesh to improve. Its boundary stays unchanged, unless `boundary="slide"`.
     spacing : float
@@ -153,28 +171,32 @@ def mesh_image(
     kind : str
         Kind of lattice, as for `tetopt.lattice_mesh`.
     k_D : float
-        Weight of the image; by default 0.85 for a graded mesh, 0.2 for a uniform one, 0.02 with `start`. On a graded
-        mesh, cells of all sizes share the shape energy, and the octree that normalises E_D already has a small E_D, so
-        larger weights than on a uniform mesh are usual.
+        Weight of the image; by default 0.85 for a graded mesh, 0.2 for a uniform one, 0.02 with
+        `start`. On a graded mesh, cells of all sizes share the shape energy, and the octree that
+        normalises E_D already has a small E_D, so larger weights than on a uniform mesh are usual.
     iterations : int
-        As for `optimize`, by default 16 for a graded mesh, else 20; nodes are exchanged in the first 0.7 of them.
+        As for `optimize`, by default 16 for a graded mesh, else 20; nodes are exchanged in the
+        first 0.7 of them.
     **options
-        Further options of `optimize` or `optimize_paper`. `max_seconds` counts from the call, over all runs.
+        Further options of `optimize` or `optimize_paper`. `max_seconds` counts from the call, over
+        all runs.
 
     Returns
     -------
     MeshingResult
-        As for `optimize`; its first record is that of the initial mesh, which it contains, too. A run that does not
-        meet all requirements still returns its mesh, and `violated` has a sentence for each violated one, by name
-        (`min_dihedral`, `box`, `cover`, `overlap`, `mask`, `labels`, `error`; see `tetopt.engine.requirements`).
+        As for `optimize`; its first record is that of the initial mesh, which it contains, too. A
+        run that does not meet all requirements still returns its mesh, and `violated` has a
+        sentence for each violated one, by name (`min_dihedral`, `box`, `cover`, `overlap`, `mask`,
+        `labels`, `error`; see `tetopt.engine.requirements`).
 
     Raises
     ------
     InputError
-        As for `optimize` or `optimize_paper`; options that do not apply to the mode; both of `nodes` and
-        `target_error`, or of `nodes` and `spacing`; `nodes_max` without `target_error`, or below what sizes require;
-        labels or a mask beside a content; a number of nodes that exceeds the image's detail (see `octree_mesh`) or the
-        memory; or an error below the image's noise.
+        As for `optimize` or `optimize_paper`; options that do not apply to the mode; both of
+        `nodes` and `target_error`, or of `nodes` and `spacing`; `nodes_max` without `target_error`,
+        or below what sizes require; labels or a mask beside a content; a number of nodes that
+        exceeds the image's detail (see `octree_mesh`) or the memory; or an error below the image's
+        noise.
     TypeError
         An unknown option.
 
@@ -206,7 +228,10 @@ def mesh_image(
     """
     if labels is not None or mask is not None:
         if isinstance(image, Content):
-            raise InputError("mesh_image: give labels and mask to tetopt.content, or an image instead of a content")
+            raise InputError(
+                "mesh_image: give labels and mask to tetopt.content, or an image instead of a "
+                "content"
+            )
         image = make_content(image, labels, mask)
     image = plain(image)
     aim = Aim(nodes, target_error, sizes, order, mode, start, spacing, kind, nodes_max)
@@ -238,12 +263,15 @@ class Attempt(NamedTuple):
     predicted: int | None = None
 
 
-Search = Generator[Attempt, None, MeshingResult]  # yields attempts, and returns the result that counts
-Attempted = Callable[..., Search]  # one attempt, with the number of nodes that exchanges lead to, and that predicted
+# yields attempts, and returns the result that counts
+Search = Generator[Attempt, None, MeshingResult]
+# one attempt, with the number of nodes that exchanges lead to, and that predicted
+Attempted = Callable[..., Search]
 
 
 class MeshSearch:
-    """The runs that lead to a mesh: iterate over the attempts, and `tell` the result of each; then take the `result`.
+    """The runs that lead to a mesh: iterate over the attempts, and `tell` the result of each; then
+    take the `result`.
 
     Parameters are those of `mesh_image`, which raises the same errors.
     """
@@ -260,9 +288,18 @@ class MeshSearch:
         _check_aim(content, aim)
         if mode == "graded" and aim.sizes is not None:
             aim = aim._replace(sizes=with_label_sizes(aim.sizes, content, aim.nodes, aim.order)[0])
-        if aim.nodes is None and aim.target_error is None and aim.spacing is None and mode != "start":
+        if (
+            aim.nodes is None
+            and aim.target_error is None
+            and aim.spacing is None
+            and mode != "start"
+        ):
             is_graded = mode == "graded"
-            nodes = default_nodes(content, aim.sizes, aim.order) if is_graded else DEFAULT_NODES[content.image.ndim]
+            nodes = (
+                default_nodes(content, aim.sizes, aim.order)
+                if is_graded
+                else DEFAULT_NODES[content.image.ndim]
+            )
             aim = aim._replace(nodes=nodes)
         if aim.target_error is not None and aim.nodes_max is None:
             aim = aim._replace(nodes_max=TARGET_NODES_MAX)
@@ -290,16 +327,23 @@ class MeshSearch:
         return _with_dropped(self._told, n_dropped, dropped)._replace(initial=initial, nodes=nodes)
 
     def _carved(self, initial: Mesh) -> tuple[Mesh, int, Counter[int]]:
-        """Carve an initial mesh within a mask; also return the number and volumes of dropped components."""
+        """Carve an initial mesh within a mask; also return the number and volumes of dropped
+        components.
+        """
         content = self._content
         if content.region is None or self._aim.mode == "start":
             return initial, 0, Counter()
-        carving = carved(initial, content.image, content.region, content.keeps_components, content.memberships)
+        carving = carved(
+            initial, content.image, content.region, content.keeps_components, content.memberships
+        )
         return part_of(initial, carving.is_kept), carving.n_dropped, Counter(carving.volumes)
 
     def _optimised(self, initial: Mesh, nodes: int | None, **more: Any) -> MeshingResult:
         """Optimise an initial mesh with further options."""
-        options, mode = self._options | _time_left(self._options, self._begin) | more, self._aim.mode
+        options, mode = (
+            self._options | _time_left(self._options, self._begin) | more,
+            self._aim.mode,
+        )
         if mode == "paper":
             return optimize_paper(self._content.image, initial, **options)
         exchanged = nodes if mode == "graded" else None
@@ -310,7 +354,12 @@ class MeshSearch:
         content, aim = self._content, self._aim
         is_filled = aim.mode != "start" and content.region is None
         result = requested(result, content, aim.target_error, is_filled)
-        if aim.mode == "graded" and aim.order == 1 and aim.nodes is not None and result.ended not in CUT_SHORT:
+        if (
+            aim.mode == "graded"
+            and aim.order == 1
+            and aim.nodes is not None
+            and result.ended not in CUT_SHORT
+        ):
             result = _with_nodes_for_walls(result, content, aim.nodes, aim.sizes)
         if aim.order == 2:
             mesh, curving = curved(result.mesh, content, result.labels)
@@ -333,13 +382,19 @@ def _searched(content: Content, aim: Aim, attempted: Attempted) -> Search:
 def _initial(content: Content, aim: Aim, corners: int | None) -> Mesh:
     """Build the initial mesh with a number of corners."""
     if aim.mode == "graded":
-        # The longest edge of order 2 may allow no octree with so few corners: exchanges remove as many as they can.
+        # The longest edge of order 2 may allow no octree with so few corners: exchanges remove as
+        # many as they can.
         return (octree_mesh if aim.order == 1 else nearest_octree)(content, corners or 0, aim.sizes)
-    return lattice_within(content.image, content.region, aim.kind, nodes=corners, spacing=aim.spacing)
+    return lattice_within(
+        content.image, content.region, aim.kind, nodes=corners, spacing=aim.spacing
+    )
 
 
-def _with_nodes_for_walls(result: MeshingResult, content: Content, nodes: int, sizes: Sizes | None) -> MeshingResult:
-    """Add the number of nodes that would keep a mask's walls to violated requirements, if the initial mesh lost some.
+def _with_nodes_for_walls(
+    result: MeshingResult, content: Content, nodes: int, sizes: Sizes | None
+) -> MeshingResult:
+    """Add the number of nodes that would keep a mask's walls to violated requirements, if the
+    initial mesh lost some.
 
     Both requirements end in the advice to allow more nodes.
     """
@@ -352,19 +407,27 @@ def _with_nodes_for_walls(result: MeshingResult, content: Content, nodes: int, s
 
 
 def _time_left(options: dict[str, Any], begin: float) -> dict[str, float]:
-    """The remaining `max_seconds` for a run, if time is limited, out of that for all runs and initial meshes."""
+    """The remaining `max_seconds` for a run, if time is limited, out of that for all runs and
+    initial meshes.
+    """
     if options.get("max_seconds") is None:
         return {}
-    return {"max_seconds": max(options["max_seconds"] - (time.perf_counter() - begin), SHORTEST_SECONDS)}
+    return {
+        "max_seconds": max(options["max_seconds"] - (time.perf_counter() - begin), SHORTEST_SECONDS)
+    }
 
 
 def _with_dropped(result: MeshingResult, number: int, by_label: Counter[int]) -> MeshingResult:
     """Add components dropped from the initial mesh to those that a run dropped."""
-    return result._replace(n_dropped=number + result.n_dropped, dropped=by_label + Counter(result.dropped))
+    return result._replace(
+        n_dropped=number + result.n_dropped, dropped=by_label + Counter(result.dropped)
+    )
 
 
 def process_bytes(content: Content, nodes: int) -> float:
-    """Memory of a whole process that reads the files of a content and meshes it with `nodes` nodes."""
+    """Memory of a whole process that reads the files of a content and meshes it with `nodes`
+    nodes.
+    """
     of_voxel = READ_BYTES
     of_voxel += 0.0 if content.region is None else REGION_BYTES
     of_voxel += 0.0 if content.memberships is None else LABEL_BYTES
@@ -374,27 +437,39 @@ def process_bytes(content: Content, nodes: int) -> float:
 def check_target_error(target_error: float) -> None:
     """Raise InputError unless the target error is a fraction."""
     if not 0.0 < target_error < 1.0:
-        raise InputError(f"target_error: expected a fraction of the image's variance, 0 to 1, got {target_error}")
+        raise InputError(
+            f"target_error: expected a fraction of the image's variance, 0 to 1, got {target_error}"
+        )
 
 
 def check_memory_of(content: Content, nodes: int, limit: float | None = None) -> None:
     """Raise InputError for more nodes than fit into memory, or into `limit` bytes in total."""
     shape = " x ".join(map(str, content.image.shape))
-    what = f"an image of {shape} voxels" + (f" of {content.n_channels} channels" if content.n_channels > 1 else "")
+    what = f"an image of {shape} voxels" + (
+        f" of {content.n_channels} channels" if content.n_channels > 1 else ""
+    )
     bare, need = bytes_of(content, 0), bytes_of(content, nodes)
     check_memory(bare, what, "mesh a part of it (`crop`), or raise the memory limit", limit)
     each = (need - bare) / max(nodes, 1) or 1.0
-    check_memory(need, f"{nodes} nodes on {what}", lambda room: at_most((room - bare) / each, "nodes"), limit)
+    check_memory(
+        need, f"{nodes} nodes on {what}", lambda room: at_most((room - bare) / each, "nodes"), limit
+    )
 
 
 def _with_defaults(mode: Mode, options: dict[str, Any]) -> dict[str, Any]:
-    """The options of an optimisation; the defaults of the mode for those that are None or missing."""
+    """The options of an optimisation; the defaults of the mode for those that are None or
+    missing.
+    """
     defaults = MODE_DEFAULTS[mode]._asdict()
-    return defaults | {name: each for name, each in options.items() if each is not None or name not in defaults}
+    return defaults | {
+        name: each for name, each in options.items() if each is not None or name not in defaults
+    }
 
 
 def _check_names(options: dict[str, Any], optimisation: Run) -> None:
-    """Raise TypeError, like Python's own calls, for options unknown to `mesh_image` and the optimisation."""
+    """Raise TypeError, like Python's own calls, for options unknown to `mesh_image` and the
+    optimisation.
+    """
     known = inspect.signature(optimisation).parameters
     for name in options:
         if name not in known:
@@ -409,7 +484,8 @@ def nodes_per_corner(ndim: int, order: int) -> float:
 
 
 def default_nodes(content: Content, sizes: Sizes | None, order: int) -> int:
-    """Number of nodes, including mid-edge ones for order 2, that targets require, and elsewhere a part of the usual.
+    """Number of nodes, including mid-edge ones for order 2, that targets require, and elsewhere a
+    part of the usual.
 
     The usual number is `DEFAULT_NODES`, or one per eight voxels of a small image.
     """
@@ -431,7 +507,11 @@ def with_label_sizes(
     """
     many = nodes_per_corner(content.image.ndim, order)
     made = sizes_by_label(sizes, content, None if nodes is None else round(nodes / many))
-    return (sizes, None) if made is None else (made.sizes, made._replace(nodes=round(many * made.nodes)))
+    return (
+        (sizes, None)
+        if made is None
+        else (made.sizes, made._replace(nodes=round(many * made.nodes)))
+    )
 
 
 def _check_aim(content: Content, aim: Aim) -> None:
@@ -449,10 +529,16 @@ def _check_aim(content: Content, aim: Aim) -> None:
         raise InputError("mesh_image: give only one of nodes and target_error")
     if aim.nodes_max is not None:
         if aim.target_error is None:
-            raise InputError("mesh_image: nodes_max needs target_error; without it, give the number of nodes itself")
+            raise InputError(
+                "mesh_image: nodes_max needs target_error; without it, give the number of nodes "
+                "itself"
+            )
         fewest = ceil(nodes_per_corner(ndim, order) * (2**ndim + 1))
         if not (isinstance(aim.nodes_max, int | np.integer) and aim.nodes_max >= fewest):
-            raise InputError(f"nodes_max: expected a whole number, {fewest} or more in {ndim}-D, got {aim.nodes_max!r}")
+            raise InputError(
+                f"nodes_max: expected a whole number, {fewest} or more in {ndim}-D, got "
+                f"{aim.nodes_max!r}"
+            )
     if mode in ("uniform", "paper") and "nodes" in names and "spacing" in names:
         raise InputError("mesh_image: give only one of nodes and spacing")
     if mode == "start" and not names:
@@ -461,8 +547,12 @@ def _check_aim(content: Content, aim: Aim) -> None:
         raise InputError("mesh_image: the paper's scheme takes one image, without labels or mask")
 
 
-def sizes_of_order(content: Content, nodes: int | None, sizes: Sizes | None, order: int) -> Sizes | None:
-    """Limits on sizes of a graded mesh for cells of an order; with `nodes` of order 2 including the longest edge."""
+def sizes_of_order(
+    content: Content, nodes: int | None, sizes: Sizes | None, order: int
+) -> Sizes | None:
+    """Limits on sizes of a graded mesh for cells of an order; with `nodes` of order 2 including
+    the longest edge.
+    """
     if order == 1:
         return sizes
     sizes = Sizes() if sizes is None else sizes
@@ -482,9 +572,14 @@ def corners_of(nodes: int, ndim: int, ratio: float) -> int:
 
 
 def _is_repeated(runs: EarlierRuns, initial: Mesh, nodes: int, has_exchanges: bool = True) -> bool:
-    """True if a run would end as an earlier one: the same initial mesh, and exchanges, if any, cannot come nearer."""
+    """True if a run would end as an earlier one: the same initial mesh, and exchanges, if any,
+    cannot come nearer.
+    """
     for points, earlier, reached in runs:
-        low, high = (1.0 - NODES_NEAR) * min(earlier, nodes), (1.0 + NODES_NEAR) * max(earlier, nodes)
+        low, high = (
+            (1.0 - NODES_NEAR) * min(earlier, nodes),
+            (1.0 + NODES_NEAR) * max(earlier, nodes),
+        )
         may_differ = has_exchanges and earlier != nodes and low <= reached <= high
         if not may_differ and np.array_equal(points, initial.points):
             return True
@@ -492,7 +587,8 @@ def _is_repeated(runs: EarlierRuns, initial: Mesh, nodes: int, has_exchanges: bo
 
 
 def meshed_in_all(content: Content, aim: Aim, attempted: Attempted) -> Search:
-    """Repeat runs with other numbers of corners until corners and mid-edge nodes together are the aim's nodes.
+    """Repeat runs with other numbers of corners until corners and mid-edge nodes together are the
+    aim's nodes.
 
     Returns the result of the nearest run, or of one that was cut short.
     """
@@ -517,12 +613,13 @@ def meshed_in_all(content: Content, aim: Aim, attempted: Attempted) -> Search:
 
 
 def meshed_to_error(content: Content, aim: Aim, attempted: Attempted) -> Search:
-    """Repeat runs with up to `nodes_max` nodes until the unexplained variance is just below a target.
+    """Repeat runs with up to `nodes_max` nodes until the unexplained variance is just below a
+    target.
 
-    Returns the result, with the octree and the number of nodes, of the run with the fewest nodes that meets the target;
-    if none does, of the run with the least error, or of one that was cut short. It is the same as with that number of
-    nodes from the start, unless limits on sizes forbid it. At least 2^(n + 2) nodes are tried, and at least as many as
-    targets of sizes require.
+    Returns the result, with the octree and the number of nodes, of the run with the fewest nodes
+    that meets the target; if none does, of the run with the least error, or of one that was cut
+    short. It is the same as with that number of nodes from the start, unless limits on sizes forbid
+    it. At least 2^(n + 2) nodes are tried, and at least as many as targets of sizes require.
 
     Raises
     ------
@@ -532,7 +629,11 @@ def meshed_to_error(content: Content, aim: Aim, attempted: Attempted) -> Search:
     target_error, nodes_max, sizes = aim.target_error or 0.0, aim.nodes_max or 0, aim.sizes
     _check_reachable(content, target_error)
     fewest = 0 if sizes is None else nodes_of_sizes(content, sizes)[0]
-    nodes, predicted, ratio = FIRST_NODES[content.image.ndim], None, nodes_per_corner(content.image.ndim, aim.order)
+    nodes, predicted, ratio = (
+        FIRST_NODES[content.image.ndim],
+        None,
+        nodes_per_corner(content.image.ndim, aim.order),
+    )
     if SIZES_MET * fewest <= nodes_max / ratio < fewest:
         fewest = round(nodes_max / ratio)
     fractions = dict[int, float]()  # unexplained variance by number of nodes
@@ -542,7 +643,8 @@ def meshed_to_error(content: Content, aim: Aim, attempted: Attempted) -> Search:
         most = round(nodes_max / ratio)
         if (nodes := max(min(nodes, most), fewest)) <= most:
             initial = nearest_octree(content, nodes, sizes)
-            # Limits on sizes may take more nodes than the error, or allow fewer; a mask's octree is only roughly near.
+            # Limits on sizes may take more nodes than the error, or allow fewer; a mask's octree is
+            # only roughly near.
             if content.region is None and not is_near(len(initial.points), nodes):
                 nodes = len(initial.points)
         if nodes > most and not best:
@@ -550,10 +652,15 @@ def meshed_to_error(content: Content, aim: Aim, attempted: Attempted) -> Search:
         if nodes > most or _is_repeated(runs, initial, nodes):
             break
         result = yield from attempted(initial, nodes, predicted)
-        count, fraction = len(result.mesh.points), unexplained_by(content, result.mesh, result.history[-1])
+        count, fraction = (
+            len(result.mesh.points),
+            unexplained_by(content, result.mesh, result.history[-1]),
+        )
         runs.append((initial.points, nodes, count))
         if result.ended in CUT_SHORT:
-            is_worse = bool(best) and fractions[len(best[0].mesh.points)] <= max(target_error, fraction)
+            is_worse = bool(best) and fractions[len(best[0].mesh.points)] <= max(
+                target_error, fraction
+            )
             return best[0]._replace(ended=result.ended) if is_worse else result
         if count in fractions:
             break
@@ -564,48 +671,70 @@ def meshed_to_error(content: Content, aim: Aim, attempted: Attempted) -> Search:
             return result
         nodes = predicted = max(_next_nodes(content.image, fractions, target_error), fewest)
         ratio = (total := node_count(result.mesh.points, result.mesh.cells, aim.order)) / count
-        if nodes in fractions or (total > (1.0 - NODES_NEAR) * nodes_max and fraction > target_error):
+        if nodes in fractions or (
+            total > (1.0 - NODES_NEAR) * nodes_max and fraction > target_error
+        ):
             break
     return best[0]
 
 
 def _check_reachable(content: Content, target_error: float) -> None:
-    """Raise InputError for a fraction out of range, or below that of the image's noise, which no mesh should follow."""
+    """Raise InputError for a fraction out of range, or below that of the image's noise, which no
+    mesh should follow.
+    """
     check_target_error(target_error)
     variance = content.variance
     if variance == 0.0:
-        raise InputError("target_error: the image is constant, so the error of every mesh is 0; give a number of nodes")
+        raise InputError(
+            "target_error: the image is constant, so the error of every mesh is 0; give a number "
+            "of nodes"
+        )
     noise = content.noise * content.unit / variance
     if target_error <= noise:
         raise InputError(
-            f"target_error: {target_error:g} of the variance is below the noise fraction, estimated as {noise:.3g}, "
+            f"target_error: {target_error:g} of the variance is below the noise fraction, "
+            f"estimated as {noise:.3g}, "
             "so cells would have to follow the noise; use a larger fraction, or denoise the image"
         )
 
 
 def _beyond(nodes_max: int, needed: int) -> InputError:
-    return InputError(f"nodes_max: sizes require about {needed} nodes, got {nodes_max}; allow as many, or larger cells")
+    return InputError(
+        f"nodes_max: sizes require about {needed} nodes, got {nodes_max}; allow as many, or "
+        "larger cells"
+    )
 
 
 def _is_better(new: int, old: int, fractions: dict[int, float], target: float) -> bool:
-    """True if a number of nodes is better than another: it meets the target with fewer, or is nearer to it."""
+    """True if a number of nodes is better than another: it meets the target with fewer, or is
+    nearer to it.
+    """
     if (fractions[new] <= target) != (fractions[old] <= target):
         return fractions[new] <= target
     return new < old if fractions[new] <= target else fractions[new] < fractions[old]
 
 
 def _next_nodes(image: Image, fractions: dict[int, float], target: float) -> int:
-    """The number of nodes to try next: between the nearest ones on either side, or beyond the nearest."""
+    """The number of nodes to try next: between the nearest ones on either side, or beyond the
+    nearest.
+    """
     above = max((n for n, fraction in fractions.items() if fraction > target), default=None)
     below = min((n for n, fraction in fractions.items() if fraction <= target), default=None)
     aim = ERROR_AIM * target
     least = 0.03 * aim  # the error may be 0
     if above is not None and below is not None and above < below:
-        part = np.log(fractions[above] / aim) / np.log(fractions[above] / max(fractions[below], least))
+        part = np.log(fractions[above] / aim) / np.log(
+            fractions[above] / max(fractions[below], least)
+        )
         return int(above * (below / above) ** part)
     nearest = min(fractions) if above is None else above
     rate, other = ERROR_RATE, max((n for n in fractions if n < nearest), default=None)
     if above is not None and other is not None:  # the rate of this image, by its last two runs
-        rate = float(np.clip(np.log(fractions[other] / fractions[nearest]) / np.log(nearest / other), *RATE_LIMITS))
+        rate = float(
+            np.clip(
+                np.log(fractions[other] / fractions[nearest]) / np.log(nearest / other),
+                *RATE_LIMITS,
+            )
+        )
     number = nearest * nodes_ratio(max(fractions[nearest], least), target, rate)
     return int(np.clip(number, 2 ** (image.ndim + 2), max(prod(image.shape) // 8, 64)))

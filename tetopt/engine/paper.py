@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 from tetopt.contents.content import plain
 from tetopt.energy.discretization import combined
 from tetopt.energy.geometric import cell_E_G
-from tetopt.energy.sampling import SamplingGrid, from_ticks, moment_sums, orientations, sampling_grid
+from tetopt.energy.sampling import (
+    SamplingGrid,
+    from_ticks,
+    moment_sums,
+    orientations,
+    sampling_grid,
+)
 from tetopt.engine.complex import State, build, cell_squares, node_stars
 from tetopt.engine.loop import (
     UNIFORM_ITERATIONS,
@@ -59,27 +65,29 @@ def optimize_paper(
 ) -> MeshingResult:
     """Move the nodes of a mesh to lower E by the paper's scheme.
 
-    E = (1 - k_D) E_G + k_D E_D is Eq. (4), with each energy relative to its value on the initial mesh.
+    E = (1 - k_D) E_G + k_D E_D is Eq. (4), with each energy relative to its value on the initial
+    mesh.
 
     Parameters
     ----------
     image : Image
         The intensities h.
     mesh : Mesh
-        The initial mesh, which also normalises the two energies; for re-tessellation it must fill the image's
-        box, as `tetopt.start.lattice.lattice_mesh` does.
+        The initial mesh, which also normalises the two energies; for re-tessellation it must fill
+        the image's box, as `tetopt.start.lattice.lattice_mesh` does.
     k_D : float
-        Weight of the image, 0 <= k_D < 1. With 0 a node moves to the minimiser of E_G (Lloyd's relaxation);
-        otherwise it moves by descent with numerical derivatives.
+        Weight of the image, 0 <= k_D < 1. With 0 a node moves to the minimiser of E_G (Lloyd's
+        relaxation); otherwise it moves by descent with numerical derivatives.
     iterations : int
         Maximum number of sweeps over all nodes.
     n_t : int, optional
         Number of first iterations with re-tessellation. Default: all for k_D = 0, else half.
     retessellate : {"first", "accept", "never"}
-        "first": accept every Delaunay tessellation of the first n_t iterations. "accept": in all iterations, accept
-        those that lower E (Section 4). "never": keep the connectivity.
+        "first": accept every Delaunay tessellation of the first n_t iterations. "accept": in all
+        iterations, accept those that lower E (Section 4). "never": keep the connectivity.
     boundary : {"slide", "fixed"}
-        Boundary nodes move within the box's faces and edges, or not at all. Those off the box are fixed.
+        Boundary nodes move within the box's faces and edges, or not at all. Those off the box are
+        fixed.
     step_ratio : float
         Step of the numerical derivative over the distance to the nearest cell centroid.
     tolerance : float
@@ -89,19 +97,22 @@ def optimize_paper(
     callback : callable, optional
         Called with each `IterationRecord`.
     stop : callable, optional
-        Called between colours of nodes (several times a second on common meshes); True ends the run.
+        Called between colours of nodes (several times a second on common meshes); True ends the
+        run.
 
     Returns
     -------
     MeshingResult
-        Mesh, history and reason for the end. The mesh covers the same domain and every cell is positively oriented.
-        With fixed connectivity, E never rises between records, except by rounding.
+        Mesh, history and reason for the end. The mesh covers the same domain and every cell is
+        positively oriented. With fixed connectivity, E never rises between records, except by
+        rounding.
 
     Raises
     ------
     InputError
-        An option out of range; a mesh that is invalid for sampling (see `cell_moments`) or has cells that overlap at a
-        facet; or, unless `retessellate` is "never", a mesh that does not fill the image's box.
+        An option out of range; a mesh that is invalid for sampling (see `cell_moments`) or has
+        cells that overlap at a facet; or, unless `retessellate` is "never", a mesh that does not
+        fill the image's box.
 
     See Also
     --------
@@ -130,8 +141,13 @@ def optimize_paper(
     def record(iteration: int, movement: float, is_new: bool) -> None:
         E_G, E_D = _energies(state, image)
         n_cells, seconds = len(_cells(state)), time.perf_counter() - begin
-        E, n_voxels = combined(E_G, E_D, E_G0, E_D0, k_D), int(state.complex.sums[:n_cells, 0].sum())
-        history.append(IterationRecord(iteration, E, E_G, E_D, movement, is_new, n_cells, n_voxels, seconds))
+        E, n_voxels = (
+            combined(E_G, E_D, E_G0, E_D0, k_D),
+            int(state.complex.sums[:n_cells, 0].sum()),
+        )
+        history.append(
+            IterationRecord(iteration, E, E_G, E_D, movement, is_new, n_cells, n_voxels, seconds)
+        )
         if callback is not None:
             callback(history[-1])
 
@@ -151,8 +167,12 @@ def optimize_paper(
         is_finished = _sweep(state, step_ratio, k_D, is_over)
         # 3. Measure.
         if state.objective.image == 0.0:  # moves did not update the sums
-            state.complex.sums[: len(_cells(state))] = moment_sums(grid, state.complex.ticks, _cells(state))
-        movement = relative_movement(before, state.complex.ticks, image, grid, state.objective.matrix)
+            state.complex.sums[: len(_cells(state))] = moment_sums(
+                grid, state.complex.ticks, _cells(state)
+            )
+        movement = relative_movement(
+            before, state.complex.ticks, image, grid, state.objective.matrix
+        )
         record(iteration, movement, is_new)
         if not is_finished:
             ended = "stopped" if stop is not None and stop() else "max_seconds"
@@ -161,7 +181,9 @@ def optimize_paper(
             ended = "converged"
             break
     points = image.to_world(from_ticks(state.complex.ticks, grid, image.ndim))
-    return checked(MeshingResult(Mesh(points, _cells(state)), history, ended, mesh), plain(image), 0.0, mesh)
+    return checked(
+        MeshingResult(Mesh(points, _cells(state)), history, ended, mesh), plain(image), 0.0, mesh
+    )
 
 
 def _cells(state: State) -> NDArray[np.int64]:
@@ -170,12 +192,19 @@ def _cells(state: State) -> NDArray[np.int64]:
 
 
 def default_n_t(k_D: float, iterations: int) -> int:
-    """Number of first iterations that reconnect the nodes: all for k_D = 0 (Lloyd's alternation), else half."""
+    """Number of first iterations that reconnect the nodes: all for k_D = 0 (Lloyd's
+    alternation), else half.
+    """
     return iterations if k_D == 0.0 else (iterations + 1) // 2
 
 
 def _check_options(
-    k_D: float, iterations: int, n_t: int | None, retessellate: str, boundary: str, step_ratio: float
+    k_D: float,
+    iterations: int,
+    n_t: int | None,
+    retessellate: str,
+    boundary: str,
+    step_ratio: float,
 ) -> None:
     check_common_options(k_D, iterations, boundary)
     if n_t is not None and n_t < 0:
@@ -187,13 +216,16 @@ def _check_options(
 
 
 def _check_fills_box(image: Image, mesh: Mesh) -> None:
-    """Raise InputError unless the mesh fills the image's box, as Delaunay fills the convex hull of the nodes."""
+    """Raise InputError unless the mesh fills the image's box, as Delaunay fills the convex hull
+    of the nodes.
+    """
     index = image.to_index(mesh.points)
     extent = np.column_stack([index.min(axis=0), index.max(axis=0)])
     is_box = np.abs(extent - box_sides(image.shape)).max() <= ON_SIDE_VOXELS
     if not is_box or abs(filled_fraction(mesh, image) - 1.0) > 1e-9:
         raise InputError(
-            "mesh: re-tessellation requires a mesh that fills the image's box exactly, as a lattice does; "
+            "mesh: re-tessellation requires a mesh that fills the image's box exactly, as a "
+            "lattice does; "
             'pass retessellate="never" to keep the connectivity'
         )
 
@@ -225,8 +257,8 @@ def _energies(state: State, image: Image) -> tuple[float, float]:
 def _retessellated(image: Image, grid: SamplingGrid, state: State) -> State | None:
     """The state with Delaunay cells; None if they are not a mesh of the same box.
 
-    The checks are exact: every cell is oriented on the fixed-point grid, every facet lies between two cells or on the
-    box, every voxel is in one cell, and no cell is flat.
+    The checks are exact: every cell is oriented on the fixed-point grid, every facet lies between
+    two cells or on the box, every voxel is in one cell, and no cell is flat.
     """
     mesh = state.complex
     cells = delaunay(from_ticks(mesh.ticks, grid, image.ndim), image.affine)

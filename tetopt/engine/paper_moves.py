@@ -1,8 +1,9 @@
 """The two moves of the paper's scheme: descent with numerical derivatives, and Lloyd's relocation.
 
-Nodes of one colour share no cell and move at the same time, so the result does not depend on the threads. A node moves
-only if no cell of its star loses its orientation (exactly, in integers) and the star's energy falls. The state's shape
-energy is E_G, measured as `tetopt.energy.geometric` measures it.
+Nodes of one colour share no cell and move at the same time, so the result does not depend on the
+threads. A node moves only if no cell of its star loses its orientation (exactly, in integers) and
+the star's energy falls. The state's shape energy is E_G, measured as `tetopt.energy.geometric`
+measures it.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from tetopt.engine.surface import projection_at
 from tetopt.geometry.vectors import difference, minus, put_row, row, scaled, times
 from tetopt.system.kernels import Floats2, Ints1, helper, run, unit
 
-LLOYD_HALVINGS = 4  # of a Lloyd step that inverts a cell or raises the star's energy, before the node stays
+# of a Lloyd step that inverts a cell or raises the star's energy, before the node stays
+LLOYD_HALVINGS = 4
 
 
 class Moves(NamedTuple):
@@ -35,20 +37,22 @@ class Moves(NamedTuple):
 def descend(moves: Moves) -> None:
     """Move nodes along the image's axes to lower the energy of their stars (Section 2.2).
 
-    For each axis the star's energy is measured one step forwards and backwards, where the step is a fraction of the
-    distance to the nearest centroid of the star's cells, and at the vertex of the parabola through the three values.
-    The node moves to the best of these if that lowers the energy.
+    For each axis the star's energy is measured one step forwards and backwards, where the step is a
+    fraction of the distance to the nearest centroid of the star's cells, and at the vertex of the
+    parabola through the three values. The node moves to the best of these if that lowers the
+    energy.
     """
     with few_threads(len(moves.nodes) * 100):
         run(_descend, len(moves.nodes), moves)
 
 
 def relocate(moves: Moves) -> None:
-    """Move nodes to the minimisers of E_G over their stars (Section 2.1), with weights 1 and 0 in the objective.
+    """Move nodes to the minimisers of E_G over their stars (Section 2.1), with weights 1 and 0 in
+    the objective.
 
-    Inside, this is the volume-weighted mean of the star's circumcentres. A node on a face or an edge of the box moves
-    to the minimiser within it. A step that inverts a cell or, by rounding, raises E_G is halved up to four times, then
-    skipped. Sums and fluxes are not updated.
+    Inside, this is the volume-weighted mean of the star's circumcentres. A node on a face or an
+    edge of the box moves to the minimiser within it. A step that inverts a cell or, by rounding,
+    raises E_G is halved up to four times, then skipped. Sums and fluxes are not updated.
     """
     with few_threads(len(moves.nodes) * 10):
         run(_relocate, len(moves.nodes), moves)
@@ -76,7 +80,9 @@ def _shape(x: NDArray, state: State, cell: int) -> float:
 
 
 @unit
-def _star_energy(trial: TrialByValue, limit: float, node: int, state: State, stars: NodeStars) -> float:
+def _star_energy(
+    trial: TrialByValue, limit: float, node: int, state: State, stars: NodeStars
+) -> float:
     """Energy of a node's star at the current ticks; measured values are written to `trial`.
 
     It is infinite if a cell is flat or inverted, or once the energy exceeds `limit`.
@@ -118,7 +124,11 @@ def _descend(moves: Moves, number: int) -> None:
     ticks, matrix, fluxes = state.complex.ticks, state.objective.matrix, state.complex.fluxes
     size, x = stars.start[node + 1] - stars.start[node], np.empty((4, 3))
     # Two trials: the best so far is in row `kept`, the next is written to the other.
-    shapes, sides, kept = np.empty((2, size)), np.empty((2, size, fluxes.shape[1], fluxes.shape[2])), 0
+    shapes, sides, kept = (
+        np.empty((2, size)),
+        np.empty((2, size, fluxes.shape[1], fluxes.shape[2])),
+        0,
+    )
     energy = 0.0
     for r in range(stars.start[node], stars.start[node + 1]):
         energy += cell_energy(state, stars.cells[r])
@@ -145,7 +155,9 @@ def _descend(moves: Moves, number: int) -> None:
                 if there == here:
                     break
             ticks[node, axis] = there
-            value = _star_energy(Trial(x, shapes[1 - kept], sides[1 - kept]), limit, node, state, stars)
+            value = _star_energy(
+                Trial(x, shapes[1 - kept], sides[1 - kept]), limit, node, state, stars
+            )
             if attempt == 0:
                 forwards = value
             elif attempt == 1:
@@ -162,8 +174,17 @@ def _descend(moves: Moves, number: int) -> None:
 def _relocate(moves: Moves, number: int) -> None:
     """Move one node to the minimiser of its star's E_G, or as far towards it as no cell inverts."""
     node, state, stars = moves.nodes[number], moves.state, moves.stars
-    ticks, n_corners, trial = state.complex.ticks, state.complex.cells.shape[1], trial_of(state, stars, node)
-    weight, gradient, energy, star_volume = 1.0 / (n_corners * (n_corners + 1)), np.zeros(3), 0.0, 0.0
+    ticks, n_corners, trial = (
+        state.complex.ticks,
+        state.complex.cells.shape[1],
+        trial_of(state, stars, node),
+    )
+    weight, gradient, energy, star_volume = (
+        1.0 / (n_corners * (n_corners + 1)),
+        np.zeros(3),
+        0.0,
+        0.0,
+    )
     for r in range(stars.start[node], stars.start[node + 1]):
         _load_cell(trial.x, state, stars.cells[r])
         volume, E_G = volume_and_E_G(trial.x, n_corners)
@@ -180,7 +201,9 @@ def _relocate(moves: Moves, number: int) -> None:
     step = scaled(-n_corners / (2.0 * star_volume), step)
     for halving in range(LLOYD_HALVINGS + 1):
         for d in range(3):
-            ticks[node, d] = here[d] + np.int64(np.rint(step[d] * 0.5**halving / 2.0**-state.objective.bits))
+            ticks[node, d] = here[d] + np.int64(
+                np.rint(step[d] * 0.5**halving / 2.0**-state.objective.bits)
+            )
         if _star_energy(trial, np.inf, node, state, stars) < energy:
             store(trial, node, state, stars)
             return

@@ -1,8 +1,9 @@
 """Enforce the minimum dihedral angle: mend the worst cells one by one, regardless of E.
 
-Moves are those of `tetopt.engine.flips` and `tetopt.engine.density` and displacements of single nodes, but their
-measure is the smallest dihedral angle of the affected cells: a move is made only if that grows (Freitag and
-Ollivier-Gooch 1997), and each cell takes the move that leaves the best worst angle, up to the minimum.
+Moves are those of `tetopt.engine.flips` and `tetopt.engine.density` and displacements of single
+nodes, but their measure is the smallest dihedral angle of the affected cells: a move is made only
+if that grows (Freitag and Ollivier-Gooch 1997), and each cell takes the move that leaves the best
+worst angle, up to the minimum.
 """
 
 from __future__ import annotations
@@ -50,7 +51,8 @@ REPAIR_ROUNDS = 40  # at most; a round without changes ends them earlier
 DISPLACED_AT_ONCE = 200  # cells between two checks of the time: up to 0.1 s, at 0.4 ms each
 STEP_HALVINGS = 7  # of a node's displacement
 FIRST_STEP_EDGES = 0.25  # of the star's mean edge: the first displacement
-WORST_WEIGHT = 40.0  # a steep sum approximates the worst cosine q: exp(-40 q) outweighs all that are 3 degrees better
+# a steep sum approximates the worst cosine q: exp(-40 q) outweighs all that are 3 degrees better
+WORST_WEIGHT = 40.0
 
 
 class Repaired(NamedTuple):
@@ -76,15 +78,19 @@ def _fill_cosines(cosines: Floats1, state: State) -> None:
         cosines[cell] = cell_cosine(x, state, cell)
 
 
-def repair(state: State, min_dihedral: float, is_over: Callable[[], bool] = lambda: False) -> Repaired:
+def repair(
+    state: State, min_dihedral: float, is_over: Callable[[], bool] = lambda: False
+) -> Repaired:
     """Lift every cell's smallest dihedral angle to `min_dihedral`, degrees, as far as moves can.
 
-    Each round treats the cells below, the worst first: by flips, then by displacements of their nodes and, if neither
-    helps, by inserting or removing nodes. Rounds end when no cell remains, nothing changes, or `is_over` returns True.
+    Each round treats the cells below, the worst first: by flips, then by displacements of their
+    nodes and, if neither helps, by inserting or removing nodes. Rounds end when no cell remains,
+    nothing changes, or `is_over` returns True.
     """
     target = -np.cos(np.radians(min_dihedral))
     source, n_moves = np.arange(len(state.complex.ticks)), 0
-    is_stuck = np.zeros(len(source), dtype=bool)  # nodes that could not be displaced, while their stars stay the same
+    # nodes that could not be displaced, while their stars stay the same
+    is_stuck = np.zeros(len(source), dtype=bool)
     for _ in range(REPAIR_ROUNDS):
         bad = _worst_first(state, target)
         if len(bad) == 0 or is_over():
@@ -92,7 +98,9 @@ def repair(state: State, min_dihedral: float, is_over: Callable[[], bool] = lamb
         if len(state.complex.cells) - state.complex.n_cells[0] < 4 * len(bad) + 64:
             state = grown(state)
         before = state.complex.cells[: state.complex.n_cells[0]].copy()
-        n_made = _reconnect(state, bad, target, cavity(len(state.complex.cells), state.complex.fluxes.shape[2]))
+        n_made = _reconnect(
+            state, bad, target, cavity(len(state.complex.cells), state.complex.fluxes.shape[2])
+        )
         _free_changed(is_stuck, before, state.complex.cells[: state.complex.n_cells[0]])
         bad = _worst_first(state, target)
         if len(bad):
@@ -113,7 +121,9 @@ def repair(state: State, min_dihedral: float, is_over: Callable[[], bool] = lamb
     return Repaired(state, source, len(_worst_first(state, target)), n_moves)
 
 
-def _free_changed(is_stuck: NDArray[np.bool_], before: NDArray[np.int64], after: NDArray[np.int64]) -> None:
+def _free_changed(
+    is_stuck: NDArray[np.bool_], before: NDArray[np.int64], after: NDArray[np.int64]
+) -> None:
     """Clear the marks of the nodes of cells that differ."""
     both = min(len(before), len(after))
     is_other = (before[:both] != after[:both]).any(axis=1)
@@ -122,9 +132,15 @@ def _free_changed(is_stuck: NDArray[np.bool_], before: NDArray[np.int64], after:
 
 
 def _displaced(
-    state: State, bad: NDArray[np.int64], target: float, is_over: Callable[[], bool], is_stuck: NDArray[np.bool_]
+    state: State,
+    bad: NDArray[np.int64],
+    target: float,
+    is_over: Callable[[], bool],
+    is_stuck: NDArray[np.bool_],
 ) -> int:
-    """`_displace` until `is_over` returns True, as tens of thousands of cells far smaller than voxels took minutes."""
+    """`_displace` until `is_over` returns True, as tens of thousands of cells far smaller than
+    voxels took minutes.
+    """
     stars, n_made = node_stars(state), 0
     for begin in range(0, len(bad), DISPLACED_AT_ONCE):
         if is_over():
@@ -134,8 +150,12 @@ def _displaced(
 
 
 def _released(state: State) -> State:
-    """The state in which nodes between labels are off their surfaces; those on a mask's surface still slide on it."""
-    return state._replace(complex=state.complex._replace(meeting=np.full_like(state.complex.meeting, -1)))
+    """The state in which nodes between labels are off their surfaces; those on a mask's surface
+    still slide on it.
+    """
+    return state._replace(
+        complex=state.complex._replace(meeting=np.full_like(state.complex.meeting, -1))
+    )
 
 
 def n_cells_below(state: State, min_dihedral: float) -> int:
@@ -151,7 +171,9 @@ def _worst_first(state: State, target: float) -> NDArray[np.int64]:
 
 @entry
 def _reconnect(state: State, bad: Ints1, target: float, work: Cavity) -> int:
-    """For each bad cell make the flip that leaves the best worst angle in its cavity, if it improves."""
+    """For each bad cell make the flip that leaves the best worst angle in its cavity, if it
+    improves.
+    """
     cells, across = state.complex.cells, state.complex.across
     room = len(cells)
     is_changed = np.zeros(room, dtype=np.bool_)
@@ -168,7 +190,9 @@ def _reconnect(state: State, bad: Ints1, target: float, work: Cavity) -> int:
                     best, choice = gain, k
         for e in range(6):
             i, j = TET_EDGES[e, 0], TET_EDGES[e, 1]
-            m, is_open = ring_of_edge(work.ring, work.around, cells, across, cell, i, j, is_changed[:0])
+            m, is_open = ring_of_edge(
+                work.ring, work.around, cells, across, cell, i, j, is_changed[:0]
+            )
             gain = _gain_of_edge(work, state, cell, e, m, is_open, target)
             if gain > best:
                 best, choice = gain, 4 + e
@@ -179,7 +203,9 @@ def _reconnect(state: State, bad: Ints1, target: float, work: Cavity) -> int:
         else:
             e = choice - 4
             i, j = TET_EDGES[e, 0], TET_EDGES[e, 1]
-            m, is_open = ring_of_edge(work.ring, work.around, cells, across, cell, i, j, is_changed[:0])
+            m, is_open = ring_of_edge(
+                work.ring, work.around, cells, across, cell, i, j, is_changed[:0]
+            )
             _gain_of_edge(work, state, cell, e, m, is_open, target)
             a, b = cells[cell, i], cells[cell, j]
             if state.objective.image > 0.0:
@@ -212,10 +238,19 @@ def _gain_of_face(x: Floats2, state: State, cell: int, k: int, target: float) ->
 
 
 @unit
-def _gain_of_edge(work: Cavity, state: State, cell: int, e: int, m: int, is_open: int, target: float) -> float:
+def _gain_of_edge(
+    work: Cavity, state: State, cell: int, e: int, m: int, is_open: int, target: float
+) -> float:
     """Growth of the worst angle by removing an edge; `work.apex` holds the triangulation."""
     cells = state.complex.cells
-    x, ring, around, cost, apex, shape = work.x, work.ring, work.around, work.cost, work.apex, work.triangle
+    x, ring, around, cost, apex, shape = (
+        work.x,
+        work.ring,
+        work.around,
+        work.cost,
+        work.apex,
+        work.triangle,
+    )
     a, b = cells[cell, TET_EDGES[e, 0]], cells[cell, TET_EDGES[e, 1]]
     if m < 3 or (is_open == 1 and not in_one_face(state, a, b, ring[0], ring[m - 1])):
         return -1.0
@@ -254,10 +289,12 @@ def _gain_of_edge(work: Cavity, state: State, cell: int, e: int, m: int, is_open
 
 @entry
 def _displace(state: State, stars: NodeStars, bad: Ints1, target: float, is_stuck: Bools1) -> int:
-    """Move the nodes of each bad cell so that the worst angle of their stars grows, up to the target.
+    """Move the nodes of each bad cell so that the worst angle of their stars grows, up to the
+    target.
 
-    A node that found no better place, marked in `is_stuck`, is tried again only after its star has changed: where the
-    target is out of reach, most nodes of most cells fail, in each of some 20 cells and in each round.
+    A node that found no better place, marked in `is_stuck`, is tried again only after its star has
+    changed: where the target is out of reach, most nodes of most cells fail, in each of some 20
+    cells and in each round.
     """
     x, n_made = np.empty((4, 3)), 0
     for number in range(len(bad)):
@@ -278,7 +315,9 @@ def _displace(state: State, stars: NodeStars, bad: Ints1, target: float, is_stuc
 
 @unit
 def _star_cosine(x: Floats2, state: State, stars: NodeStars, node: int, least: float) -> float:
-    """Worst cosine of a star's cells; -2 if one is flat or inverted, or some value below `least` if it falls below."""
+    """Worst cosine of a star's cells; -2 if one is flat or inverted, or some value below `least`
+    if it falls below.
+    """
     worst = 1.0
     for r in range(stars.start[node], stars.start[node + 1]):
         c = state.complex.cells[stars.cells[r]]
@@ -290,7 +329,9 @@ def _star_cosine(x: Floats2, state: State, stars: NodeStars, node: int, least: f
 
 @unit
 def _lift(x: Floats2, state: State, stars: NodeStars, node: int, target: float) -> bool:
-    """Search around a node, with ever smaller steps, for a place where its star's worst angle is larger."""
+    """Search around a node, with ever smaller steps, for a place where its star's worst angle is
+    larger.
+    """
     start, before = row(state.complex.ticks, node), _star_cosine(x, state, stars, node, -3.0)
     if before >= target:
         return False
@@ -328,9 +369,18 @@ def _first_step(x: NDArray, state: State, stars: NodeStars, node: int) -> float:
 
 @unit
 def _step_around(
-    x: Floats2, normal: Floats2, is_sliding: bool, state: State, stars: NodeStars, node: int, step: float, best: float
+    x: Floats2,
+    normal: Floats2,
+    is_sliding: bool,
+    state: State,
+    stars: NodeStars,
+    node: int,
+    step: float,
+    best: float,
 ) -> float:
-    """Move a node by a step, mm, in the best of 26 directions for its star's cosine; return that, or `best`."""
+    """Move a node by a step, mm, in the best of 26 directions for its star's cosine; return
+    that, or `best`.
+    """
     t, P, scale = state.complex.ticks, projection_at(state, node), 2.0**-state.objective.bits
     here = row(t, node)
     there = here

@@ -1,7 +1,7 @@
 """The requirements of a mesh, measured on the mesh itself, independently of the engine.
 
-A run that ends in time returns a mesh even if it does not meet them all; its result lists those that it violates, and
-the command exits with status 1.
+A run that ends in time returns a mesh even if it does not meet them all; its result lists those
+that it violates, and the command exits with status 1.
 """
 
 from __future__ import annotations
@@ -32,25 +32,37 @@ from tetopt.geometry.topology import components
 from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
 
-OF_VOXELS = ("mask", "components", "labels")  # requirements on the voxels in cells, which curved edges change
-MASK_DICE = 0.9  # least Dice of a mesh with its mask, below which cells are too large for the mask's detail
-LABEL_VOXELS = 200  # a label with as many voxels must have cells that contain some, of about their volume
+# requirements on the voxels in cells, which curved edges change
+OF_VOXELS = ("mask", "components", "labels")
+# least Dice of a mesh with its mask, below which cells are too large for the mask's detail
+MASK_DICE = 0.9
+# a label with as many voxels must have cells that contain some, of about their volume
+LABEL_VOXELS = 200
 LARGE_COMPONENTS = f"of {COMPONENT_VOXELS} voxels or more"
 LEAST_VOLUME, MOST_VOLUME = 0.6, 1.5  # of a label's cells, over its voxels'
 LABEL_REMEDY = "allow more nodes, more `cells_across`, or a higher `label_weight`"
-PIECES_REMEDY = "allow more nodes, so that cells are smaller than these, or merge (`merge`) or clean labels of crumbs"
+PIECES_REMEDY = (
+    "allow more nodes, so that cells are smaller than these, or merge (`merge`) or "
+    "clean labels of crumbs"
+)
 COMPONENTS_LISTED = 5  # of those without a cell
-ANGLE_ROUNDING = 1e-6  # degrees by which a measured angle may be below the minimum that kernels enforce in ticks
+# degrees by which a measured angle may be below the minimum that kernels enforce in ticks
+ANGLE_ROUNDING = 1e-6
 VOLUME_ROUNDING = 1e-9  # relative: rounding of the total volume of cells that fill the box exactly
 BEYOND_WORDS = "nodes lie up to {:.3g} voxels beyond the image's box; please report this"
-ERROR_RATE = 0.6  # E_D falls with nodes^-0.57 on the MNI152 T1 from 1,500 to 5,400 nodes, ^-0.7 up to 40,000
+# E_D falls with nodes^-0.57 on the MNI152 T1 from 1,500 to 5,400 nodes, ^-0.7 up to 40,000
+ERROR_RATE = 0.6
 ERROR_REACHED = 0.85  # of the target error: a run from here up to the target ends the search
 ERROR_AIM = 0.5 * (1.0 + ERROR_REACHED)
 BOUNDARY_ROUNDING = 1e-6  # relative: the same within a boundary with the user's digits
 
 
 def checked(
-    result: MeshingResult, content: Content, min_dihedral: float, start: Mesh, dice: float | None = None
+    result: MeshingResult,
+    content: Content,
+    min_dihedral: float,
+    start: Mesh,
+    dice: float | None = None,
 ) -> MeshingResult:
     """Add the requirements that a run's mesh violates to its result, each as a sentence.
 
@@ -65,23 +77,27 @@ def checked(
     start : Mesh
         The mesh that the run began with, whose domain it should cover, if there is no mask.
     dice : float, optional
-        Dice of the whole mesh with the mask; by default by the content's voxels, which a run's mesh does not leave.
+        Dice of the whole mesh with the mask; by default by the content's voxels, which a run's mesh
+        does not leave.
 
     Returns
     -------
     MeshingResult
-        With `violated`, empty if all are met. `min_dihedral`: tetrahedra with a smaller dihedral angle. `box`: nodes
-        farther beyond the image's box than the initial mesh's. `cover`: voxels or volume lost or gained relative to the
-        initial mesh. Within a mask, instead of the last, `overlap`: voxels that lie in
-        two cells; `mask`: a Dice with the mask below 0.9; and `components`: more connected components than the mask, or
-        components of the mask, or parts far from any cell, of 50 voxels or more without a cell.
-        `manifold`: edges or nodes at which the boundary, within a mask, or the interface of two labels is not a
-        manifold. `labels`: labels of 200 voxels or more none of which lies in a cell
-        with that label, or whose cells have less than 0.6 or more than 1.5 times their volume, and components of labels
-        of 50 voxels or more without a cell. A requirement that cannot be checked, for lack
-        of memory, counts as violated, with the reason, and the mesh is kept.
+        With `violated`, empty if all are met. `min_dihedral`: tetrahedra with a smaller dihedral
+        angle. `box`: nodes farther beyond the image's box than the initial mesh's. `cover`: voxels
+        or volume lost or gained relative to the initial mesh. Within a mask, instead of the last,
+        `overlap`: voxels that lie in two cells; `mask`: a Dice with the mask below 0.9; and
+        `components`: more connected components than the mask, or components of the mask, or parts
+        far from any cell, of 50 voxels or more without a cell. `manifold`: edges or nodes at which
+        the boundary, within a mask, or the interface of two labels is not a manifold. `labels`:
+        labels of 200 voxels or more none of which lies in a cell with that label, or whose cells
+        have less than 0.6 or more than 1.5 times their volume, and components of labels of 50
+        voxels or more without a cell. A requirement that cannot be checked, for lack of memory,
+        counts as violated, with the reason, and the mesh is kept.
     """
-    of_domain: dict[str, Callable[[], dict[str, str]]] = {"cover": lambda: _violated_cover(result, start)}
+    of_domain: dict[str, Callable[[], dict[str, str]]] = {
+        "cover": lambda: _violated_cover(result, start)
+    }
     pieces, n_pieces = result.mesh.straight_pieces()
     owner = cache(lambda: cell_of_voxel(content.image, pieces) // n_pieces)
     if (region := content.region) is not None:
@@ -112,7 +128,9 @@ def checked_curved(result: MeshingResult, content: Content) -> MeshingResult:
     if result.mesh.midpoints is None:
         return result
     violated = {name: words for name, words in result.violated.items() if name not in OF_VOXELS}
-    return result._replace(violated={**violated, **checked(result, content, 0.0, result.mesh).violated})
+    return result._replace(
+        violated={**violated, **checked(result, content, 0.0, result.mesh).violated}
+    )
 
 
 def violated_box(mesh: Mesh, image: Image, start: Mesh | None = None) -> dict[str, str]:
@@ -123,8 +141,14 @@ def violated_box(mesh: Mesh, image: Image, start: Mesh | None = None) -> dict[st
 
 
 def checked_in_box(result: MeshingResult, grid: Image, min_dihedral: float) -> MeshingResult:
-    """Like `checked`, for a mesh that fills the box of an image, whose voxels need not be in memory."""
-    violated = _violated_min_dihedral(result, min_dihedral) | _uncovered(grid, result) | violated_box(result.mesh, grid)
+    """Like `checked`, for a mesh that fills the box of an image, whose voxels need not be in
+    memory.
+    """
+    violated = (
+        _violated_min_dihedral(result, min_dihedral)
+        | _uncovered(grid, result)
+        | violated_box(result.mesh, grid)
+    )
     return result._replace(violated=violated)
 
 
@@ -134,29 +158,44 @@ def _violated_min_dihedral(result: MeshingResult, min_dihedral: float) -> dict[s
         return {}
     angles = dihedral_angles(mesh.points, mesh.cells).min(axis=1)
     below = int((angles < min_dihedral - ANGLE_ROUNDING).sum())
-    words = f"{below} of {len(angles)} cells have a dihedral angle below {min_dihedral:g} degrees, down to "
-    first = "more `iterations`, as none was made" if result.history[-1].iteration == 0 else "more nodes, a lower `k_D`"
+    words = (
+        f"{below} of {len(angles)} cells have a dihedral angle below {min_dihedral:g} "
+        "degrees, down to "
+    )
+    first = (
+        "more `iterations`, as none was made"
+        if result.history[-1].iteration == 0
+        else "more nodes, a lower `k_D`"
+    )
     words += f"{angles.min():.2f}; allow {first}, or a lower `min_dihedral`"
     return {"min_dihedral": words} if below else {}
 
 
-def requested(result: MeshingResult, content: Content, target_error: float | None, is_filled: bool) -> MeshingResult:
+def requested(
+    result: MeshingResult, content: Content, target_error: float | None, is_filled: bool
+) -> MeshingResult:
     """Add requests to `mesh_image` that a run's result does not meet to its violated requirements.
 
-    `error`: an unexplained variance above `target_error`. `cover`: uncovered voxels or volume, if the mesh should fill
-    the image's box (`is_filled`). `manifold`: edges or nodes at which the boundary of the user's own mesh is none.
+    `error`: an unexplained variance above `target_error`. `cover`: uncovered voxels or volume, if
+    the mesh should fill the image's box (`is_filled`). `manifold`: edges or nodes at which the
+    boundary of the user's own mesh is none.
     """
     violated = dict(result.violated)
     fraction = unexplained_by(content, result.mesh, result.history[-1])
     if target_error is not None and fraction > target_error:
         ratio = float(f"{nodes_ratio(fraction, target_error):.2g}")
         rest = (
-            f"as the run was cut short ({result.ended}); allow more time or memory, or raise `target_error`"
+            f"as the run was cut short ({result.ended}); allow more time or memory, or raise "
+            "`target_error`"
             if result.ended in CUT_SHORT
-            else f"which requires about {ratio:g} times the nodes; allow more (`nodes_max`), smaller cells or more "
+            else f"which requires about {ratio:g} times the nodes; allow more (`nodes_max`), "
+            "smaller cells or more "
             "iterations, or raise `target_error`"
         )
-        violated["error"] = f"{fraction:.4g} of the image's variance is unexplained, more than {target_error:g}, {rest}"
+        violated["error"] = (
+            f"{fraction:.4g} of the image's variance is unexplained, more than {target_error:g}, "
+            f"{rest}"
+        )
     violated |= _uncovered(content.image, result) if is_filled else {}
     if not is_filled and content.region is None and (problems := manifold_problems(result.mesh)):
         violated["manifold"] = "; ".join([*problems, "mend the initial mesh"])
@@ -164,13 +203,18 @@ def requested(result: MeshingResult, content: Content, target_error: float | Non
 
 
 def nodes_ratio(fraction: float, target_error: float, rate: float = ERROR_RATE) -> float:
-    """Return how many times the nodes that leave a fraction of the variance unexplained a target error takes."""
+    """Return how many times the nodes that leave a fraction of the variance unexplained a target
+    error takes.
+    """
     return float((fraction / (ERROR_AIM * target_error)) ** (1.0 / rate))
 
 
 def unexplained_by(content: Content, mesh: Mesh, record: IterationRecord) -> float:
-    """Return the unexplained variance of a mesh with this record, `tetopt.energy.discretization.unexplained`; or 0."""
-    if content.region is None and record.n_voxels == content.n_voxels:  # also if the voxels stay in their file
+    """Return the unexplained variance of a mesh with this record,
+    `tetopt.energy.discretization.unexplained`; or 0.
+    """
+    # also if the voxels stay in their file
+    if content.region is None and record.n_voxels == content.n_voxels:
         return record.E_D / (content.variance * content.volume or 1.0)
     return unexplained(content, mesh) or 0.0
 
@@ -179,7 +223,10 @@ def _uncovered(image: Image, result: MeshingResult) -> dict[str, str]:
     outside, volume = prod(image.shape) - result.history[-1].n_voxels, _volume(result.mesh)
     if outside == 0 and abs(volume / image.volume - 1.0) < VOLUME_ROUNDING:
         return {}
-    words = f"the mesh does not cover the image: {outside} voxels are outside, and its volume is {volume:.9g} of "
+    words = (
+        f"the mesh does not cover the image: {outside} voxels are outside, and its volume "
+        f"is {volume:.9g} of "
+    )
     return {"cover": f"{words}{image.volume:.9g} mm^{image.ndim}; please report this"}
 
 
@@ -188,7 +235,10 @@ def _violated_cover(result: MeshingResult, start: Mesh) -> dict[str, str]:
     gained = result.history[-1].n_voxels - result.history[0].n_voxels
     if gained == 0 and abs(volume / before - 1.0) <= BOUNDARY_ROUNDING:
         return {}
-    words = f"the mesh no longer covers its initial domain: {gained:+d} voxels, and its volume is {volume:.9g} of "
+    words = (
+        f"the mesh no longer covers its initial domain: {gained:+d} voxels, and its volume "
+        f"is {volume:.9g} of "
+    )
     return {"cover": f"{words}{before:.9g} mm^{start.ndim}; please report this"}
 
 
@@ -197,37 +247,58 @@ def _violated_mask(
 ) -> dict[str, str]:
     violated = {}
     is_covered, inside = owner >= 0, region.inside
-    if result.mesh.midpoints is None and (twice := result.history[-1].n_voxels - int(is_covered.sum())):
+    if result.mesh.midpoints is None and (
+        twice := result.history[-1].n_voxels - int(is_covered.sum())
+    ):
         violated["overlap"] = (
-            f"cells overlap: {twice} voxels lie in two cells; allow more nodes, and please report this"
+            f"cells overlap: {twice} voxels lie in two cells; allow more nodes, and please "
+            "report this"
         )
     if dice is None:
         dice = 2.0 * int((is_covered & inside).sum()) / max(int(is_covered.sum() + inside.sum()), 1)
     if dice < MASK_DICE:
         violated["mask"] = (
-            f"the mesh and the mask overlap with a Dice of only {dice:.3f}: cells are too large for the mask's detail; "
+            f"the mesh and the mask overlap with a Dice of only {dice:.3f}: cells are too large "
+            "for the mask's detail; "
             "allow more nodes"
         )
     return violated
 
 
-def _violated_components(content: Content, region: Region, mesh: Mesh, owner: NDArray[np.int64]) -> dict[str, str]:
+def _violated_components(
+    content: Content, region: Region, mesh: Mesh, owner: NDArray[np.int64]
+) -> dict[str, str]:
     n_cells, texts = np.sort(np.bincount(components(mesh.cells)))[::-1], []
     planes, affine = _own_voxels(content)
     n_mask, lost = voxel_components(region.inside[planes], owner[planes] >= 0, affine)
     if len(n_cells) > max(n_mask, 1):
-        words = f"the mesh has {len(n_cells)} connected components, the mask {n_mask}; the smallest have"
+        words = (
+            f"the mesh has {len(n_cells)} connected components, the mask {n_mask}; the "
+            "smallest have"
+        )
         texts.append(f"{words} {', '.join(map(str, n_cells[:-4:-1]))} cells")
     large = [(each, "") for each in lost if each.voxels >= COMPONENT_VOXELS]
-    texts += [f"components of the mask {LARGE_COMPONENTS} without a cell: {_listed(large)}"] if large else []
+    texts += (
+        [f"components of the mask {LARGE_COMPONENTS} without a cell: {_listed(large)}"]
+        if large
+        else []
+    )
     bare = _bare_parts(mesh, region.inside[planes] & (owner[planes] < 0), affine)
     far = [(each, "") for each in bare if each.voxels >= COMPONENT_VOXELS]
-    texts += [f"parts of the mask {LARGE_COMPONENTS} with no cell near: {_listed(far)}"] if far and not large else []
+    texts += (
+        [f"parts of the mask {LARGE_COMPONENTS} with no cell near: {_listed(far)}"]
+        if far and not large
+        else []
+    )
     return {"components": "; ".join([*texts, "allow more nodes"])} if texts else {}
 
 
-def _bare_parts(mesh: Mesh, is_bare: NDArray[np.bool_], affine: NDArray[np.float64]) -> tuple[LostComponent, ...]:
-    """Components of a mask's voxels without a cell that lie farther from the nearest node than its longest edge."""
+def _bare_parts(
+    mesh: Mesh, is_bare: NDArray[np.bool_], affine: NDArray[np.float64]
+) -> tuple[LostComponent, ...]:
+    """Components of a mask's voxels without a cell that lie farther from the nearest node than
+    its longest edge.
+    """
     ends, longest = mesh.cells[:, edge_pairs(mesh.ndim)], np.zeros(len(mesh.points))
     np.maximum.at(longest, ends, np.sqrt(squared_edges(mesh.points, mesh.cells))[:, :, None])
     index = np.argwhere(is_bare)
@@ -262,7 +333,11 @@ class LabelFit(NamedTuple):
     @property
     def is_off(self) -> bool:
         """True if a large label has cells of too much or too little volume."""
-        return self.voxels >= LABEL_VOXELS and self.is_met and not LEAST_VOLUME <= self.volume_ratio <= MOST_VOLUME
+        return (
+            self.voxels >= LABEL_VOXELS
+            and self.is_met
+            and not LEAST_VOLUME <= self.volume_ratio <= MOST_VOLUME
+        )
 
     @property
     def is_faulty(self) -> bool:
@@ -271,9 +346,15 @@ class LabelFit(NamedTuple):
 
     @property
     def pieces(self) -> tuple[LostComponent, ...]:
-        """The large ones of a tissue that has cells elsewhere; those of the space between tissues do not count."""
+        """The large ones of a tissue that has cells elsewhere; those of the space between
+        tissues do not count.
+        """
         is_exempt = self.is_lost or self.label == BACKGROUND_LABEL
-        return () if is_exempt else tuple(each for each in self.components if each.voxels >= COMPONENT_VOXELS)
+        return (
+            ()
+            if is_exempt
+            else tuple(each for each in self.components if each.voxels >= COMPONENT_VOXELS)
+        )
 
 
 def label_faults(fits: Iterable[LabelFit], words: Mapping[int, str]) -> str:
@@ -281,23 +362,33 @@ def label_faults(fits: Iterable[LabelFit], words: Mapping[int, str]) -> str:
     faulty, texts = [fit for fit in fits if fit.is_faulty], []
     if lost := [words[fit.label] for fit in faulty if fit.is_lost]:
         texts.append(
-            f"no voxel of label {', '.join(lost)}, of {LABEL_VOXELS} voxels or more, lies in a cell with that label"
+            f"no voxel of label {', '.join(lost)}, of {LABEL_VOXELS} voxels or more, lies in a "
+            "cell with that label"
         )
-    off = sorted((fit for fit in faulty if fit.is_off), key=lambda fit: -abs(np.log(fit.volume_ratio)))
+    off = sorted(
+        (fit for fit in faulty if fit.is_off), key=lambda fit: -abs(np.log(fit.volume_ratio))
+    )
     if off:
         rows = ", ".join(f"{fit.volume_ratio:.3g} for label {words[fit.label]}" for fit in off)
-        texts.append(f"the volume of cells is not {LEAST_VOLUME:g} to {MOST_VOLUME:g} times that of voxels: {rows}")
+        texts.append(
+            f"the volume of cells is not {LEAST_VOLUME:g} to {MOST_VOLUME:g} times that of "
+            f"voxels: {rows}"
+        )
     pieces = [(each, f" of label {words[fit.label]}") for fit in faulty for each in fit.pieces]
-    texts += [f"components of labels {LARGE_COMPONENTS} without a cell: {_listed(pieces)}"] if pieces else []
+    texts += (
+        [f"components of labels {LARGE_COMPONENTS} without a cell: {_listed(pieces)}"]
+        if pieces
+        else []
+    )
     return "; ".join(texts)
 
 
 def label_remedy(fits: Iterable[LabelFit]) -> str:
     """Return what helps labels that violate the requirement.
 
-    A higher weight hardly gives small components cells, at the expense of volumes: in the MNI152 T1 with tissues and
-    5,000 nodes, weight 4 leaves 23 of 28 without a cell, and fluid with -23 instead of -20 % of its volume; 20,000
-    nodes leave 2, and -10 %.
+    A higher weight hardly gives small components cells, at the expense of volumes: in the MNI152 T1
+    with tissues and 5,000 nodes, weight 4 leaves 23 of 28 without a cell, and fluid with -23
+    instead of -20 % of its volume; 20,000 nodes leave 2, and -10 %.
     """
     return PIECES_REMEDY if any(fit.pieces for fit in fits) else LABEL_REMEDY
 
@@ -309,10 +400,14 @@ def _listed(pieces: list[tuple[LostComponent, str]]) -> str:
         f"{each.voxels} voxels{words} at ({', '.join(f'{x:.4g}' for x in each.place)}) mm"
         for each, words in ranked[:COMPONENTS_LISTED]
     ]
-    return ", ".join(rows) + (f" and {len(ranked) - len(rows)} more" if len(ranked) > len(rows) else "")
+    return ", ".join(rows) + (
+        f" and {len(ranked) - len(rows)} more" if len(ranked) > len(rows) else ""
+    )
 
 
-def _violated_labels(content: Content, result: MeshingResult, owner: Callable[[], NDArray[np.int64]]) -> dict[str, str]:
+def _violated_labels(
+    content: Content, result: MeshingResult, owner: Callable[[], NDArray[np.int64]]
+) -> dict[str, str]:
     if content.memberships is None or result.labels is None:
         return {}
     fits = _label_fits(content, content.memberships, result.mesh, result.labels, owner())
@@ -321,7 +416,11 @@ def _violated_labels(content: Content, result: MeshingResult, owner: Callable[[]
 
 
 def _label_fits(
-    content: Content, members: Memberships, mesh: Mesh, of_cell: NDArray[np.int64], owner: NDArray[np.int64]
+    content: Content,
+    members: Memberships,
+    mesh: Mesh,
+    of_cell: NDArray[np.int64],
+    owner: NDArray[np.int64],
 ) -> list[LabelFit]:
     """Compare each label with its cells, as `tetopt.measure.fidelity.label_fidelity` does."""
     planes, affine = _own_voxels(content)
@@ -345,7 +444,9 @@ def _label_fits(
 
 
 def _own_voxels(content: Content) -> tuple[tuple[slice, ...], NDArray[np.float64]]:
-    """Select the voxels of a content that have the centres of its image's own voxels; also return their affine."""
+    """Select the voxels of a content that have the centres of its image's own voxels; also
+    return their affine.
+    """
     image, factors = content.image, (1,) * content.image.ndim
     if content.memberships is not None:
         factors = supersampling(content.given.spacing)

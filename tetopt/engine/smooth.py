@@ -1,14 +1,15 @@
 """Move nodes by Newton steps on E of their stars, one colour of groups at a time.
 
-The shape energy's derivative has a closed form. For fixed connectivity, that of E_D needs only the facets around the
-node: with hbar_j the mean of cell j, dE_D/dx_a is the sum over the cells of the integral of (h - hbar_j)^2 phi_a n
-over their facets, where phi_a is the node's hat function and n the outward normal; the change of hbar drops out,
-because hbar is the minimiser. Two cells share a facet with opposite normals, which leaves (h - hbar_j)^2 -
-(h - hbar_i)^2. The second derivative of the shape energy is exact; for E_D only the change of h across facets is used.
+The shape energy's derivative has a closed form. For fixed connectivity, that of E_D needs only the
+facets around the node: with hbar_j the mean of cell j, dE_D/dx_a is the sum over the cells of the
+integral of (h - hbar_j)^2 phi_a n over their facets, where phi_a is the node's hat function and n
+the outward normal; the change of hbar drops out, because hbar is the minimiser. Two cells share a
+facet with opposite normals, which leaves (h - hbar_j)^2 - (h - hbar_i)^2. The second derivative of
+the shape energy is exact; for E_D only the change of h across facets is used.
 
-Groups of nodes of one colour share no cell, so they are processed, and their stars rewritten, in parallel; the result
-does not depend on the threads. A move is made only if no cell of the star loses its orientation (exactly, in integers)
-and the star's measured energy falls, so E never rises.
+Groups of nodes of one colour share no cell, so they are processed, and their stars rewritten, in
+parallel; the result does not depend on the threads. A move is made only if no cell of the star
+loses its orientation (exactly, in integers) and the star's measured energy falls, so E never rises.
 """
 
 from __future__ import annotations
@@ -74,17 +75,22 @@ from tetopt.system.kernels import (
 
 FACET_PARTS = 8  # most parts of a facet's edge for integrating h over it; four times as many in 2-D
 PART_VOXELS = 3.0  # voxels between the points of this integration
-FACET_ASIDE = 0.25  # distance to either side at which h is sampled: E falls by less per sweep at 0.05 and at 0.5
-BEND_FRACTION = 0.4  # of the image's curvature: jumps of h end within voxels, and steps are longer than that
-FLAT_BEND = 1e-9  # least determinant of a curvature over the product of its diagonal that allows division
-FIRST_STEP_FRACTION = 0.4  # longest first step, of the distance to the nearest centroid of the star's cells
+# distance to either side at which h is sampled: E falls by less per sweep at 0.05 and at 0.5
+FACET_ASIDE = 0.25
+# of the image's curvature: jumps of h end within voxels, and steps are longer than that
+BEND_FRACTION = 0.4
+# least determinant of a curvature over the product of its diagonal that allows division
+FLAT_BEND = 1e-9
+# longest first step, of the distance to the nearest centroid of the star's cells
+FIRST_STEP_FRACTION = 0.4
 AXIS_STEP_FRACTION = 0.1  # of that distance: search step of a stalled node along the axes
 BLOCK_NODES = 128  # nodes in a group, at most: their data fit into the cache
 APPROACH_TRIALS = 4  # fractions of the way to a surface: all of it, a half, ...
-# of the mean of a node's edges: shorter ones are not made on the way to a surface. Without it, 97 edges, not 49, are
-# shorter than a third of those around them (CT with 41 labels, 4,000 nodes)
+# of the mean of a node's edges: shorter ones are not made on the way to a surface. Without it, 97
+# edges, not 49, are shorter than a third of those around them (CT with 41 labels, 4,000 nodes)
 SHORTEST_FRACTION = 1.0 / 3.0
-LINE_TRIALS = 2  # energies measured along the step: a third one gains a twentieth of the search along the axes
+# energies measured along the step: a third one gains a twentieth of the search along the axes
+LINE_TRIALS = 2
 
 
 class Blocks(NamedTuple):
@@ -96,7 +102,9 @@ class Blocks(NamedTuple):
 
 
 def blocks(ticks: NDArray[np.int64]) -> Blocks:
-    """Group nodes along a Z-order curve (Morton 1966), which gives equal groups on a graded mesh, too."""
+    """Group nodes along a Z-order curve (Morton 1966), which gives equal groups on a graded
+    mesh, too.
+    """
     size = max(1, min(BLOCK_NODES, len(ticks) // 64))
     low, high = ticks.min(axis=0), ticks.max(axis=0)
     cell = (ticks - low) * 1023 // np.maximum(high - low, 1)
@@ -119,11 +127,12 @@ def sweep(
     is_over: Callable[[], bool] = lambda: False,
     gains: NDArray[np.float64] | None = None,
 ) -> bool:
-    """Move the nodes in `may_move` (N,), each along the axes and on the surfaces that `is_frozen` allows.
+    """Move the nodes in `may_move` (N,), each along the axes and on the surfaces that `is_frozen`
+    allows.
 
-    The reduction of E by each move is written to `gains` (N,).
-    Groups of one colour share no cell and are processed in parallel, their nodes one after the other. These read the
-    same voxels from the cache, 1.5 to 2 times faster than nodes of one colour all over the volume. Returns False if
+    The reduction of E by each move is written to `gains` (N,). Groups of one colour share no cell
+    and are processed in parallel, their nodes one after the other. These read the same voxels from
+    the cache, 1.5 to 2 times faster than nodes of one colour all over the volume. Returns False if
     `is_over` cut the sweep short, between two colours.
     """
     gains = np.zeros(len(may_move)) if gains is None else gains
@@ -139,12 +148,16 @@ def sweep(
 def colours_of(state: State, stars: NodeStars, groups: Blocks) -> list[NDArray[np.int64]]:
     """The groups of each colour; groups of one colour share no cell."""
     start, cells = _block_stars(groups.nodes, groups.start, stars.start, stars.cells)
-    colours = greedy_colours(groups.of_node[state.complex.cells[: state.complex.n_cells[0]]], start, cells)
+    colours = greedy_colours(
+        groups.of_node[state.complex.cells[: state.complex.n_cells[0]]], start, cells
+    )
     return [np.flatnonzero(colours == colour) for colour in range(int(colours.max()) + 1)]
 
 
 @entry
-def _block_stars(nodes: Ints1, start: Ints1, star_start: Ints1, star_cells: Ints1) -> tuple[Ints1, Ints1]:
+def _block_stars(
+    nodes: Ints1, start: Ints1, star_start: Ints1, star_cells: Ints1
+) -> tuple[Ints1, Ints1]:
     """The cells around the nodes of each group, as `Stars`; cells may occur several times."""
     first = np.zeros(len(start), dtype=np.int64)
     cells = np.empty(len(star_cells), dtype=np.int64)
@@ -159,7 +172,9 @@ def _block_stars(nodes: Ints1, start: Ints1, star_start: Ints1, star_cells: Ints
 
 
 def gradient(state: State, stars: NodeStars) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Derivatives of the weighted shape and image terms of E by each node's position, (N, 3) each, per mm."""
+    """Derivatives of the weighted shape and image terms of E by each node's position, (N, 3)
+    each, per mm.
+    """
     shape, image = np.zeros((len(state.complex.ticks), 3)), np.zeros((len(state.complex.ticks), 3))
     run(_gradients, len(shape), Gradients(shape, image, state, stars))
     return shape, image
@@ -167,13 +182,20 @@ def gradient(state: State, stars: NodeStars) -> tuple[NDArray[np.float64], NDArr
 
 @unit
 def _facet_moments(
-    moment: Floats2, ticks: Ints2, node: int, b: int, c: int, aside: tuple[float, float, float], objective: Objective
+    moment: Floats2,
+    ticks: Ints2,
+    node: int,
+    b: int,
+    c: int,
+    aside: tuple[float, float, float],
+    objective: Objective,
 ) -> float:
-    """Means of phi, h phi and phi^2 dh over the facet (node, b, c) or segment (node, b), with hat function phi.
+    """Means of phi, h phi and phi^2 dh over the facet (node, b, c) or segment (node, b), with hat
+    function phi.
 
-    h is the mean of the values at a place plus and minus `aside`, in voxels, minus the grid's shift, and dh is their
-    difference. moment (2, n_channels) gets the means of h phi and of phi^2 dh; the mean of phi, 1/3 (1/2 in 2-D), is
-    returned.
+    h is the mean of the values at a place plus and minus `aside`, in voxels, minus the grid's
+    shift, and dh is their difference. moment (2, n_channels) gets the means of h phi and of phi^2
+    dh; the mean of phi, 1/3 (1/2 in 2-D), is returned.
     """
     if objective.volume.is_short:
         return _moments_of(moment, objective.volume.short, ticks, node, b, c, aside, objective)
@@ -182,7 +204,14 @@ def _facet_moments(
 
 @helper
 def _moments_of(
-    moment: NDArray, prefix: NDArray, ticks: NDArray, node: int, b: int, c: int, aside: tuple, objective: Objective
+    moment: NDArray,
+    prefix: NDArray,
+    ticks: NDArray,
+    node: int,
+    b: int,
+    c: int,
+    aside: tuple,
+    objective: Objective,
 ) -> float:
     scale, weight = 2.0**-objective.bits, 0.0
     moment[:] = 0.0
@@ -193,7 +222,14 @@ def _moments_of(
         for p in range(parts):
             s = (p + 0.5) / parts
             weight += 1.0 - s
-            _add_sample(moment, prefix, (a[0], a[1] + s * e[1], a[2] + s * e[2]), aside, 1.0 - s, 1.0 / parts)
+            _add_sample(
+                moment,
+                prefix,
+                (a[0], a[1] + s * e[1], a[2] + s * e[2]),
+                aside,
+                1.0 - s,
+                1.0 / parts,
+            )
         return weight / parts
     f = minus(scaled(scale, row(ticks, c)), a)
     parts = min(max(int(np.sqrt(max(dot(e, e), dot(f, f))) / PART_VOXELS) + 1, 2), FACET_PARTS)
@@ -206,14 +242,22 @@ def _moments_of(
                 s = (p + (1.0 + half) / 3.0) / parts
                 t = (q + (1.0 + half) / 3.0) / parts
                 weight += 1.0 - s - t
-                at = a[0] + s * e[0] + t * f[0], a[1] + s * e[1] + t * f[1], a[2] + s * e[2] + t * f[2]
+                at = (
+                    a[0] + s * e[0] + t * f[0],
+                    a[1] + s * e[1] + t * f[1],
+                    a[2] + s * e[2] + t * f[2],
+                )
                 _add_sample(moment, prefix, at, aside, 1.0 - s - t, fraction)
     return weight * fraction
 
 
 @helper
-def _add_sample(moment: NDArray, prefix: NDArray, at: tuple, aside: tuple, phi: float, fraction: float) -> None:
-    """Add a fraction of phi h and of phi^2 dh at a place, in voxels, to the rows of `moment`; see `_facet_moments`."""
+def _add_sample(
+    moment: NDArray, prefix: NDArray, at: tuple, aside: tuple, phi: float, fraction: float
+) -> None:
+    """Add a fraction of phi h and of phi^2 dh at a place, in voxels, to the rows of `moment`;
+    see `_facet_moments`.
+    """
     most_i, most_j, most_k = prefix.shape[0] - 1, prefix.shape[1] - 1, prefix.shape[2] - 2
     i = min(max(int(np.rint(at[0] + aside[0])), 0), most_i)
     j = min(max(int(np.rint(at[1] + aside[1])), 0), most_j)
@@ -231,12 +275,18 @@ def _add_sample(moment: NDArray, prefix: NDArray, at: tuple, aside: tuple, phi: 
 
 @unit
 def _add_image_gradient(g: Floats1, H: Floats2, state: State, stars: NodeStars, node: int) -> None:
-    """Add the derivative of the weighted E_D by a node's position to g (3,), and its curvature to H (3, 3), per voxel.
+    """Add the derivative of the weighted E_D by a node's position to g (3,), and its curvature to H
+    (3, 3), per voxel.
 
-    As a facet moves by phi along its normal, the jump of (h - hbar)^2 across it changes with h. As in a Gauss-Newton
-    step, only this part of the curvature is used, and only if it is positive.
+    As a facet moves by phi along its normal, the jump of (h - hbar)^2 across it changes with h. As
+    in a Gauss-Newton step, only this part of the curvature is used, and only if it is positive.
     """
-    cells, sums, ticks, objective = state.complex.cells, state.complex.sums, state.complex.ticks, state.objective
+    cells, sums, ticks, objective = (
+        state.complex.cells,
+        state.complex.sums,
+        state.complex.ticks,
+        state.objective,
+    )
     n, first, scale = cells.shape[1], stars.start[node], 2.0**-objective.bits
     every, means = np.empty((2, objective.n_channels)), np.empty((2, objective.n_means))
     for r in range(first, stars.start[node + 1]):
@@ -244,7 +294,9 @@ def _add_image_gradient(g: Floats1, H: Floats2, state: State, stars: NodeStars, 
         for k in range(n):
             twin = stars.twin[r, k]
             if k == stars.corner[r] or twin < 0 or twin // n < r - first:
-                continue  # not a facet of the node, on the boundary, along which the node slides, or already done
+                # not a facet of the node, on the boundary, along which the node slides, or already
+                # done
+                continue
             other = stars.cells[first + twin // n]
             label_1, label_2 = state.complex.labels[cell], state.complex.labels[other]
             if _has_same_values(sums, cell, other, label_1, label_2, objective):
@@ -261,13 +313,18 @@ def _add_image_gradient(g: Floats1, H: Floats2, state: State, stars: NodeStars, 
                 elif c == node:
                     b, c = a, b
             normal, area = scaled(float(objective.hand), normal), np.sqrt(dot(normal, normal))
-            moment = means if label_1 == label_2 else every  # cells of one label differ only in their means
-            weight = _facet_moments(moment, ticks, node, b, c, scaled(FACET_ASIDE / area, normal), objective)
+            # cells of one label differ only in their means
+            moment = means if label_1 == label_2 else every
+            weight = _facet_moments(
+                moment, ticks, node, b, c, scaled(FACET_ASIDE / area, normal), objective
+            )
             jump, rise = 0.0, 0.0
             for channel in range(moment.shape[1]):
                 value_1 = cell_value(sums, cell, label_1, channel, objective)
                 value_2 = cell_value(sums, other, label_2, channel, objective)
-                jump += (value_2 - value_1) * (2.0 * moment[0, channel] - (value_1 + value_2) * weight)
+                jump += (value_2 - value_1) * (
+                    2.0 * moment[0, channel] - (value_1 + value_2) * weight
+                )
                 rise += (value_2 - value_1) * moment[1, channel]
             bend = BEND_FRACTION * max(rise, 0.0) / (FACET_ASIDE * area)
             for d in range(3):
@@ -277,8 +334,12 @@ def _add_image_gradient(g: Floats1, H: Floats2, state: State, stars: NodeStars, 
 
 
 @helper
-def _has_same_values(sums: NDArray, cell: int, other: int, label_1: int, label_2: int, objective: Objective) -> bool:
-    """True if two cells have equal values in all channels, as in the background, or one contains no voxel."""
+def _has_same_values(
+    sums: NDArray, cell: int, other: int, label_1: int, label_2: int, objective: Objective
+) -> bool:
+    """True if two cells have equal values in all channels, as in the background, or one contains
+    no voxel.
+    """
     count_1, count_2 = sums[cell, 0], sums[other, 0]
     if count_1 <= 0.0 or count_2 <= 0.0:
         return True
@@ -339,14 +400,15 @@ def _add_shape_gradient(
 ) -> tuple[float, float]:
     """Add the weighted shape energy's derivatives to g (3,), per mm, and H (3, 3), per mm^2.
 
-    Returns the distance in mm to the nearest centroid of the star's cells, and the star's worst cosine, up to the
-    angle limit.
+    Returns the distance in mm to the nearest centroid of the star's cells, and the star's worst
+    cosine, up to the angle limit.
     """
     cells, objective = state.complex.cells, state.objective
     n, power = cells.shape[1], objective.power
     dim, nearest, least = n - 1, np.inf, objective.angle_limit
-    # W is proportional to v^alpha S^p with alpha = 1 - 2 (p - 1) / n, on a graded mesh alpha = -2 p / n. The volume is
-    # linear in the corner's place, and S has the second derivative 2 n along each axis.
+    # W is proportional to v^alpha S^p with alpha = 1 - 2 (p - 1) / n, on a graded mesh alpha = -2 p
+    # / n. The volume is linear in the corner's place, and S has the second derivative 2 n along
+    # each axis.
     alpha = -2.0 * power / dim if objective.is_graded else 1.0 - 2.0 * (power - 1.0) / dim
     for r in range(stars.start[node], stars.start[node + 1]):
         cell, at = stars.cells[r], stars.corner[r]
@@ -363,7 +425,11 @@ def _add_shape_gradient(
             g[d] += W * slope
             H[d, d] += W * power * 2.0 * dim / S
             for m in range(3):
-                H[d, m] += W * (slope * (alpha * v[m] + power * w[m]) - alpha * v[d] * v[m] - power * w[d] * w[m])
+                H[d, m] += W * (
+                    slope * (alpha * v[m] + power * w[m])
+                    - alpha * v[d] * v[m]
+                    - power * w[d] * w[m]
+                )
         if n == 4 and least > -1.0:
             least = min(least, cosine_up_to_limit(x, objective))
     return np.sqrt(nearest) / n, least
@@ -411,12 +477,16 @@ TrialByValue = Annotated[Trial, by_value(Trial)]  # made by the kernels, several
 def trial_of(state: State, stars: NodeStars, node: int) -> Trial:
     """Space for measurements of a node's star."""
     size, fluxes = stars.start[node + 1] - stars.start[node], state.complex.fluxes
-    return Trial(np.empty((4, 3)), np.empty(size), np.empty((size, fluxes.shape[1], fluxes.shape[2])))
+    return Trial(
+        np.empty((4, 3)), np.empty(size), np.empty((size, fluxes.shape[1], fluxes.shape[2]))
+    )
 
 
 @inlined
 def star_misfit(state: State, stars: NodeStars, node: int) -> tuple:
-    """Minus the star's weighted misfit to the mask before a move, and True if a move may change it."""
+    """Minus the star's weighted misfit to the mask before a move, and True if a move may change
+    it.
+    """
     misfit, has_misfit = 0.0, False
     if state.objective.surface > 0.0:
         for r in range(stars.start[node], stars.start[node + 1]):
@@ -430,10 +500,11 @@ def star_misfit(state: State, stars: NodeStars, node: int) -> tuple:
 def star_shape(
     trial: Trial, limit: float, least: float, node: int, state: State, stars: NodeStars, joined: int
 ) -> float:
-    """Weighted shape energy of a node's star at the current ticks; each cell's is written to `trial.shapes`.
+    """Weighted shape energy of a node's star at the current ticks; each cell's is written to
+    `trial.shapes`.
 
-    It is infinite if a cell is flat or inverted or has a cosine below `least`, or once the energy exceeds `limit`.
-    Cells with the node `joined`, at whose place the node is, count as removed.
+    It is infinite if a cell is flat or inverted or has a cosine below `least`, or once the energy
+    exceeds `limit`. Cells with the node `joined`, at whose place the node is, count as removed.
     """
     cells, objective = state.complex.cells, state.objective
     has_limit = cells.shape[1] == 4 and least > -1.0
@@ -460,14 +531,27 @@ def star_shape(
 
 @inlined
 def star_image(
-    sums: NDArray, trial: Trial, energy: float, misfit: float, bound: float, node: int, state: State, stars: NodeStars
+    sums: NDArray,
+    trial: Trial,
+    energy: float,
+    misfit: float,
+    bound: float,
+    node: int,
+    state: State,
+    stars: NodeStars,
 ) -> tuple:
-    """Add the image energy of a node's star at the current ticks to `energy`, and its misfit to the misfit.
+    """Add the image energy of a node's star at the current ticks to `energy`, and its misfit to the
+    misfit.
 
-    It is infinite once the energy exceeds `bound`. Fluxes are written to `trial`, whose `shapes` are negative for
-    removed cells; `sums` (1, D) is work space for a cell's sums.
+    It is infinite once the energy exceeds `bound`. Fluxes are written to `trial`, whose `shapes`
+    are negative for removed cells; `sums` (1, D) is work space for a cell's sums.
     """
-    cells, objective, shapes, fluxes = state.complex.cells, state.objective, trial.shapes, trial.fluxes
+    cells, objective, shapes, fluxes = (
+        state.complex.cells,
+        state.objective,
+        trial.shapes,
+        trial.fluxes,
+    )
     n, D, first = cells.shape[1], fluxes.shape[2], stars.start[node]
     for r in range(first, stars.start[node + 1]):
         if shapes[r - first] < 0.0:
@@ -498,15 +582,24 @@ def star_image(
 
 @unit
 def star_energy(
-    trial: TrialByValue, limit: float, least: float, node: int, state: State, stars: NodeStars, joined: int
+    trial: TrialByValue,
+    limit: float,
+    least: float,
+    node: int,
+    state: State,
+    stars: NodeStars,
+    joined: int,
 ) -> float:
-    """Energy of a node's star at the current ticks, with details in `trial`; infinite as for `star_shape`.
+    """Energy of a node's star at the current ticks, with details in `trial`; infinite as for
+    `star_shape`.
 
     It includes the growth of the star's misfit to the mask.
     """
     misfit, has_misfit = star_misfit(state, stars, node)
-    bound = np.inf if has_misfit else limit  # partial sums are meaningless until they include all of the misfit
-    energy = star_shape(trial, bound, least, node, state, stars, joined)  # cheap rejections before any voxel is read
+    # partial sums are meaningless until they include all of the misfit
+    bound = np.inf if has_misfit else limit
+    # cheap rejections before any voxel is read
+    energy = star_shape(trial, bound, least, node, state, stars, joined)
     if energy == np.inf or state.objective.image == 0.0:
         return energy
     sums = np.empty((1, trial.fluxes.shape[2]))
@@ -552,7 +645,9 @@ def _sweep(work: Sweep, number: int) -> None:
 
 
 class Search(NamedTuple):
-    """The best place of a node so far, and space for two trials: slot[0] is the best, the other one the next."""
+    """The best place of a node so far, and space for two trials: slot[0] is the best, the other
+    one the next.
+    """
 
     x: NDArray[np.float64]  # (4, 3) room for a cell's corners
     normal: NDArray[np.float64]  # (7, 3) see `tetopt.engine.surface.normals_at`
@@ -564,12 +659,18 @@ class Search(NamedTuple):
     fluxes: NDArray[np.float64]  # (2, R, n+1, D)
 
 
-# Its steps and those of `star_energy` are inlined: compared with one long function, a sweep took 12 % longer with
-# calls, and 3 to 8 % longer with inlined steps (MNI152 T1, 5,000 nodes, one thread).
+# Its steps and those of `star_energy` are inlined: compared with one long function, a sweep took 12
+# % longer with calls, and 3 to 8 % longer with inlined steps (MNI152 T1, 5,000 nodes, one thread).
 @unit
 def _move(node: int, state: State, stars: NodeStars) -> float:
-    """Move one node towards the least energy of its star, if that lowers it; return the reduction."""
-    ticks, fluxes, has_image = state.complex.ticks, state.complex.fluxes, state.objective.image > 0.0
+    """Move one node towards the least energy of its star, if that lowers it; return the
+    reduction.
+    """
+    ticks, fluxes, has_image = (
+        state.complex.ticks,
+        state.complex.fluxes,
+        state.objective.image > 0.0,
+    )
     x, normal, g, H = np.empty((4, 3)), np.zeros((7, 3)), np.zeros(3), np.zeros((3, 3))
     # A star with flat cells may stay as it is, but not get worse, hence its own `least`.
     nearest, least = _add_shape_gradient(g, H, x, state, stars, node)
@@ -581,7 +682,10 @@ def _move(node: int, state: State, stars: NodeStars) -> float:
     is_sliding = slides(normal, state, node)
     is_bound = is_sliding and not band_of(state, node) > 0.0
     step = _sliding_step(normal, g, node, state) if is_bound else _newton_step(g, H, node, state)
-    moved, slope = times(state.objective.matrix, step), g[0] * step[0] + g[1] * step[1] + g[2] * step[2]
+    moved, slope = (
+        times(state.objective.matrix, step),
+        g[0] * step[0] + g[1] * step[1] + g[2] * step[2],
+    )
     square = dot(moved, moved)  # mm^2
     if not (square > 0.0 and slope < 0.0):
         return 0.0
@@ -589,9 +693,15 @@ def _move(node: int, state: State, stars: NodeStars) -> float:
     for r in range(stars.start[node], stars.start[node + 1]):
         energy += cell_energy(state, stars.cells[r])
     search = Search(
-        x, normal, is_sliding, np.empty(1), np.empty((1, 3), dtype=np.int64), np.zeros(1, dtype=np.int64),
-        np.empty((2, size)), np.empty((2, size, fluxes.shape[1], fluxes.shape[2]))
-    )  # fmt: skip
+        x,
+        normal,
+        is_sliding,
+        np.empty(1),
+        np.empty((1, 3), dtype=np.int64),
+        np.zeros(1, dtype=np.int64),
+        np.empty((2, size)),
+        np.empty((2, size, fluxes.shape[1], fluxes.shape[2])),
+    )
     search.best[0] = energy
     put_row(search.place, 0, row(ticks, node))
     length, bend = FIRST_STEP_FRACTION * nearest / np.sqrt(square), dot(step, times(H, step))
@@ -633,7 +743,8 @@ def _per_mm(g: NDArray, state: State) -> tuple:
 
 @helper
 def _newton_step(g: NDArray, H: NDArray, node: int, state: State) -> tuple:
-    """-H^-1 g, in index units, over the axes along which a node may move; down the gradient if H is not positive.
+    """-H^-1 g, in index units, over the axes along which a node may move; down the gradient if H is
+    not positive.
 
     The rows of the other axes are cleared.
     """
@@ -657,7 +768,9 @@ def _newton_step(g: NDArray, H: NDArray, node: int, state: State) -> tuple:
 
 @helper
 def _sliding_step(normal: NDArray, g: NDArray, node: int, state: State) -> tuple:
-    """Down the gradient g (3,), along the axes and on the surfaces on which a node may move; index units."""
+    """Down the gradient g (3,), along the axes and on the surfaces on which a node may move;
+    index units.
+    """
     step = scaled(-1.0, times(projection_at(state, node), _per_mm(g, state)))
     count = normals_at(normal, state, node)
     rise = dot(row(normal, 0), step), dot(row(normal, 1), step), dot(row(normal, 2), step)
@@ -667,14 +780,30 @@ def _sliding_step(normal: NDArray, g: NDArray, node: int, state: State) -> tuple
 
 @inlined
 def _try_place(
-    search: Search, place: tuple, limit: float, least: float, node: int, state: State, stars: NodeStars
+    search: Search,
+    place: tuple,
+    limit: float,
+    least: float,
+    node: int,
+    state: State,
+    stars: NodeStars,
 ) -> float:
-    """Energy of the star with the node at a place in ticks, or on the surface next to it; stores the best place."""
+    """Energy of the star with the node at a place in ticks, or on the surface next to it; stores
+    the best place.
+    """
     put_row(state.complex.ticks, node, place)
     if search.is_sliding and not slid(search.normal, state, stars, node):
         return np.inf
     slot = 1 - search.slot[0]
-    value = star_energy(Trial(search.x, search.shapes[slot], search.fluxes[slot]), limit, least, node, state, stars, -1)
+    value = star_energy(
+        Trial(search.x, search.shapes[slot], search.fluxes[slot]),
+        limit,
+        least,
+        node,
+        state,
+        stars,
+        -1,
+    )
     if value < search.best[0]:
         search.best[0], search.slot[0] = value, slot
         put_row(search.place, 0, row(state.complex.ticks, node))
@@ -683,7 +812,14 @@ def _try_place(
 
 @inlined
 def _search_line(
-    search: Search, step: tuple, t: float, slope: float, least: float, node: int, state: State, stars: NodeStars
+    search: Search,
+    step: tuple,
+    t: float,
+    slope: float,
+    least: float,
+    node: int,
+    state: State,
+    stars: NodeStars,
 ) -> None:
     """Try the place t steps ahead, then the vertex of the parabola through the measured values.
 
@@ -719,11 +855,19 @@ def _search_line(
 
 @inlined
 def _search_axes(
-    search: Search, step: tuple, length: float, least: float, node: int, state: State, stars: NodeStars
+    search: Search,
+    step: tuple,
+    length: float,
+    least: float,
+    node: int,
+    state: State,
+    stars: NodeStars,
 ) -> None:
-    """Search by a length, mm, along each free axis in turn, towards the step first, and continue where E is lower.
+    """Search by a length, mm, along each free axis in turn, towards the step first, and continue
+    where E is lower.
 
-    The gradient is that of the continuous image, the energy that of its voxels: a stalled node may still lower E so.
+    The gradient is that of the continuous image, the energy that of its voxels: a stalled node may
+    still lower E so.
     """
     M = state.objective.matrix
     for axis in range(4 - state.complex.cells.shape[1], 3):
@@ -747,18 +891,24 @@ def _search_axes(
 
 @unit
 def slid(normal: Floats2, state: State, stars: NodeStars, node: int) -> bool:
-    """Return a moved node to its surfaces; True if it gets there and the mask's facets keep facing outwards."""
+    """Return a moved node to its surfaces; True if it gets there and the mask's facets keep
+    facing outwards.
+    """
     is_there = put_on_surface(normal, state, node)
-    return is_there and (not state.complex.is_frozen[node, 3] or star_faces_up(normal, state, stars, node, -1))
+    return is_there and (
+        not state.complex.is_frozen[node, 3] or star_faces_up(normal, state, stars, node, -1)
+    )
 
 
 # Move nodes of a mask's surface, or between labels, to their places there, where they will slide.
 
 
 def attract(state: State, stars: NodeStars, groups: Blocks, angle_limit: float) -> None:
-    """Move nodes to their places at surfaces, or as far as no cell becomes flatter than `angle_limit`.
+    """Move nodes to their places at surfaces, or as far as no cell becomes flatter than
+    `angle_limit`.
 
-    A cell that is flatter already may not get worse. E may rise. `angle_limit` is minus a cosine, as in `Objective`.
+    A cell that is flatter already may not get worse. E may rise. `angle_limit` is minus a cosine,
+    as in `Objective`.
     """
     lowered = state._replace(objective=state.objective._replace(angle_limit=angle_limit))
     is_beside = (state.complex.meeting[:, 1] >= 0) | state.complex.is_frozen[:, 3]
@@ -792,14 +942,17 @@ def _approach(node: int, state: State, stars: NodeStars) -> None:
     way, fraction, trial = minus(row(ticks, node), here), 1.0, trial_of(state, stars, node)
     for _ in range(APPROACH_TRIALS):
         put_row(
-            ticks, node,
+            ticks,
+            node,
             (
                 here[0] + np.int64(np.rint(fraction * way[0])),
                 here[1] + np.int64(np.rint(fraction * way[1])),
                 here[2] + np.int64(np.rint(fraction * way[2])),
             ),
-        )  # fmt: skip
-        is_free = not state.complex.is_frozen[node, 3] or star_faces_up(normal, state, stars, node, -1)
+        )
+        is_free = not state.complex.is_frozen[node, 3] or star_faces_up(
+            normal, state, stars, node, -1
+        )
         is_free = is_free and _shortest(node, state, stars) >= shortest
         if is_free and star_energy(trial, np.inf, least, node, state, stars, -1) < np.inf:
             store(trial, node, state, stars)
@@ -810,7 +963,9 @@ def _approach(node: int, state: State, stars: NodeStars) -> None:
 
 @helper
 def _shortest(node: int, state: State, stars: NodeStars) -> float:
-    """Length of a node's shortest edge over the mean of all, each counted once for each of its cells."""
+    """Length of a node's shortest edge over the mean of all, each counted once for each of its
+    cells.
+    """
     least, total, count = np.inf, 0.0, 0
     for r in range(stars.start[node], stars.start[node + 1]):
         for k in range(state.complex.cells.shape[1]):

@@ -1,4 +1,6 @@
-"""Nodes that slide on the surface of a mask: the zero level of the function of `tetopt.contents.domain`."""
+"""Nodes that slide on the surface of a mask: the zero level of the function of
+`tetopt.contents.domain`.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +12,17 @@ from tetopt.engine.complex import NodeStars, State, facet_area, has_node, outwar
 from tetopt.geometry.vectors import cross, dot, row, scaled
 from tetopt.system.kernels import Floats1, Floats2, Singles3, entry, helper, unit
 
-NEAR_CURVE_VOXELS = 0.1  # where several surfaces meet, a place whose levels are this close to 0 lies on all of them
+# where several surfaces meet, a place whose levels are this close to 0 lies on all of them
+NEAR_CURVE_VOXELS = 0.1
 CURVE_STEP_VOXELS = 0.7  # longest step towards such a place, where levels bend
 CURVE_STEPS = 16  # at most, onto a curve or a point
 NEWTON_STEPS = 6  # at most, onto the surface
-OUTWARD_COSINE = 0.1  # cosine of the widest angle between a facet's normal and the way up the level at its moved node
+# cosine of the widest angle between a facet's normal and the way up the level at its moved node
+OUTWARD_COSINE = 0.1
 ASIDE_VOXELS = 0.25  # distance to either side of a place for the slope of the level
 MOST_MEETING = 4  # most labels whose levels a node is moved onto; where more meet, four of them
-PARALLEL_FRACTION = 1e-3  # squared sine of the angle between ways up, below which two surfaces count as one
+# squared sine of the angle between ways up, below which two surfaces count as one
+PARALLEL_FRACTION = 1e-3
 LEVELS_RISE = 2.0  # of one label's level over another's, per voxel across their surface
 FLAT_RISE = 1e-12  # least rise of a level along the way up that allows division
 
@@ -46,9 +51,15 @@ def _slope_at(slope: NDArray, row: int, state: State, node: int) -> None:
     """Write the slope of the level at a node, per voxel along each axis, to slope[row]."""
     ticks, scale, L = state.complex.ticks, 2.0**-state.objective.bits, state.sides.level
     i, j, k = ticks[node, 0] * scale, ticks[node, 1] * scale, ticks[node, 2] * scale
-    slope[row, 0] = 2.0 * (level_at(L, i + ASIDE_VOXELS, j, k) - level_at(L, i - ASIDE_VOXELS, j, k))
-    slope[row, 1] = 2.0 * (level_at(L, i, j + ASIDE_VOXELS, k) - level_at(L, i, j - ASIDE_VOXELS, k))
-    slope[row, 2] = 2.0 * (level_at(L, i, j, k + ASIDE_VOXELS) - level_at(L, i, j, k - ASIDE_VOXELS))
+    slope[row, 0] = 2.0 * (
+        level_at(L, i + ASIDE_VOXELS, j, k) - level_at(L, i - ASIDE_VOXELS, j, k)
+    )
+    slope[row, 1] = 2.0 * (
+        level_at(L, i, j + ASIDE_VOXELS, k) - level_at(L, i, j - ASIDE_VOXELS, k)
+    )
+    slope[row, 2] = 2.0 * (
+        level_at(L, i, j, k + ASIDE_VOXELS) - level_at(L, i, j, k - ASIDE_VOXELS)
+    )
 
 
 @unit
@@ -63,7 +74,8 @@ def uphill_at(uphill: Floats2, state: State, node: int) -> None:
 
 @unit
 def faces_up(state: State, cell: int, k: int, old: int, new: int, uphill: Floats2) -> bool:
-    """True if a boundary facet, with the node `new` for `old`, faces up the level or lies on a side of the box.
+    """True if a boundary facet, with the node `new` for `old`, faces up the level or lies on a side
+    of the box.
 
     A node that slides or is put across a gap onto another part of the surface would reverse it.
     """
@@ -99,9 +111,13 @@ def star_faces_up(uphill: Floats2, state: State, stars: NodeStars, node: int, jo
 
 @helper
 def projection_at(state: State, node: int) -> NDArray:
-    """The map (3, 3) from a vector in mm to the index vector nearest to it along the axes on which a node may move."""
+    """The map (3, 3) from a vector in mm to the index vector nearest to it along the axes on
+    which a node may move.
+    """
     is_frozen = state.complex.is_frozen
-    return state.sides.projections[is_frozen[node, 0] + 2 * is_frozen[node, 1] + 4 * is_frozen[node, 2]]
+    return state.sides.projections[
+        is_frozen[node, 0] + 2 * is_frozen[node, 1] + 4 * is_frozen[node, 2]
+    ]
 
 
 @helper
@@ -115,9 +131,21 @@ def _label_levels(state: State, node: int, m: int) -> tuple:
 def _add_slope(slope: NDArray, row: int, level: NDArray, at: tuple, sign: float) -> None:
     """Add the slope of a level at an index position, per voxel along each axis, to slope[row]."""
     i, j, k = at
-    slope[row, 0] += sign * 2.0 * (level_at(level, i + ASIDE_VOXELS, j, k) - level_at(level, i - ASIDE_VOXELS, j, k))
-    slope[row, 1] += sign * 2.0 * (level_at(level, i, j + ASIDE_VOXELS, k) - level_at(level, i, j - ASIDE_VOXELS, k))
-    slope[row, 2] += sign * 2.0 * (level_at(level, i, j, k + ASIDE_VOXELS) - level_at(level, i, j, k - ASIDE_VOXELS))
+    slope[row, 0] += (
+        sign
+        * 2.0
+        * (level_at(level, i + ASIDE_VOXELS, j, k) - level_at(level, i - ASIDE_VOXELS, j, k))
+    )
+    slope[row, 1] += (
+        sign
+        * 2.0
+        * (level_at(level, i, j + ASIDE_VOXELS, k) - level_at(level, i, j - ASIDE_VOXELS, k))
+    )
+    slope[row, 2] += (
+        sign
+        * 2.0
+        * (level_at(level, i, j, k + ASIDE_VOXELS) - level_at(level, i, j, k - ASIDE_VOXELS))
+    )
 
 
 @unit
@@ -140,11 +168,18 @@ def constraint_values(normal: Floats2, state: State, node: int) -> int:
 
 @unit
 def normals_at(normal: Floats2, state: State, node: int) -> int:
-    """Write slopes and shortest ways up of a node's constraints, in index units; return their number.
+    """Write slopes and shortest ways up of a node's constraints, in index units; return their
+    number.
 
-    Ways stay within the node's sides of the box. `normal` is (7, 3): slopes start in the first row, ways in the fourth.
+    Ways stay within the node's sides of the box. `normal` is (7, 3): slopes start in the first row,
+    ways in the fourth.
     """
-    P, ticks, scale, count = projection_at(state, node), state.complex.ticks, 2.0**-state.objective.bits, 0
+    P, ticks, scale, count = (
+        projection_at(state, node),
+        state.complex.ticks,
+        2.0**-state.objective.bits,
+        0,
+    )
     at = ticks[node, 0] * scale, ticks[node, 1] * scale, ticks[node, 2] * scale
     normal[:6] = 0.0
     if state.complex.is_frozen[node, 3]:
@@ -170,9 +205,11 @@ def normals_at(normal: Floats2, state: State, node: int) -> int:
 def combined_ways(
     normal: Floats2, count: int, r: tuple[float, float, float]
 ) -> tuple[bool, tuple[float, float, float]]:
-    """The shortest index vector along which the constraints in `normal` (from `normals_at`) rise by r, (3,).
+    """The shortest index vector along which the constraints in `normal` (from `normals_at`) rise by
+    r, (3,).
 
-    The first result is True if there is one: not where a level is flat, or two levels rise the same way.
+    The first result is True if there is one: not where a level is flat, or two levels rise the same
+    way.
     """
     w = row(normal, 3)
     g00 = dot(row(normal, 0), w)
@@ -208,7 +245,9 @@ def combined_ways(
 
 @helper
 def band_of(state: State, node: int) -> float:
-    """Allowed difference of two labels' levels at a node; 0 where a third label or a mask's surface meets them."""
+    """Allowed difference of two labels' levels at a node; 0 where a third label or a mask's
+    surface meets them.
+    """
     is_one = state.complex.meeting[node, 2] < 0 and not state.complex.is_frozen[node, 3]
     return LEVELS_RISE * state.complex.band[node] if is_one else 0.0
 
@@ -225,7 +264,9 @@ def is_on_surface(normal: NDArray, state: State, node: int) -> bool:
 
 @unit
 def slides(normal: Floats2, state: State, node: int) -> bool:
-    """True if a node is on its surfaces and stays there; a node between labels may not have reached them yet."""
+    """True if a node is on its surfaces and stays there; a node between labels may not have
+    reached them yet.
+    """
     if state.complex.is_frozen[node, 3]:
         return True
     return state.complex.meeting[node, 1] >= 0 and is_on_surface(normal, state, node)
@@ -233,10 +274,11 @@ def slides(normal: Floats2, state: State, node: int) -> bool:
 
 @unit
 def put_on_surface(normal: Floats2, state: State, node: int) -> bool:
-    """Move a node to meet its constraints, nearly the shortest way in its sides of the box; return False on failure.
+    """Move a node to meet its constraints, nearly the shortest way in its sides of the box; return
+    False on failure.
 
-    A place beyond the box first moves back to its side, as the level continues unchanged beyond the side and would have
-    its zero there, too.
+    A place beyond the box first moves back to its side, as the level continues unchanged beyond the
+    side and would have its zero there, too.
     """
     ticks, scale = state.complex.ticks, 2.0**-state.objective.bits
     _put_in_box(state, node)
@@ -269,17 +311,22 @@ def _put_in_box(state: State, node: int) -> None:
         ticks[node, d] = min(max(ticks[node, d], sides.low[d]), sides.high[d])
 
 
-# A flat facet with its corners on a round surface cuts off what lies beyond it: nodes off the surface make up for it.
+# A flat facet with its corners on a round surface cuts off what lies beyond it: nodes off the
+# surface make up for it.
 
 
 def _facet_places(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Barycentric places (S, n) on a facet of n corners; weights (S, 2) of a mean over the facet and at its corners.
+    """Barycentric places (S, n) on a facet of n corners; weights (S, 2) of a mean over the facet
+    and at its corners.
 
-    Exact for quadratic functions: Simpson's rule on an edge, the middles of edges of a triangle's four parts.
+    Exact for quadratic functions: Simpson's rule on an edge, the middles of edges of a triangle's
+    four parts.
     """
     corners = np.eye(n)
     if n == 2:
-        return np.vstack([[0.5, 0.5], corners]), np.array([[4.0, 0.0], [1.0, 3.0], [1.0, 3.0]]) / 6.0
+        return np.vstack([[0.5, 0.5], corners]), np.array(
+            [[4.0, 0.0], [1.0, 3.0], [1.0, 3.0]]
+        ) / 6.0
     middles = 0.5 * (corners + np.roll(corners, 1, axis=0))
     parts = [middles, *(0.5 * (corners + corner) for corner in corners)]
     places = np.vstack([*(middles @ part for part in parts), corners])
@@ -287,19 +334,23 @@ def _facet_places(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def fill_offsets(state: State, most: NDArray[np.float64]) -> None:
-    """Set the values of nodes' first constraints at which facets cut off as much of a round surface as they add.
+    """Set the values of nodes' first constraints at which facets cut off as much of a round surface
+    as they add.
 
-    The mean of a level over a facet minus that at its corners is what the facet cuts off: h^2 / 8R on a sphere of
-    radius R, for an equilateral facet with edge h. A node's offset is minus the mean over the facets around it, of the
-    mask's surface or between two labels, up to `most` (N,), in voxels; 0 where more labels meet. Nodes that lie within
-    a band, and not in its middle, move the band until the level's mean over their facets is 0.
+    The mean of a level over a facet minus that at its corners is what the facet cuts off: h^2 / 8R
+    on a sphere of radius R, for an equilateral facet with edge h. A node's offset is minus the mean
+    over the facets around it, of the mask's surface or between two labels, up to `most` (N,), in
+    voxels; 0 where more labels meet. Nodes that lie within a band, and not in its middle, move the
+    band until the level's mean over their facets is 0.
     """
     room = np.zeros((3, len(most)))
     _fill_offsets(state, most, room, *_facet_places(state.complex.cells.shape[1] - 1))
 
 
 @entry
-def _fill_offsets(state: State, most: Floats1, room: Floats2, places: Floats2, weights: Floats2) -> None:
+def _fill_offsets(
+    state: State, most: Floats1, room: Floats2, places: Floats2, weights: Floats2
+) -> None:
     mesh, n = state.complex, state.complex.cells.shape[1]
     area, mean, at_corners, corners = room[0], room[1], room[2], np.empty(3, dtype=np.int64)
     for cell in range(mesh.n_cells[0]):
@@ -312,7 +363,9 @@ def _fill_offsets(state: State, most: Floats1, room: Floats2, places: Floats2, w
             whole, ends = _facet_means(state, cell, other, corners[: n - 1], places, weights)
             size = facet_area(mesh.ticks, corners[0], corners[1], corners[2], state.objective)
             for node in corners[: n - 1]:
-                if mesh.is_frozen[node, 3] == (other < 0) and (other < 0 or mesh.meeting[node, 2] < 0):
+                if mesh.is_frozen[node, 3] == (other < 0) and (
+                    other < 0 or mesh.meeting[node, 2] < 0
+                ):
                     area[node] += size
                     mean[node] += size * whole
                     at_corners[node] += size * ends
@@ -341,14 +394,19 @@ def _is_on_mask(state: State, corners: NDArray) -> bool:
 
 
 @helper
-def _facet_means(state: State, cell: int, other: int, corners: NDArray, places: NDArray, weights: NDArray) -> tuple:
+def _facet_means(
+    state: State, cell: int, other: int, corners: NDArray, places: NDArray, weights: NDArray
+) -> tuple:
     """The mean of a facet's constraint over the facet, and its mean at the corners."""
     ticks, scale, whole, ends = state.complex.ticks, 2.0**-state.objective.bits, 0.0, 0.0
     one = beyond = state.sides.level
     if other >= 0:
         of_cell, of_other = state.complex.labels[cell], state.complex.labels[other]
         channel, levels = state.sides.channel, state.sides.levels
-        one, beyond = levels[channel[min(of_cell, of_other)]], levels[channel[max(of_cell, of_other)]]
+        one, beyond = (
+            levels[channel[min(of_cell, of_other)]],
+            levels[channel[max(of_cell, of_other)]],
+        )
     for s in range(len(weights)):
         i, j, k = 0.0, 0.0, 0.0
         for m in range(len(corners)):

@@ -1,1 +1,3 @@
-"""Finite elements on the mesh: linear elasticity, strain energy, conditioning, the voxel reference."""
+"""Finite elements on the mesh: linear elasticity, strain energy, conditioning, the voxel
+reference.
+"""

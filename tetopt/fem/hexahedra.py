@@ -1,9 +1,10 @@
-"""Linear elasticity on a grid with one n-linear element per voxel, assembled and solved as meshes are.
+"""Linear elasticity on a grid with one n-linear element per voxel, assembled and solved as meshes
+are.
 
-Elements are hexahedra (quadrilaterals of plane stress in 2-D), parallelepipeds under the image's affine. All have the
-same shape, so that the stiffness between a node and each of its neighbours is a sum over the voxels around both, each
-with its modulus. Two faces of the grid are plates, whose displacements are prescribed. Only the blocks between the
-other nodes are stored.
+Elements are hexahedra (quadrilaterals of plane stress in 2-D), parallelepipeds under the image's
+affine. All have the same shape, so that the stiffness between a node and each of its neighbours is
+a sum over the voxels around both, each with its modulus. Two faces of the grid are plates, whose
+displacements are prescribed. Only the blocks between the other nodes are stored.
 """
 
 from __future__ import annotations
@@ -24,9 +25,11 @@ DOF_BYTES = 4800.0  # of memory per dof; 4,750 were measured at 12,000, 4,400 at
 
 
 def element_stiffness(jacobian: NDArray[np.float64], nu: float) -> NDArray[np.float64]:
-    """Stiffness of one element of modulus 1 between its corners, (2^n, 2^n, n, n); corners as `product((0, 1), ...)`.
+    """Stiffness of one element of modulus 1 between its corners, (2^n, 2^n, n, n); corners as
+    `product((0, 1), ...)`.
 
-    `jacobian` (n, n) maps a voxel's index axes to mm. Gauss's rule with two points along each axis is exact here.
+    `jacobian` (n, n) maps a voxel's index axes to mm. Gauss's rule with two points along each axis
+    is exact here.
     """
     n = len(jacobian)
     corners = np.array(_corners(n))
@@ -38,16 +41,24 @@ def element_stiffness(jacobian: NDArray[np.float64], nu: float) -> NDArray[np.fl
         g = shape_gradients(at, corners) @ np.linalg.inv(jacobian)
         outer = np.einsum("ai,bj->abij", g, g)
         dot = np.einsum("ai,bi->ab", g, g)
-        K += size * (lame_1 * outer + mu * outer.transpose(0, 1, 3, 2) + mu * dot[..., None, None] * np.eye(n))
+        K += size * (
+            lame_1 * outer
+            + mu * outer.transpose(0, 1, 3, 2)
+            + mu * dot[..., None, None] * np.eye(n)
+        )
     return K
 
 
 def shape_gradients(at: NDArray[np.float64], corners: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Gradients of the n-linear hat functions at a point of the unit cube, (2^n, n), per unit of index."""
+    """Gradients of the n-linear hat functions at a point of the unit cube, (2^n, n), per unit of
+    index.
+    """
     factors = np.where(corners == 1, at, 1.0 - at)
     g = np.empty(corners.shape)
     for axis in range(len(at)):
-        g[:, axis] = np.where(corners[:, axis] == 1, 1.0, -1.0) * np.delete(factors, axis, axis=1).prod(axis=1)
+        g[:, axis] = np.where(corners[:, axis] == 1, 1.0, -1.0) * np.delete(
+            factors, axis, axis=1
+        ).prod(axis=1)
     return g
 
 
@@ -56,14 +67,18 @@ def stiffness_product(modulus: Image, nu: float, u: NDArray[np.float64]) -> NDAr
     n, out = modulus.ndim, np.zeros_like(u)
     of_corners = [_of_voxels(corner, modulus.shape) for corner in _corners(n)]
     for at, blocks in zip(of_corners, element_stiffness(modulus.affine[:n, :n], nu), strict=True):
-        force = sum(np.einsum("ij,...j->...i", block, u[to]) for to, block in zip(of_corners, blocks, strict=True))
+        force = sum(
+            np.einsum("ij,...j->...i", block, u[to])
+            for to, block in zip(of_corners, blocks, strict=True)
+        )
         out[at] += modulus.data[..., None] * force
     return out
 
 
 @on_one_blas_thread
 def solve_between_plates(modulus: Image, nu: float, u: NDArray[np.float64]) -> int:
-    """Solve for the displacements between plates on the two faces across the upright axis, without forces.
+    """Solve for the displacements between plates on the two faces across the upright axis, without
+    forces.
 
     Return the number of iterations, 0 if the matrix was factorised.
 
@@ -74,7 +89,8 @@ def solve_between_plates(modulus: Image, nu: float, u: NDArray[np.float64]) -> i
     nu : float
         Poisson's ratio.
     u : (*shape + 1, n) array
-        mm, world, at the voxels' corners, with the plates' displacements; those between are overwritten.
+        mm, world, at the voxels' corners, with the plates' displacements; those between are
+        overwritten.
 
     Raises
     ------
@@ -84,7 +100,9 @@ def solve_between_plates(modulus: Image, nu: float, u: NDArray[np.float64]) -> i
         As for `tetopt.fem.elasticity.solved`.
     """
     what = f"reference: {u.size:.4g} degrees of freedom"
-    check_memory(DOF_BYTES * u.size, what, lambda room: f"{at_most(room / DOF_BYTES)} (`reference_dofs`)")
+    check_memory(
+        DOF_BYTES * u.size, what, lambda room: f"{at_most(room / DOF_BYTES)} (`reference_dofs`)"
+    )
     n, inside = modulus.ndim, _between_plates(modulus)
     u[inside] = 0.0
     load = -stiffness_product(modulus, nu, u)[inside].ravel()
@@ -93,7 +111,9 @@ def solve_between_plates(modulus: Image, nu: float, u: NDArray[np.float64]) -> i
     index = np.moveaxis(np.indices(u.shape[:-1]), 0, -1)[inside].reshape(-1, n).astype(np.float64)
     K = free_stiffness(modulus, nu)
     modes = rigid_modes(modulus.to_world(index))
-    solution, n_steps = solved_in_steps(System(K, np.arange(len(load)), K, load, np.zeros(len(load)), modes, np.eye(n)))
+    solution, n_steps = solved_in_steps(
+        System(K, np.arange(len(load)), K, load, np.zeros(len(load)), modes, np.eye(n))
+    )
     u[inside] = solution.reshape(u[inside].shape)
     return n_steps
 
@@ -104,7 +124,8 @@ def free_stiffness(modulus: Image, nu: float) -> csr_array:
     corners, element = _corners(n), element_stiffness(modulus.affine[:n, :n], nu)
     steps = list(combinations_of((-1, 0, 1), repeat=n))  # from a node to its neighbours and itself
     inside = _between_plates(modulus)
-    number = np.full([s + 3 for s in shape], -1, dtype=np.int32)  # of nodes, with one row more around them
+    # of nodes, with one row more around them
+    number = np.full([s + 3 for s in shape], -1, dtype=np.int32)
     free = number[(slice(1, -1),) * n][inside]
     free[:] = np.arange(free.size).reshape(free.shape)
     column = np.empty((free.size, len(steps)), dtype=np.int32)
@@ -116,11 +137,15 @@ def free_stiffness(modulus: Image, nu: float) -> csr_array:
         for a, corner in enumerate(corners):
             other = tuple(c + d for c, d in zip(corner, step, strict=True))
             if other in corners:
-                of_step[_of_voxels(corner, shape)] += modulus.data[..., None, None] * element[a, corners.index(other)]
+                of_step[_of_voxels(corner, shape)] += (
+                    modulus.data[..., None, None] * element[a, corners.index(other)]
+                )
         block[:, k] = of_step[inside].reshape(-1, n, n)
     is_there = column >= 0
     starts = np.concatenate([[0], np.cumsum(is_there.sum(axis=1))]).astype(np.int32)
-    return bsr_array((block[is_there], column[is_there], starts), shape=(n * free.size,) * 2).tocsr()
+    return bsr_array(
+        (block[is_there], column[is_there], starts), shape=(n * free.size,) * 2
+    ).tocsr()
 
 
 def _corners(n: int) -> list[tuple[int, ...]]:

@@ -24,16 +24,19 @@ from tetopt.geometry.quadratic import shape_slopes, shape_values
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 
-STEP_GROWTH = 1.02  # ratio of successive voxel sizes tried for the grid, which misses the limit by less than 6 %
+# ratio of successive voxel sizes tried for the grid, which misses the limit by less than 6 %
+STEP_GROWTH = 1.02
 INTERFACE_BAND_VOXELS = 2.0  # distance from an interface within which its strain is compared
-VOXELS_AT_ONCE = 2**18  # compared at a time, so that a volume of millions takes no more memory than its solution
+# compared at a time, so that a volume of millions takes no more memory than its solution
+VOXELS_AT_ONCE = 2**18
 
 
 class OwnError(NamedTuple):
-    """Relative differences of the solution at half the resolution from the reference's, as in `Errors`.
+    """Relative differences of the solution at half the resolution from the reference's, as in
+    `Errors`.
 
-    If errors are proportional to the voxels' size, the reference's own error is about as large; if to its square, a
-    third of it.
+    If errors are proportional to the voxels' size, the reference's own error is about as large; if
+    to its square, a third of it.
     """
 
     strain_energy: float
@@ -61,19 +64,23 @@ class Errors(NamedTuple):
     """Relative errors of a mesh's solution against the reference; 0 is best."""
 
     strain_energy: float  # |E_strain - E_ref| / E_ref
-    displacement: float | None  # RMS of u - u_ref, over RMS of u_ref - u_homogeneous; None if these two are equal
-    interface_strain: float | None  # RMS of the strain's error near interfaces, over RMS of the strain there
+    # RMS of u - u_ref, over RMS of u_ref - u_homogeneous; None if these two are equal
+    displacement: float | None
+    # RMS of the strain's error near interfaces, over RMS of the strain there
+    interface_strain: float | None
 
 
 def reference(modulus: Image, nu: float, percent: float = 1.0) -> Reference:
-    """Fix the box's top and push its bottom in, both bonded: `tetopt.study.paper.simulate` on the voxels.
+    """Fix the box's top and push its bottom in, both bonded: `tetopt.study.paper.simulate` on the
+    voxels.
 
     Parameters
     ----------
     modulus : Image
         Young's modulus of each voxel, kPa, above 0.
     nu : float
-        Poisson's ratio, -1 < nu < 0.5. Near 0.5 these elements are too stiff, although less so than linear tetrahedra.
+        Poisson's ratio, -1 < nu < 0.5. Near 0.5 these elements are too stiff, although less so than
+        linear tetrahedra.
     percent : float
         Displacement of the bottom, in per cent of the distance between the faces; see `push_of`.
 
@@ -85,7 +92,10 @@ def reference(modulus: Image, nu: float, percent: float = 1.0) -> Reference:
         As for `tetopt.fem.elasticity.solved`.
     """
     if not (modulus.data > 0.0).all():
-        raise InputError(f"modulus: expected values above 0 kPa in every voxel, got as low as {modulus.data.min():g}")
+        raise InputError(
+            "modulus: expected values above 0 kPa in every voxel, got as low as "
+            f"{modulus.data.min():g}"
+        )
     push = push_of(modulus, percent)
     u, n_iterations = _compressed(modulus, nu, push)
     half = averaged(modulus, tuple(max(1, s // 2) for s in modulus.shape))
@@ -96,12 +106,18 @@ def reference(modulus: Image, nu: float, percent: float = 1.0) -> Reference:
     energy, half_energy = _strain_energy(modulus, nu, u), _strain_energy(half, nu, u_half)
     error, scale = (_squares(u - other) for other in (interpolated(u_half, modulus.shape), even))
     is_homogeneous = scale <= 1e-14 * _squares(u)  # only the solver's error remains
-    own = OwnError(abs(half_energy / energy - 1.0), None if is_homogeneous else float(np.sqrt(error / scale)))
+    own = OwnError(
+        abs(half_energy / energy - 1.0), None if is_homogeneous else float(np.sqrt(error / scale))
+    )
     return Reference(modulus, nu, energy, u, even, own, n_iterations)
 
 
-def _compressed(modulus: Image, nu: float, push: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
-    """Displacements of the nodes with the bottom pushed in and the top fixed, and the number of iterations."""
+def _compressed(
+    modulus: Image, nu: float, push: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], int]:
+    """Displacements of the nodes with the bottom pushed in and the top fixed, and the number of
+    iterations.
+    """
     n, axis = modulus.ndim, upright_axis(modulus.affine)
     u = np.zeros((*(s + 1 for s in modulus.shape), n))
     bottom = 0 if modulus.affine[n - 1, axis] > 0.0 else -1
@@ -114,23 +130,29 @@ def _strain_energy(modulus: Image, nu: float, u: NDArray[np.float64]) -> float:
 
 
 def interpolated(u: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Displacements of a grid's nodes at the nodes of another grid of this shape over the same box."""
+    """Displacements of a grid's nodes at the nodes of another grid of this shape over the same
+    box.
+    """
     factors = [(new + 1) / old for new, old in zip(shape, u.shape, strict=False)]
     return ndimage.zoom(u, [*factors, 1.0], order=1, mode="nearest")
 
 
-def compare(exact: Reference, mesh: Mesh, u: NDArray[np.float64], strain_energy: float, labels: ArrayLike) -> Errors:
+def compare(
+    exact: Reference, mesh: Mesh, u: NDArray[np.float64], strain_energy: float, labels: ArrayLike
+) -> Errors:
     """Compare a mesh's displacements and energy with the reference, over voxel centres in the mesh.
 
     Parameters
     ----------
     exact : Reference
     mesh, u, strain_energy
-        The solution from `tetopt.fem.elasticity.compression` with the same `nu` and push; `u` has a row for each node
-        of order 1 or 2. Displacement and strain are those of the cell at each voxel's centre.
+        The solution from `tetopt.fem.elasticity.compression` with the same `nu` and push; `u` has a
+        row for each node of order 1 or 2. Displacement and strain are those of the cell at each
+        voxel's centre.
     labels : array of the image's shape
-        Materials: an interface is where neighbouring voxels have different ones. Its strain is compared at voxel
-        centres up to `INTERFACE_BAND_VOXELS` away; the error is None without interfaces.
+        Materials: an interface is where neighbouring voxels have different ones. Its strain is
+        compared at voxel centres up to `INTERFACE_BAND_VOXELS` away; the error is None without
+        interfaces.
 
     Raises
     ------
@@ -138,7 +160,9 @@ def compare(exact: Reference, mesh: Mesh, u: NDArray[np.float64], strain_energy:
         A mesh without voxel centres, or with curved cells, for which voxels are not located.
     """
     if mesh.midpoints is not None and order_of(mesh, u) == 2:
-        raise InputError("compare: expected straight edges, got a mesh with midpoints; solve Mesh(points, cells)")
+        raise InputError(
+            "compare: expected straight edges, got a mesh with midpoints; solve Mesh(points, cells)"
+        )
     owner = cell_of_voxel(exact.modulus, mesh).ravel()
     inside = np.flatnonzero(owner >= 0)
     if len(inside) == 0:
@@ -154,7 +178,9 @@ def compare(exact: Reference, mesh: Mesh, u: NDArray[np.float64], strain_energy:
         error += _squares(_displacements(elements, order, u, cell, places) - there)
         scale += _squares(there - at_centres(exact.modulus, exact.u_homogeneous, voxels)[0])
         size += _squares(there)
-        strain_error += _squares(_strains(elements, order, u, cell[near], places[near]) - strain[near])
+        strain_error += _squares(
+            _strains(elements, order, u, cell[near], places[near]) - strain[near]
+        )
         strain_size += _squares(strain[near])
     is_homogeneous = scale <= 1e-14 * size  # only the solver's error remains
     return Errors(
@@ -167,7 +193,9 @@ def compare(exact: Reference, mesh: Mesh, u: NDArray[np.float64], strain_energy:
 def at_centres(
     image: Image, u: NDArray[np.float64], voxels: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Displacement (K, n) and strain (K, n, n) at the centres of voxels with these flat indices, from nodes' `u`."""
+    """Displacement (K, n) and strain (K, n, n) at the centres of voxels with these flat indices,
+    from nodes' `u`.
+    """
     n = image.ndim
     corners = np.array(list(combinations_of((0, 1), repeat=n)))
     gradients = shape_gradients(np.full(n, 0.5), corners) @ np.linalg.inv(image.affine[:n, :n])
@@ -181,9 +209,13 @@ def at_centres(
 
 
 def near_interface(labels: NDArray) -> NDArray[np.bool_]:
-    """Mask of voxels whose centre is within `INTERFACE_BAND_VOXELS` voxels of a facet between two labels."""
+    """Mask of voxels whose centre is within `INTERFACE_BAND_VOXELS` voxels of a facet between
+    two labels.
+    """
     around = ndimage.generate_binary_structure(labels.ndim, 1)  # a voxel and its face neighbours
-    is_edge = ndimage.minimum_filter(labels, footprint=around) != ndimage.maximum_filter(labels, footprint=around)
+    is_edge = ndimage.minimum_filter(labels, footprint=around) != ndimage.maximum_filter(
+        labels, footprint=around
+    )
     if not is_edge.any():
         return is_edge
     # A voxel at an interface has its centre half a voxel away from it.
@@ -191,7 +223,8 @@ def near_interface(labels: NDArray) -> NDArray[np.bool_]:
 
 
 def averaged(image: Image, shape: tuple[int, ...]) -> Image:
-    """The image on a coarser grid over the same box: means over new voxels, with cut voxels weighted by their fraction.
+    """The image on a coarser grid over the same box: means over new voxels, with cut voxels
+    weighted by their fraction.
 
     `shape` has at most as many voxels along each axis as the image.
     """
@@ -214,8 +247,12 @@ def _fractions(new: int, old: int) -> csr_array:
     return csr_array((length * new / old, (row, middle.astype(np.int64))), shape=(new, old))
 
 
-def reference_shape(shape: Sequence[int], spacing: NDArray[np.float64], dofs: int) -> tuple[int, ...]:
-    """The finest grid of nearly cubic voxels over the image's box with at most `dofs`, no finer than the image."""
+def reference_shape(
+    shape: Sequence[int], spacing: NDArray[np.float64], dofs: int
+) -> tuple[int, ...]:
+    """The finest grid of nearly cubic voxels over the image's box with at most `dofs`, no finer
+    than the image.
+    """
     n = len(shape)
     size = np.array(shape) * spacing
     step = spacing.min()
@@ -229,15 +266,20 @@ def reference_shape(shape: Sequence[int], spacing: NDArray[np.float64], dofs: in
 def refined(image: Image, shape: tuple[int, ...]) -> Image:
     """The same field on evenly divided voxels, about `shape` along the axes.
 
-    All voxels have the same number of parts, so that means over parts of the box are those of the field. Values at the
-    centres of another grid (`nearest`) use some voxels more often: MNI152 at 2 mm, sampled at 1 mm, has a mean modulus
-    that is 0.6 % too high, as large as the measured errors.
+    All voxels have the same number of parts, so that means over parts of the box are those of the
+    field. Values at the centres of another grid (`nearest`) use some voxels more often: MNI152 at 2
+    mm, sampled at 1 mm, has a mean modulus that is 0.6 % too high, as large as the measured errors.
     """
-    return divided(image, [max(int(np.rint(new / old)), 1) for new, old in zip(shape, image.shape, strict=True)])
+    return divided(
+        image,
+        [max(int(np.rint(new / old)), 1) for new, old in zip(shape, image.shape, strict=True)],
+    )
 
 
 def nearest(image: Image, grid: Image) -> Image:
-    """The image's values at the centres of another grid over the same box, each from the voxel that contains it."""
+    """The image's values at the centres of another grid over the same box, each from the voxel
+    that contains it.
+    """
     places = [
         np.minimum(((np.arange(new) + 0.5) * old / new).astype(np.int64), old - 1)
         for new, old in zip(grid.shape, image.shape, strict=True)
@@ -250,7 +292,9 @@ def _places(
 ) -> NDArray[np.float64]:
     """Barycentric coordinates (K, n + 1) of the centres of voxels in their cells."""
     n = image.ndim
-    centres = image.to_world(np.stack(np.unravel_index(voxels, image.shape), axis=1).astype(np.float64))
+    centres = image.to_world(
+        np.stack(np.unravel_index(voxels, image.shape), axis=1).astype(np.float64)
+    )
     arms = centres - elements.points[elements.cells[cell, 0]]
     places = np.empty((len(voxels), n + 1))
     places[:, 1:] = np.einsum("kai,ki->ka", elements.gradients[cell, 1:], arms)
@@ -259,13 +303,21 @@ def _places(
 
 
 def _displacements(
-    elements: Elements, order: int, u: NDArray[np.float64], cell: NDArray[np.int64], places: NDArray[np.float64]
+    elements: Elements,
+    order: int,
+    u: NDArray[np.float64],
+    cell: NDArray[np.int64],
+    places: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     return np.einsum("ka,kai->ki", shape_values(places, order), u[elements.cells[cell]])
 
 
 def _strains(
-    elements: Elements, order: int, u: NDArray[np.float64], cell: NDArray[np.int64], places: NDArray[np.float64]
+    elements: Elements,
+    order: int,
+    u: NDArray[np.float64],
+    cell: NDArray[np.int64],
+    places: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     by_place = np.einsum("kai,kab->kib", u[elements.cells[cell]], shape_slopes(places, order))
     slope = by_place @ elements.gradients[cell]

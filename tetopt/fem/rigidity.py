@@ -1,9 +1,10 @@
 """Rigid motions, and a check that constraints prevent all of them.
 
-The null space of a constrained stiffness matrix is known in advance. Without strain, cells that share a facet move as
-one rigid body; so the motions without strain are rigid motions of the facet-connected sets of cells such that sets that
-share a node agree there and prescribed displacements are 0. This is a small eigenvalue problem with six unknowns per
-set, whose answer identifies loose cells, where a solver would only return large numbers.
+The null space of a constrained stiffness matrix is known in advance. Without strain, cells that
+share a facet move as one rigid body; so the motions without strain are rigid motions of the
+facet-connected sets of cells such that sets that share a node agree there and prescribed
+displacements are 0. This is a small eigenvalue problem with six unknowns per set, whose answer
+identifies loose cells, where a solver would only return large numbers.
 """
 
 from __future__ import annotations
@@ -18,12 +19,14 @@ from scipy.sparse.linalg import eigsh
 from tetopt.errors import InputError
 from tetopt.geometry.topology import components, linked
 
-# Least squared violation of all constraints by a rigid motion of size 1; less is rounding, and the motion is free.
+# Least squared violation of all constraints by a rigid motion of size 1; less is rounding, and the
+# motion is free.
 LOOSE_VIOLATION = 1e-11
 
 
 def rigid_modes(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rigid motions of points (N, n) as dofs, (N*n, 3) in 2-D and (N*n, 6) in 3-D: translations, then rotations.
+    """Rigid motions of points (N, n) as dofs, (N*n, 3) in 2-D and (N*n, 6) in 3-D: translations,
+    then rotations.
 
     Rotations are about the centre, with the root mean square of a translation by 1.
     """
@@ -34,7 +37,9 @@ def rigid_modes(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _rigid_rows(arms: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Displacements (K, n, n(n+1)/2) of points with given arms (K, n) by translations and infinitesimal rotations."""
+    """Displacements (K, n, n(n+1)/2) of points with given arms (K, n) by translations and
+    infinitesimal rotations.
+    """
     n = arms.shape[1]
     rows = np.zeros((len(arms), n, n * (n + 1) // 2))
     rows[:, range(n), range(n)] = 1.0
@@ -44,22 +49,30 @@ def _rigid_rows(arms: NDArray[np.float64]) -> NDArray[np.float64]:
     return rows
 
 
-def check_held(points: NDArray[np.float64], cells: NDArray[np.int64], is_prescribed: NDArray[np.bool_]) -> None:
+def check_held(
+    points: NDArray[np.float64], cells: NDArray[np.int64], is_prescribed: NDArray[np.bool_]
+) -> None:
     """Raise InputError if any part of the mesh can move without strain, as K_ff is singular then.
 
-    Cells (M, A) may have either order, with their corners first; `is_prescribed` (N, n) is also True for springs.
+    Cells (M, A) may have either order, with their corners first; `is_prescribed` (N, n) is also
+    True for springs.
 
-    Without strain, cells that share a facet move as one rigid body. So a motion without strain consists of rigid
-    motions of the facet-connected sets of cells such that sets that share a node agree there and prescribed dofs are 0.
+    Without strain, cells that share a facet move as one rigid body. So a motion without strain
+    consists of rigid motions of the facet-connected sets of cells such that sets that share a node
+    agree there and prescribed dofs are 0.
     """
     is_used = np.zeros(len(points), dtype=bool)
     is_used[cells] = True
     unused = np.flatnonzero(~is_used & ~is_prescribed.all(axis=1))
     if len(unused):
-        raise InputError(f"mesh: {len(unused)} nodes belong to no cell, the first {unused[:5].tolist()}; remove them")
+        raise InputError(
+            f"mesh: {len(unused)} nodes belong to no cell, the first {unused[:5].tolist()}; "
+            "remove them"
+        )
     if not is_prescribed.any():
         raise InputError(
-            "mesh: no displacement or spring constrains it, so it can move freely; fix or support at least one set, "
+            "mesh: no displacement or spring constrains it, so it can move freely; fix or "
+            "support at least one set, "
             "for example with hold:SET or spring:SET:K"
         )
     body = components(cells[:, : points.shape[1] + 1])
@@ -68,12 +81,16 @@ def check_held(points: NDArray[np.float64], cells: NDArray[np.int64], is_prescri
     if weakest < LOOSE_VIOLATION:
         inside = np.flatnonzero(body == loose)
         raise InputError(
-            f"mesh: {len(inside)} cells around cell {inside[0]} (node {cells[inside[0], 0]}) can still rotate or slide "
-            "as a whole, as too few nodes connect them; fix more nodes or keep the largest facet-connected set"
+            f"mesh: {len(inside)} cells around cell {inside[0]} (node {cells[inside[0], 0]}) can "
+            "still rotate or slide "
+            "as a whole, as too few nodes connect them; fix more nodes or keep the largest "
+            "facet-connected set"
         )
 
 
-def _check_pieces(cells: NDArray[np.int64], body: NDArray[np.int64], is_prescribed: NDArray[np.bool_]) -> None:
+def _check_pieces(
+    cells: NDArray[np.int64], body: NDArray[np.int64], is_prescribed: NDArray[np.bool_]
+) -> None:
     """Raise InputError if a component of cells connected by nodes has no prescribed dof."""
     n_bodies = int(body.max()) + 1
     bodies = np.repeat(body, cells.shape[1]) + len(is_prescribed)
@@ -84,15 +101,22 @@ def _check_pieces(cells: NDArray[np.int64], body: NDArray[np.int64], is_prescrib
         piece = loose[label[cells[loose, 0]] == label[cells[loose[0], 0]]]
         n_pieces = len(np.unique(label[cells[loose, 0]]))
         raise InputError(
-            f"mesh: {n_pieces} components have no node that is fixed, displaced or on a spring; the first has "
-            f"{len(piece)} cells around cell {piece[0]} (node {cells[piece[0], 0]}); fix it or remove it"
+            f"mesh: {n_pieces} components have no node that is fixed, displaced or on a spring; "
+            "the first has "
+            f"{len(piece)} cells around cell {piece[0]} (node {cells[piece[0], 0]}); fix it or "
+            "remove it"
         )
 
 
 def _weakest_hold(
-    points: NDArray[np.float64], cells: NDArray[np.int64], body: NDArray[np.int64], is_prescribed: NDArray[np.bool_]
+    points: NDArray[np.float64],
+    cells: NDArray[np.int64],
+    body: NDArray[np.int64],
+    is_prescribed: NDArray[np.bool_],
 ) -> tuple[float, int]:
-    """Smallest sum of squared violations by a rigid motion of size 1 of the bodies, and the body that it moves most."""
+    """Smallest sum of squared violations by a rigid motion of size 1 of the bodies, and the body
+    that it moves most.
+    """
     n = points.shape[1]
     incidence = np.unique(cells * (int(body.max()) + 1) + body[:, None])
     node, of_body = np.divmod(incidence, int(body.max()) + 1)
@@ -116,7 +140,11 @@ def _weakest_hold(
     leading = np.flatnonzero(is_first)
     joint = np.flatnonzero(~is_first)
     violations = block_array(
-        [[spread(leading)[is_prescribed[node[leading]].ravel()]], [spread(joint - 1) - spread(joint)]], format="csr"
+        [
+            [spread(leading)[is_prescribed[node[leading]].ravel()]],
+            [spread(joint - 1) - spread(joint)],
+        ],
+        format="csr",
     )
     gram = (violations.T @ violations).tocsc()
     if gram.shape[0] <= 120:

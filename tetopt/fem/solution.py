@@ -1,8 +1,8 @@
 """The solution of a model: displacements, strains, stresses, energies, reactions.
 
-Each step of a model is one linear problem, from the undeformed state. Loads on facets act on nodes by the weights of
-`tetopt.model.loads.facet_weights`, which files for other solvers use, too, so that all of them solve the same
-equations.
+Each step of a model is one linear problem, from the undeformed state. Loads on facets act on nodes
+by the weights of `tetopt.model.loads.facet_weights`, which files for other solvers use, too, so
+that all of them solve the same equations.
 
 Body and springs store half the product of all forces and their displacements (Clapeyron's theorem):
 
@@ -39,11 +39,13 @@ from tetopt.model.materials import density_of
 from tetopt.model.model import Model, element_facets, elements, in_units
 
 KG_PER_MM3 = 1e-9  # in a kg/m3
-BALANCE_ROUNDING = 1e-12  # of a matrix's row times its displacements: rounding error in a sum of forces
+# of a matrix's row times its displacements: rounding error in a sum of forces
+BALANCE_ROUNDING = 1e-12
 
 
 class Solution(NamedTuple):
-    """Solution of one step of a model, in mm, kPa, mN and uJ (in 2-D per mm of thickness) and the model's axes.
+    """Solution of one step of a model, in mm, kPa, mN and uJ (in 2-D per mm of thickness) and the
+    model's axes.
 
     Parameters
     ----------
@@ -60,7 +62,8 @@ class Solution(NamedTuple):
     spring_energy : float
         Energy in the springs, uJ.
     work : float
-        Half the product of forces, including reactions, and displacements, uJ: the sum of the two energies.
+        Half the product of forces, including reactions, and displacements, uJ: the sum of the two
+        energies.
     reactions : dict of (n,) float64
         Force of the support or springs on each set that has any, mN.
     applied : (n,) float64
@@ -111,7 +114,8 @@ def solve(model: Model, step: int = 1, method: Method = "auto") -> Solution:
     Parameters
     ----------
     model : Model
-        A model with moduli: those of its materials, or, if given, those at the nodes, linear within each cell.
+        A model with moduli: those of its materials, or, if given, those at the nodes, linear within
+        each cell.
     step : int
         Number of the step, from 1. Loads without a step belong to all steps.
     method : {"auto", "direct", "amg"}
@@ -125,10 +129,11 @@ def solve(model: Model, step: int = 1, method: Method = "auto") -> Solution:
     Raises
     ------
     InputError
-        No moduli, no such step, gravity without a density, an unknown kind of load, or a part that can move without
-        strain, as no load constrains it.
+        No moduli, no such step, gravity without a density, an unknown kind of load, or a part that
+        can move without strain, as no load constrains it.
     RuntimeError
-        No solution, or forces and reactions do not balance, as may happen if moduli differ too much.
+        No solution, or forces and reactions do not balance, as may happen if moduli differ too
+        much.
 
     See Also
     --------
@@ -164,31 +169,51 @@ def solve(model: Model, step: int = 1, method: Method = "auto") -> Solution:
     task = _task(model, in_step(model.loads, step))
     young, nu = gauss_moduli(model), model.materials.nu[model.materials.of_cell]
     system = constrained(
-        model.mesh, young, nu, task.is_prescribed, task.prescribed, order=model.order, outside=task.outside
+        model.mesh,
+        young,
+        nu,
+        task.is_prescribed,
+        task.prescribed,
+        order=model.order,
+        outside=task.outside,
     )
     u, n_iterations = solved_in_steps(system, method)
     strain = gauss_strains(model.mesh, u)
     stress = _stress(strain, young, nu)
-    strain_energy = 0.5 * float((gauss_volumes(model.mesh, model.order) * (strain * stress).sum(axis=(2, 3))).sum())
+    strain_energy = 0.5 * float(
+        (gauss_volumes(model.mesh, model.order) * (strain * stress).sum(axis=(2, 3))).sum()
+    )
     pull = -task.outside.springs[:, None] * u
-    # K includes the springs, so their forces count as the body's, and the remainder is the supports'.
+    # K includes the springs, so their forces count as the body's, and the remainder is the
+    # supports'.
     reaction = (system.K @ u.ravel()).reshape(u.shape) - task.outside.forces
     _check_balance(system, task, reaction, pull, u)
-    reactions = {name: np.where(where, reaction, 0.0).sum(axis=0) for name, where in task.of_set.items()}
+    reactions = {
+        name: np.where(where, reaction, 0.0).sum(axis=0) for name, where in task.of_set.items()
+    }
     for name, springs in task.springs.items():
         reactions[name] = reactions.get(name, 0.0) - (springs[:, None] * u).sum(axis=0)
     by_supports = np.where(task.is_prescribed, reaction * task.prescribed, 0.0).sum()
     return Solution(
-        u, young, strain, stress, strain_energy, -0.5 * float((pull * u).sum()),
+        u,
+        young,
+        strain,
+        stress,
+        strain_energy,
+        -0.5 * float((pull * u).sum()),
         0.5 * float((task.outside.forces * u).sum() + by_supports),
-        reactions, task.outside.forces.sum(axis=0), n_iterations, system,
-    )  # fmt: skip
+        reactions,
+        task.outside.forces.sum(axis=0),
+        n_iterations,
+        system,
+    )
 
 
 def gauss_moduli(model: Model) -> NDArray[np.float64]:
     """Modulus at the Gauss points of the model's order, (M, Q), in its unit of stress.
 
-    From each cell's material, from linear interpolation of moduli at the nodes, or from the model's own Gauss values.
+    From each cell's material, from linear interpolation of moduli at the nodes, or from the model's
+    own Gauss values.
     """
     is_curved = model.mesh.midpoints is not None and model.order == 2
     if model.gauss_young is not None:
@@ -197,11 +222,17 @@ def gauss_moduli(model: Model) -> NDArray[np.float64]:
         return gauss_young(model.node_young, model.mesh, model.order)
     assert model.materials is not None, "callers check that the model has moduli"
     of_cell = model.materials.young[model.materials.of_cell]
-    return np.repeat(of_cell[:, None], len(gauss_rule(model.mesh.ndim, model.order, is_curved)[1]), axis=1)
+    return np.repeat(
+        of_cell[:, None], len(gauss_rule(model.mesh.ndim, model.order, is_curved)[1]), axis=1
+    )
 
 
-def _stress(strain: NDArray[np.float64], young: NDArray[np.float64], nu: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Stress (M, Q, n, n), kPa, from strains, moduli (M, Q) and ratios (M,); in 2-D plane stress."""
+def _stress(
+    strain: NDArray[np.float64], young: NDArray[np.float64], nu: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Stress (M, Q, n, n), kPa, from strains, moduli (M, Q) and ratios (M,); in 2-D plane
+    stress.
+    """
     n = strain.shape[-1]
     lame, mu = lame_constants(young, nu[:, None], n)
     spread = lame * np.einsum("cqii->cq", strain)
@@ -216,14 +247,19 @@ def _task(model: Model, loads: tuple[Load, ...]) -> _Task:
     of_set: dict[str, NDArray[np.bool_]] = {}
     springs: dict[str, NDArray[np.float64]] = {}
     task = _Task(
-        np.zeros(points.shape, dtype=bool), np.zeros(points.shape), of_set,
-        Outside(np.zeros(points.shape), np.zeros(len(points))), springs,
-    )  # fmt: skip
+        np.zeros(points.shape, dtype=bool),
+        np.zeros(points.shape),
+        of_set,
+        Outside(np.zeros(points.shape), np.zeros(len(points))),
+        springs,
+    )
     for load in loads:
         if load.kind == "displacement":
             where = np.zeros(points.shape, dtype=bool)
             # By facets, not by pairs of nodes, as an edge between two nodes of a set may leave it.
-            where[np.unique(element_facets(cells, model.sets.facets[load.set_name]))] = ~np.isnan(load.numbers)
+            where[np.unique(element_facets(cells, model.sets.facets[load.set_name]))] = ~np.isnan(
+                load.numbers
+            )
             task.is_prescribed[where] = True
             task.prescribed[where] = np.broadcast_to(load.numbers, where.shape)[where]
             of_set[load.set_name] = where | of_set.get(load.set_name, False)
@@ -239,19 +275,23 @@ def _task(model: Model, loads: tuple[Load, ...]) -> _Task:
             density = density_of(table)[table.of_cell]  # type: ignore[union-attr]  # or it was rejected
             task.outside.forces[:] += weight_forces(model.mesh, density, load.numbers, model.order)
         else:
-            raise InputError(f'load: expected displacement, pressure, traction, spring or gravity, got "{load.kind}"')
+            raise InputError(
+                "load: expected displacement, pressure, traction, spring or gravity, got "
+                f'"{load.kind}"'
+            )
     return task
 
 
 def weight_forces(
     mesh: Mesh, density: NDArray[np.float64], acceleration: NDArray[np.float64], order: int
 ) -> NDArray[np.float64]:
-    """Forces on nodes, (N, n) mN, from a uniform acceleration (n,), mm/s2, of cells with a density (M,), kg/m3.
+    """Forces on nodes, (N, n) mN, from a uniform acceleration (n,), mm/s2, of cells with a density
+    (M,), kg/m3.
 
-    Each node of a cell gets the integral of its shape function. For order 1 all nodes get the same; for order 2 a
-    triangle's weight goes only to its mid-edge nodes, and a tetrahedron's to these (1/5 each) and its corners (-1/20
-    each) (Zienkiewicz and Taylor, The Finite Element Method, volume 1, on consistent nodal forces). A curved cell is
-    integrated at its Gauss points.
+    Each node of a cell gets the integral of its shape function. For order 1 all nodes get the same;
+    for order 2 a triangle's weight goes only to its mid-edge nodes, and a tetrahedron's to these
+    (1/5 each) and its corners (-1/20 each) (Zienkiewicz and Taylor, The Finite Element Method,
+    volume 1, on consistent nodal forces). A curved cell is integrated at its Gauss points.
     """
     n = mesh.ndim
     points, cells = of_order(mesh.points, mesh.cells, order)
@@ -264,26 +304,37 @@ def weight_forces(
     weights = mass[:, None] * fractions
     if order == 2 and mesh.midpoints is not None:
         shapes = shape_values(gauss_rule(n, 2, is_curved=True)[0], 2)
-        weights = (KG_PER_MM3 * density)[:, None] * np.einsum("cq,qa->ca", gauss_volumes(mesh, 2), shapes)
+        weights = (KG_PER_MM3 * density)[:, None] * np.einsum(
+            "cq,qa->ca", gauss_volumes(mesh, 2), shapes
+        )
     at_node = np.bincount(cells.ravel(), weights=weights.ravel(), minlength=len(points))
     return at_node[:, None] * acceleration
 
 
 def _check_balance(
-    system: System, task: _Task, reaction: NDArray[np.float64], pull: NDArray[np.float64], u: NDArray[np.float64]
+    system: System,
+    task: _Task,
+    reaction: NDArray[np.float64],
+    pull: NDArray[np.float64],
+    u: NDArray[np.float64],
 ) -> None:
-    """Raise RuntimeError unless reactions, forces and springs cancel in their sum and moments about any axis.
+    """Raise RuntimeError unless reactions, forces and springs cancel in their sum and moments about
+    any axis.
 
-    Their total work on each rigid motion, of root mean square 1, is that of the residual at the free nodes.
+    Their total work on each rigid motion, of root mean square 1, is that of the residual at the
+    free nodes.
     """
     total = np.where(task.is_prescribed, reaction, 0.0) + task.outside.forces + pull
     left = float(np.abs(system.modes.T @ total.ravel()).max())
-    residual = 10.0 * RESIDUAL_FRACTION * np.sqrt(len(system.free)) * float(np.linalg.norm(system.load))
+    residual = (
+        10.0 * RESIDUAL_FRACTION * np.sqrt(len(system.free)) * float(np.linalg.norm(system.load))
+    )
     size = float(np.abs(system.modes).max())
     allowed = size * (residual + BALANCE_ROUNDING * float(system.K.diagonal() @ np.abs(u.ravel())))
     if not left <= allowed:
         raise RuntimeError(
-            f"elasticity: forces and reactions do not balance: the remainder {left:.3g} mN exceeds {allowed:.3g} mN"
+            f"elasticity: forces and reactions do not balance: the remainder {left:.3g} mN "
+            f"exceeds {allowed:.3g} mN"
         )
 
 
@@ -297,10 +348,11 @@ def von_mises(stress: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def node_means(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Extrapolate values at Gauss points (M, Q, ...) to the nodes of the order with Q points, (N, ...).
+    """Extrapolate values at Gauss points (M, Q, ...) to the nodes of the order with Q points, (N,
+    ...).
 
-    Within a cell they are linear, like strains of order 2, or fitted by least squares in a curved cell. A node has the
-    mean over the cells around it, weighted by (straight) volume.
+    Within a cell they are linear, like strains of order 2, or fitted by least squares in a curved
+    cell. A node has the mean over the cells around it, weighted by (straight) volume.
     """
     n, n_places = mesh.ndim, values.shape[1]
     order = 1 if n_places == 1 else 2
@@ -316,7 +368,12 @@ def node_means(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
     weight = np.repeat(volumes(mesh.points, mesh.cells)[:, None], cells.shape[1], axis=1)
     around = np.bincount(cells.ravel(), weights=weight.ravel(), minlength=n_nodes)
     columns = [
-        np.bincount(cells.ravel(), weights=(weight * (flat[:, :, k] @ at_nodes.T)).ravel(), minlength=n_nodes) / around
+        np.bincount(
+            cells.ravel(),
+            weights=(weight * (flat[:, :, k] @ at_nodes.T)).ravel(),
+            minlength=n_nodes,
+        )
+        / around
         for k in range(flat.shape[2])
     ]
     return np.stack(columns, axis=1).reshape(n_nodes, *values.shape[2:])
@@ -349,10 +406,11 @@ class SolutionFields(NamedTuple):
 
 @on_one_blas_thread
 def solution_fields(mesh: Mesh, solution: Solution, step: int = 1) -> SolutionFields:
-    """Convert displacement, strain and stress to fields on cells (means) and nodes, for a mesh's file.
+    """Convert displacement, strain and stress to fields on cells (means) and nodes, for a mesh's
+    file.
 
-    Displacement is in mm; stress and von Mises stress are in kPa; tensors are stored row by row. Names for steps after
-    the first end in "_step2" and so on.
+    Displacement is in mm; stress and von Mises stress are in kPa; tensors are stored row by row.
+    Names for steps after the first end in "_step2" and so on.
 
     Parameters
     ----------
@@ -386,7 +444,10 @@ def solution_fields(mesh: Mesh, solution: Solution, step: int = 1) -> SolutionFi
     """
     suffix = "" if step == 1 else f"_step{step}"
     n = mesh.ndim
-    strain_nodes, stress_nodes = node_means(mesh, solution.strain), node_means(mesh, solution.stress)
+    strain_nodes, stress_nodes = (
+        node_means(mesh, solution.strain),
+        node_means(mesh, solution.stress),
+    )
     cell_data = {
         "strain": cell_means(solution.strain).reshape(-1, n * n),
         "stress": cell_means(solution.stress).reshape(-1, n * n),

@@ -1,6 +1,8 @@
-"""The box of an image: its sides, the places on them, and the correspondence of its axes to the world's.
+"""The box of an image: its sides, the places on them, and the correspondence of its axes to the
+world's.
 
-Index coordinates: voxel centres are whole numbers, so that the box runs from -0.5 to s - 0.5 along an axis of s voxels.
+Index coordinates: voxel centres are whole numbers, so that the box runs from -0.5 to s - 0.5 along
+an axis of s voxels.
 """
 
 from __future__ import annotations
@@ -11,8 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-# A place this near to a side lies on it. Reading a file and converting its points to index coordinates moves them by
-# some 1e-12 voxel (1e-7 of the coordinate in mm where a file holds float32), and no mesh has cells as thin as this.
+# A place this near to a side lies on it. Reading a file and converting its points to index
+# coordinates moves them by some 1e-12 voxel (1e-7 of the coordinate in mm where a file holds
+# float32), and no mesh has cells as thin as this.
 ON_SIDE_VOXELS = 1e-6
 
 
@@ -21,8 +24,11 @@ def box_sides(shape: tuple[int, ...]) -> NDArray[np.float64]:
     return np.column_stack([np.full(len(shape), -0.5), np.array(shape) - 0.5])
 
 
-def is_on_sides(places: NDArray[Any], sides: NDArray[Any], tolerance: float = ON_SIDE_VOXELS) -> NDArray[np.bool_]:
-    """True where places (..., n) lie on the sides (n, 2) of a box, (..., n, 2); exactly if `tolerance` is 0.
+def is_on_sides(
+    places: NDArray[Any], sides: NDArray[Any], tolerance: float = ON_SIDE_VOXELS
+) -> NDArray[np.bool_]:
+    """True where places (..., n) lie on the sides (n, 2) of a box, (..., n, 2); exactly if
+    `tolerance` is 0.
 
     Examples
     --------
@@ -33,7 +39,10 @@ def is_on_sides(places: NDArray[Any], sides: NDArray[Any], tolerance: float = ON
 
 
 def facets_on_sides(
-    places: NDArray[Any], nodes: NDArray[np.int64], sides: NDArray[Any], tolerance: float = ON_SIDE_VOXELS
+    places: NDArray[Any],
+    nodes: NDArray[np.int64],
+    sides: NDArray[Any],
+    tolerance: float = ON_SIDE_VOXELS,
 ) -> NDArray[np.bool_]:
     """True where all nodes of facets `nodes` (F, n), at places (N, n), lie on a side, (F, n, 2)."""
     is_on: NDArray[np.bool_] = np.all(is_on_sides(places, sides, tolerance)[nodes], axis=1)
@@ -41,17 +50,22 @@ def facets_on_sides(
 
 
 def upright_axis(affine: NDArray[np.float64]) -> int:
-    """The index axis that corresponds to the last world axis: z in 3-D, from inferior to superior, and y in 2-D."""
+    """The index axis that corresponds to the last world axis: z in 3-D, from inferior to
+    superior, and y in 2-D.
+    """
     return world_axes(affine).index(len(affine) - 2)
 
 
 def world_axes(affine: NDArray[np.float64]) -> tuple[int, ...]:
-    """The world axis that corresponds to each index axis, by the largest sum of cosines; each occurs once."""
+    """The world axis that corresponds to each index axis, by the largest sum of cosines; each
+    occurs once.
+    """
     cosines = _cosines(affine)
 
     def alignment(order: tuple[int, ...]) -> tuple[float, float]:
         chosen = cosines[list(order), range(len(order))]
-        # Rounded, so that the first order wins where several are as good, as in a turn by 45 degrees.
+        # Rounded, so that the first order wins where several are as good, as in a turn by 45
+        # degrees.
         return round(float(chosen.sum()), 9), round(float(chosen.prod()), 9)
 
     return max(permutations(range(len(cosines))), key=alignment)

@@ -10,7 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides, facets_on_sides
 from tetopt.geometry.manifold import OUTSIDE_LABEL, pinches
-from tetopt.geometry.quadratic import cell_edges, curved_rule, gauss_rule, jacobian_ratios, quadratic
+from tetopt.geometry.quadratic import (
+    cell_edges,
+    curved_rule,
+    gauss_rule,
+    jacobian_ratios,
+    quadratic,
+)
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import Facets, boundary_facets, components, facets, folded
 
@@ -30,19 +36,20 @@ def check_mesh(
 ) -> list[str]:
     """List the defects of a mesh, one line each, with the first offenders; empty if there are none.
 
-    In a sound mesh every node is used, and no two nodes coincide. Every cell is positively oriented, has distinct
-    corners, occurs once, and is not folded by a mid-edge node. Every facet belongs to one or two cells, which lie on
-    opposite sides of it, so that the mesh conforms and does not fold. The boundary is closed, a manifold
-    (`manifold_problems`) and connected. With labels, their interfaces are manifolds, too. With an image, no node lies
-    beyond its box; if the mesh fills the box, boundary facets lie on its faces and the cells' volumes add up to it.
+    In a sound mesh every node is used, and no two nodes coincide. Every cell is positively
+    oriented, has distinct corners, occurs once, and is not folded by a mid-edge node. Every facet
+    belongs to one or two cells, which lie on opposite sides of it, so that the mesh conforms and
+    does not fold. The boundary is closed, a manifold (`manifold_problems`) and connected. With
+    labels, their interfaces are manifolds, too. With an image, no node lies beyond its box; if the
+    mesh fills the box, boundary facets lie on its faces and the cells' volumes add up to it.
 
     Parameters
     ----------
     mesh : Mesh
         Points in world coordinates, mm.
     image : Image, optional
-        The image whose box the mesh should fill, or lie in. Overlaps of cells that share no facet are found only if
-        the mesh should fill it.
+        The image whose box the mesh should fill, or lie in. Overlaps of cells that share no facet
+        are found only if the mesh should fill it.
     is_whole : bool
         Require one connected component; a mask may have several.
     is_filled : bool
@@ -76,7 +83,8 @@ def check_mesh(
     """
     if image is not None and image.ndim != mesh.ndim:
         raise InputError(
-            f"mesh and image: expected the same dimension, got a {mesh.ndim}-D mesh and a {image.ndim}-D image"
+            f"mesh and image: expected the same dimension, got a {mesh.ndim}-D mesh and a "
+            f"{image.ndim}-D image"
         )
     problems = [*_problems_of_nodes(mesh), *_problems_of_cells(mesh)]
     if not problems:  # the other checks assume sound cells
@@ -124,9 +132,11 @@ def _problems_of_cells(mesh: Mesh) -> list[str]:
 
 
 def scaled_jacobians(mesh: Mesh) -> NDArray[np.float64]:
-    """Least ratio of each quadratic cell's Jacobian determinant to the straight cell's, (M,); 0 or less if folded.
+    """Least ratio of each quadratic cell's Jacobian determinant to the straight cell's, (M,); 0 or
+    less if folded.
 
-    Evaluated at corners, mid-edge nodes and the points of both integration rules of `tetopt.geometry.quadratic`.
+    Evaluated at corners, mid-edge nodes and the points of both integration rules of
+    `tetopt.geometry.quadratic`.
     """
     n = mesh.ndim
     nodes, cells = quadratic(mesh.points, mesh.cells, mesh.midpoints)
@@ -147,7 +157,10 @@ def _problems_of_facets(mesh: Mesh) -> list[str]:
     shared = facets(mesh.cells)
     pairs = folded(mesh.cells, shared)
     if len(pairs):
-        problems.append(f"facets with both cells on the same side, or with more than two cells; cells: {_first(pairs)}")
+        problems.append(
+            "facets with both cells on the same side, or with more than two cells; cells: "
+            f"{_first(pairs)}"
+        )
     outer = shared.nodes[shared.n_cells == 1]
     if mesh.ndim == 3:  # every edge of the boundary's triangles belongs to an even number of them
         edges = np.sort(outer[:, [[0, 1], [1, 2], [0, 2]]].reshape(-1, 2), axis=1)
@@ -156,21 +169,28 @@ def _problems_of_facets(mesh: Mesh) -> list[str]:
         kinds, counts = np.unique(outer, return_counts=True)
         kinds = kinds[:, None]
     if (counts % 2).any():
-        problems.append(f"places where the boundary is open; nodes: {_first(kinds[counts % 2 == 1])}")
+        problems.append(
+            f"places where the boundary is open; nodes: {_first(kinds[counts % 2 == 1])}"
+        )
     return problems
 
 
 def _problems_of_pieces(mesh: Mesh) -> list[str]:
     sizes = np.sort(np.bincount(components(mesh.cells)))[::-1]
-    return [f"components that share no facet: {len(sizes)}, of {sizes[:5].tolist()} cells"] if len(sizes) > 1 else []
+    return (
+        [f"components that share no facet: {len(sizes)}, of {sizes[:5].tolist()} cells"]
+        if len(sizes) > 1
+        else []
+    )
 
 
 def manifold_problems(mesh: Mesh, of_cell: ArrayLike | None = None) -> list[str]:
-    """List where the boundary, or with labels an interface between two labels, is not a manifold, one line each.
+    """List where the boundary, or with labels an interface between two labels, is not a manifold,
+    one line each.
 
-    It is not a manifold at an edge (in 2-D a node) that belongs to more than two of its facets, and at a node around
-    which its facets form several fans. Where three or more labels meet, or two at the boundary, interfaces end, and
-    nothing is checked.
+    It is not a manifold at an edge (in 2-D a node) that belongs to more than two of its facets, and
+    at a node around which its facets form several fans. Where three or more labels meet, or two at
+    the boundary, interfaces end, and nothing is checked.
 
     Parameters
     ----------
@@ -185,8 +205,13 @@ def manifold_problems(mesh: Mesh, of_cell: ArrayLike | None = None) -> list[str]
         Labels that are not one whole number >= 0 per cell.
     """
     labels = np.zeros(len(mesh.cells), dtype=np.int64) if of_cell is None else np.asarray(of_cell)
-    if labels.shape != (len(mesh.cells),) or not ((np.rint(labels) == labels) & (labels >= 0)).all():
-        raise InputError(f"of_cell: expected a whole number >= 0 for each of the mesh's {len(mesh.cells)} cells")
+    if (
+        labels.shape != (len(mesh.cells),)
+        or not ((np.rint(labels) == labels) & (labels >= 0)).all()
+    ):
+        raise InputError(
+            f"of_cell: expected a whole number >= 0 for each of the mesh's {len(mesh.cells)} cells"
+        )
     at_ridges, at_nodes = pinches(facets(mesh.cells), labels.astype(np.int64))
     whose = "the boundary" if of_cell is None else "the interface of two labels"
     problems = []
@@ -197,7 +222,9 @@ def manifold_problems(mesh: Mesh, of_cell: ArrayLike | None = None) -> list[str]
         is_meant = (places.labels[:, 0] == OUTSIDE_LABEL) == (of_cell is None)
         if is_meant.any():
             which = "" if of_cell is None else f" ({_most_frequent(places.labels[is_meant])})"
-            problems.append(f"{noun} where {whose} {words}{which}; nodes: {_first(places.nodes[is_meant])}")
+            problems.append(
+                f"{noun} where {whose} {words}{which}; nodes: {_first(places.nodes[is_meant])}"
+            )
     return problems
 
 
@@ -210,7 +237,8 @@ def _most_frequent(pairs: NDArray[np.int64]) -> str:
 
 
 def check_unfolded(mesh: Mesh, shared: Facets | None = None, source: str = "mesh") -> None:
-    """Raise InputError if cells overlap at a facet, or more than two share one; `shared` are its facets, if known.
+    """Raise InputError if cells overlap at a facet, or more than two share one; `shared` are its
+    facets, if known.
 
     The message names the mesh by `source`.
 
@@ -222,7 +250,8 @@ def check_unfolded(mesh: Mesh, shared: Facets | None = None, source: str = "mesh
     pairs = folded(mesh.cells, shared)
     if len(pairs):
         raise InputError(
-            f"{source}: at {len(pairs)} facets cells overlap (inverted cells do) or more than two cells meet; the "
+            f"{source}: at {len(pairs)} facets cells overlap (inverted cells do) or more than "
+            "two cells meet; the "
             f"first belong to cells {pairs[:3].tolist()}; repair the mesh"
         )
 
@@ -245,7 +274,9 @@ def filled_fraction(mesh: Mesh, image: Image) -> float:
 
 
 def beyond_box(mesh: Mesh, image: Image) -> NDArray[np.float64]:
-    """Distance of each node beyond the image's box, voxels along an index axis, (N,); negative inside."""
+    """Distance of each node beyond the image's box, voxels along an index axis, (N,); negative
+    inside.
+    """
     low, high = box_sides(image.shape).T
     index = image.to_index(mesh.points)
     return np.asarray(np.maximum(low - index, index - high).max(axis=1))
@@ -255,12 +286,16 @@ def _problems_with_box(mesh: Mesh, image: Image, is_filled: bool) -> list[str]:
     problems = []
     beyond = beyond_box(mesh, image)
     if len(outside := np.flatnonzero(beyond > ON_SIDE_VOXELS)):
-        problems.append(f"nodes up to {beyond.max():.3g} voxels beyond the image's box: {_first(outside)}")
+        problems.append(
+            f"nodes up to {beyond.max():.3g} voxels beyond the image's box: {_first(outside)}"
+        )
     if not is_filled:
         return problems
     outer, is_on_box = facets_on_box(mesh, image)
     if not is_on_box.all():
-        problems.append(f"boundary facets off the faces of the image's box; nodes: {_first(outer[~is_on_box])}")
+        problems.append(
+            f"boundary facets off the faces of the image's box; nodes: {_first(outer[~is_on_box])}"
+        )
     filled = filled_fraction(mesh, image)
     if abs(filled - 1.0) > 1e-9:
         problems.append(f"volume: {filled:.12g} of the image's box")

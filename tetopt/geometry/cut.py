@@ -17,8 +17,8 @@ class Cut(NamedTuple):
     cells: NDArray[np.int64]  # (K,) the cell each one comes from
 
 
-# Corners of the section as pairs of local nodes, in order around it, by which nodes lie above the plane
-# (bit k: node k). One node apart gives a triangle, two a quadrilateral.
+# Corners of the section as pairs of local nodes, in order around it, by which nodes lie above the
+# plane (bit k: node k). One node apart gives a triangle, two a quadrilateral.
 CUT_SECTIONS = np.zeros((16, 4, 2), dtype=np.int64)
 for _alone in range(4):
     _others = [k for k in range(4) if k != _alone]
@@ -38,7 +38,8 @@ def plane_cut(points: Points, cells: Cells, height: NDArray[np.float64]) -> Cut:
         Node coordinates, or any other values that are linear in each cell.
     cells : (M, 4) integer
     height : (N,) float64
-        Signed distance of each node from the plane, in any unit; a node on the plane counts as above.
+        Signed distance of each node from the plane, in any unit; a node on the plane counts as
+        above.
 
     Returns
     -------
@@ -58,14 +59,18 @@ def plane_cut(points: Points, cells: Cells, height: NDArray[np.float64]) -> Cut:
 def triangle_cut(
     points: NDArray[np.float64], triangles: NDArray[np.int64], height: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Segments (K, 2, 3) in which the plane height = 0 cuts triangles, and the numbers (K,) of these.
+    """Segments (K, 2, 3) in which the plane height = 0 cuts triangles, and the numbers (K,) of
+    these.
 
     A node on the plane counts as above it.
     """
     is_above = height[triangles] >= 0.0
     n_above = is_above.sum(axis=1)
-    alone = (is_above == (n_above == 1)[:, None]).argmax(axis=1)  # the node with no other on its side
-    turned = np.take_along_axis(triangles, (alone[:, None] + np.arange(3)) % 3, axis=1)[(n_above % 3) > 0]
+    # the node with no other on its side
+    alone = (is_above == (n_above == 1)[:, None]).argmax(axis=1)
+    turned = np.take_along_axis(triangles, (alone[:, None] + np.arange(3)) % 3, axis=1)[
+        (n_above % 3) > 0
+    ]
     one, others = turned[:, :1], turned[:, 1:]
     fraction = (height[one] / (height[one] - height[others]))[..., None]
     return points[one] * (1.0 - fraction) + points[others] * fraction, np.flatnonzero(n_above % 3)

@@ -1,8 +1,9 @@
 """The surfaces between the labels of a mesh's cells, and the places where they are not manifold.
 
-A facet between two labels belongs to the surface of both and faces out of either; on the boundary the other label is
-`OUTSIDE_LABEL`, which has a surface, too. Facets of a surface meet at ridges: edges of triangles, nodes of segments.
-In a manifold without a rim two facets meet at each ridge, and the facets around a node form one fan.
+A facet between two labels belongs to the surface of both and faces out of either; on the boundary
+the other label is `OUTSIDE_LABEL`, which has a surface, too. Facets of a surface meet at ridges:
+edges of triangles, nodes of segments. In a manifold without a rim two facets meet at each ridge,
+and the facets around a node form one fan.
 """
 
 from __future__ import annotations
@@ -46,7 +47,8 @@ class Fans(NamedTuple):
 
     label: NDArray[np.int64]  # (P,)
     node: NDArray[np.int64]  # (P,)
-    n_fans: NDArray[np.int64]  # (P,), connected sets of the label's facets around it, over the ridges that end there
+    # (P,), connected sets of the label's facets around it, over the ridges that end there
+    n_fans: NDArray[np.int64]
     n_labels: NDArray[np.int64]  # (P,), labels that meet there, including `OUTSIDE_LABEL`
 
 
@@ -63,7 +65,9 @@ def label_surfaces(shared: Facets, of_cell: NDArray[np.integer]) -> LabelSurface
     sides = np.where(shared.cells >= 0, of_cell[shared.cells], OUTSIDE_LABEL).astype(np.int64)
     between = np.flatnonzero(sides[:, 0] != sides[:, 1])
     first = shared.cells[between, 0]
-    is_outward = (shared.sign[first] * (shared.of_cell[first] == between[:, None])).sum(axis=1, keepdims=True) > 0
+    is_outward = (shared.sign[first] * (shared.of_cell[first] == between[:, None])).sum(
+        axis=1, keepdims=True
+    ) > 0
     nodes = shared.nodes[between]
     turned = nodes.copy()
     turned[:, :2] = nodes[:, 1::-1]
@@ -82,7 +86,8 @@ def surface_ridges(surfaces: LabelSurfaces) -> Ridges:
     nodes = np.sort(surfaces.nodes[:, np.array(facet_nodes(n - 1))], axis=2)  # (S, n, n-1)
     place = nodes[..., 0] if n == 2 else nodes[..., 0] * base + nodes[..., 1]
     step = base ** (n - 1)
-    labels, row = np.unique(surfaces.label, return_inverse=True)  # rows, as large labels would overflow the key
+    # rows, as large labels would overflow the key
+    labels, row = np.unique(surfaces.label, return_inverse=True)
     key = row.reshape(-1, 1) * step + place
     distinct, of_facet, n_facets = np.unique(key.ravel(), return_inverse=True, return_counts=True)
     row, place = np.divmod(distinct, step)
@@ -94,7 +99,8 @@ def surface_fans(surfaces: LabelSurfaces, ridges: Ridges) -> Fans:
     """The fans around each node of each label's surface, by label."""
     n = surfaces.nodes.shape[1]
     local = np.array(facet_nodes(n - 1))
-    # A corner is a facet at one of its nodes; those of two facets that share a ridge are linked at each of its ends.
+    # A corner is a facet at one of its nodes; those of two facets that share a ridge are linked at
+    # each of its ends.
     order = np.argsort(surfaces.nodes[:, local], axis=2)
     corner = np.arange(len(surfaces.nodes))[:, None, None] * n + np.take_along_axis(
         np.broadcast_to(local, order.shape), order, axis=2
@@ -119,9 +125,11 @@ class Pinches(NamedTuple):
 
 
 def pinches(shared: Facets, of_cell: NDArray[np.integer]) -> tuple[Pinches, Pinches]:
-    """Ridges in more than two facets of a surface, and nodes around which its facets form several fans.
+    """Ridges in more than two facets of a surface, and nodes around which its facets form several
+    fans.
 
-    Surfaces end where three or more labels meet, so those places are skipped. Arguments as for `label_surfaces`.
+    Surfaces end where three or more labels meet, so those places are skipped. Arguments as for
+    `label_surfaces`.
     """
     surfaces = label_surfaces(shared, of_cell)
     ridges = surface_ridges(surfaces)
@@ -133,16 +141,19 @@ def pinches(shared: Facets, of_cell: NDArray[np.integer]) -> tuple[Pinches, Pinc
     ):
         rows = np.flatnonzero(is_bad)
         rows = rows[np.lexsort((label[rows], *nodes[rows].T[::-1]))]
-        # The surfaces of the two labels have all facets there in common: each place is listed once for either.
+        # The surfaces of the two labels have all facets there in common: each place is listed once
+        # for either.
         both.append(Pinches(label[rows].reshape(-1, 2), nodes[rows[::2]]))
     return both[0], both[1]
 
 
 def manifold_part(cells: NDArray[np.int64], size: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Select the cells to keep, (M,), so that the boundary of a conforming mesh is a manifold; few are dropped.
+    """Select the cells to keep, (M,), so that the boundary of a conforming mesh is a manifold; few
+    are dropped.
 
-    Where several fans of cells surround an edge or a node of the boundary, the largest stays. Where the cells around a
-    node form one fan but the outside does not, the cells between two parts of the outside are dropped.
+    Where several fans of cells surround an edge or a node of the boundary, the largest stays. Where
+    the cells around a node form one fan but the outside does not, the cells between two parts of
+    the outside are dropped.
 
     Parameters
     ----------
@@ -163,7 +174,11 @@ def manifold_part(cells: NDArray[np.int64], size: NDArray[np.float64]) -> NDArra
         place = ridges.popleft() if ridges else nodes.popleft()
         near = around.cells[around.start[place[0]] : around.start[place[0] + 1]].tolist()
         corners = {cell: cells[cell].tolist() for cell in near if is_kept[cell]}
-        star = {cell: Corners(at, across[cell].tolist()) for cell, at in corners.items() if set(place) <= set(at)}
+        star = {
+            cell: Corners(at, across[cell].tolist())
+            for cell, at in corners.items()
+            if set(place) <= set(at)
+        }
         for cell in _cells_at_pinch(place, star, size):
             is_kept[cell] = False
             beyond = across[across[cell][across[cell] >= 0]]
@@ -181,10 +196,18 @@ class Corners(NamedTuple):
     across: list[int]  # cell beyond the facet opposite each node; -1 outside
 
 
-def _cells_at_pinch(place: tuple[int, ...], star: dict[int, Corners], size: NDArray[np.float64]) -> Iterable[int]:
-    """Cells of an edge's or a node's star to drop so that the boundary is a manifold there; none if it is."""
+def _cells_at_pinch(
+    place: tuple[int, ...], star: dict[int, Corners], size: NDArray[np.float64]
+) -> Iterable[int]:
+    """Cells of an edge's or a node's star to drop so that the boundary is a manifold there; none
+    if it is.
+    """
     links = {
-        cell: [other for node, other in zip(*corners, strict=True) if node not in place and other in star]
+        cell: [
+            other
+            for node, other in zip(*corners, strict=True)
+            if node not in place and other in star
+        ]
         for cell, corners in star.items()
     }
     fans = _linked(links)
@@ -201,10 +224,16 @@ def _cells_at_pinch(place: tuple[int, ...], star: dict[int, Corners], size: NDAr
         if other < 0 and node not in place
     ]
     ends = {facet: {*star[facet[0]].nodes} - {facet[1], *place} for facet in outer}
-    patches = _linked({facet: [other for other in outer if ends[facet] & ends[other]] for facet in outer})
+    patches = _linked(
+        {facet: [other for other in outer if ends[facet] & ends[other]] for facet in outer}
+    )
     if len(patches) < 2:
         return []
-    return _way(links, {cell for cell, _ in patches[0]}, {cell for patch in patches[1:] for cell, _ in patch})
+    return _way(
+        links,
+        {cell for cell, _ in patches[0]},
+        {cell for patch in patches[1:] for cell, _ in patch},
+    )
 
 
 def _linked(links: dict[_Key, list[_Key]]) -> list[list[_Key]]:
@@ -216,14 +245,18 @@ def _linked(links: dict[_Key, list[_Key]]) -> list[list[_Key]]:
             members = [first]
             seen.add(first)
             for member in members:  # grows as it goes
-                members += (new := [other for other in dict.fromkeys(links[member]) if other not in seen])
+                members += (
+                    new := [other for other in dict.fromkeys(links[member]) if other not in seen]
+                )
                 seen.update(new)
             sets.append(members)
     return sets
 
 
 def _way(links: dict[int, list[int]], begin: set[int], end: set[int]) -> list[int]:
-    """The shortest path in a connected graph from one set of cells to another, including both ends."""
+    """The shortest path in a connected graph from one set of cells to another, including both
+    ends.
+    """
     before: dict[int, int | None] = dict.fromkeys(sorted(begin))
     for cell in (queue := list(before)):
         if cell in end:

@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 from tetopt.geometry.vectors import cross, dot, minus, over, row, scaled
 from tetopt.system.kernels import Floats1, Floats2, Ints1, Ints2, entry, helper, run, unit
 
-BINS_POWER = 0.37  # exponent of the number of triangles for bins along the longest side, with a few triangles in each
-FLAT_NORMAL = 2e-6  # of a triangle's longest edge, squared: with a shorter normal it counts as its edges
+# exponent of the number of triangles for bins along the longest side, with a few triangles in each
+BINS_POWER = 0.37
+# of a triangle's longest edge, squared: with a shorter normal it counts as its edges
+FLAT_NORMAL = 2e-6
 POINTS_PER_TASK = 64  # points that a parallel task handles at once
 
 
@@ -32,7 +34,8 @@ class _Search(NamedTuple):
 def triangle_distances(
     points: NDArray[np.float64], nodes: NDArray[np.float64], facets: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Distance of points (K, 3) from the nearest of one or more triangles (T, 3) of nodes (P, 3): (K,), in their unit.
+    """Distance of points (K, 3) from the nearest of one or more triangles (T, 3) of nodes (P, 3):
+    (K,), in their unit.
 
     Flat triangles count as their edges, or as a single point.
     """
@@ -47,7 +50,8 @@ def triangle_distances(
     _list_by_bin(start[2:], np.empty(0, dtype=np.int64), bins, facets, counts)
     np.cumsum(start, out=start)
     listed = np.empty(start[-1], dtype=np.int64)
-    _list_by_bin(start[1:], listed, bins, facets, counts)  # moves each bin's start to that of the next one
+    # moves each bin's start to that of the next one
+    _list_by_bin(start[1:], listed, bins, facets, counts)
     squares = np.full(len(points), np.inf)
     points, nodes = np.ascontiguousarray(points), np.ascontiguousarray(nodes)
     work = _Search(squares, points, nodes, facets, start[:-1], listed, counts, low, size)
@@ -60,12 +64,17 @@ def triangle_distances(
 
 @entry
 def _list_by_bin(place: Ints1, listed: Ints1, bins: Ints2, facets: Ints2, counts: Ints1) -> None:
-    """Count the triangles whose bounding boxes reach each bin, or list them, starting at the place of each bin.
+    """Count the triangles whose bounding boxes reach each bin, or list them, starting at the place
+    of each bin.
 
     `bins` (P, 3) are those of the triangles' nodes.
     """
     for triangle in range(len(facets)):
-        a, b, c = row(bins, facets[triangle, 0]), row(bins, facets[triangle, 1]), row(bins, facets[triangle, 2])
+        a, b, c = (
+            row(bins, facets[triangle, 0]),
+            row(bins, facets[triangle, 1]),
+            row(bins, facets[triangle, 2]),
+        )
         for i in range(min(a[0], b[0], c[0]), max(a[0], b[0], c[0]) + 1):
             for j in range(min(a[1], b[1], c[1]), max(a[1], b[1], c[1]) + 1):
                 for k in range(min(a[2], b[2], c[2]), max(a[2], b[2], c[2]) + 1):
@@ -78,13 +87,17 @@ def _list_by_bin(place: Ints1, listed: Ints1, bins: Ints2, facets: Ints2, counts
 @helper
 def _edge_square(p: tuple, along: tuple) -> float:
     """Squared distance of p from the segment between 0 and `along`."""
-    way = minus(p, scaled(min(max(dot(p, along) / max(dot(along, along), 1e-300), 0.0), 1.0), along))
+    way = minus(
+        p, scaled(min(max(dot(p, along) / max(dot(along, along), 1e-300), 0.0), 1.0), along)
+    )
     return float(dot(way, way))
 
 
 @helper
 def _triangle_square(p: tuple, a: tuple, b: tuple, c: tuple) -> float:
-    """Squared distance of p from a triangle: at its foot in the plane if that is inside, else from the edges."""
+    """Squared distance of p from a triangle: at its foot in the plane if that is inside, else
+    from the edges.
+    """
     pa, ab, ac, bc = minus(p, a), minus(b, a), minus(c, a), minus(c, b)
     normal = cross(ab, ac)
     square = dot(normal, normal)
@@ -114,7 +127,9 @@ def _gap(x: float, place: int) -> float:
 
 @helper
 def _nearest_square(work: _Search, p: tuple) -> float:
-    """Squared distance of p: search rings of bins around the nearest one until none can be nearer."""
+    """Squared distance of p: search rings of bins around the nearest one until none can be
+    nearer.
+    """
     least, counts, size = np.inf, work.counts, work.size
     x = over(minus(p, (work.low[0], work.low[1], work.low[2])), size)
     at_i = int(min(max(x[0], 0.0), counts[0] - 1.0))
@@ -135,5 +150,7 @@ def _nearest_square(work: _Search, p: tuple) -> float:
 
 @unit
 def _fill_squares(work: _Search, chunk: int) -> None:
-    for number in range(chunk * POINTS_PER_TASK, min((chunk + 1) * POINTS_PER_TASK, len(work.points))):
+    for number in range(
+        chunk * POINTS_PER_TASK, min((chunk + 1) * POINTS_PER_TASK, len(work.points))
+    ):
         work.squares[number] = _nearest_square(work, row(work.points, number))

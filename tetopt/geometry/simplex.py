@@ -27,24 +27,36 @@ def facet_nodes(n: int) -> list[tuple[int, ...]]:
 
 
 def outward_facet_nodes(n: int) -> NDArray[np.int64]:
-    """Local nodes of each facet, facing out; for even k, `facet_nodes` of a positively oriented simplex do already."""
+    """Local nodes of each facet, facing out; for even k, `facet_nodes` of a positively oriented
+    simplex do already.
+    """
     return np.array(
-        [nodes if k % 2 == 0 else (nodes[1], nodes[0], *nodes[2:]) for k, nodes in enumerate(facet_nodes(n))]
+        [
+            nodes if k % 2 == 0 else (nodes[1], nodes[0], *nodes[2:])
+            for k, nodes in enumerate(facet_nodes(n))
+        ]
     )
 
 
 def volumes(points: Points, cells: Cells) -> NDArray[np.float64]:
-    """Signed volumes (areas in 2-D), (M,) float64, mm^n; positive for a positively oriented cell."""
+    """Signed volumes (areas in 2-D), (M,) float64, mm^n; positive for a positively oriented
+    cell.
+    """
     result, columns = np.empty(len(cells)), np.ascontiguousarray(points.T)
     for start in range(0, len(cells), CELLS_AT_A_TIME):
         some = slice(start, start + CELLS_AT_A_TIME)
-        corners = columns[:, np.ascontiguousarray(cells[some].T)]  # coordinate by coordinate takes half the time
-        result[some] = determinants((corners[:, 1:] - corners[:, :1]).T) / factorial(points.shape[1])
+        # coordinate by coordinate takes half the time
+        corners = columns[:, np.ascontiguousarray(cells[some].T)]
+        result[some] = determinants((corners[:, 1:] - corners[:, :1]).T) / factorial(
+            points.shape[1]
+        )
     return result
 
 
 def determinants(frames: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Determinants of (M, n, n) matrices, written out: exactly 0 where two rows are equal, unlike an LU's."""
+    """Determinants of (M, n, n) matrices, written out: exactly 0 where two rows are equal,
+    unlike an LU's.
+    """
     if frames.shape[1] == 2:
         return frames[:, 0, 0] * frames[:, 1, 1] - frames[:, 0, 1] * frames[:, 1, 0]
     (a, b, c), (d, e, f), (g, h, i) = (frames[:, row].T for row in range(3))
@@ -52,7 +64,9 @@ def determinants(frames: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def oriented(points: Points, cells: Cells) -> NDArray[np.int64]:
-    """Copy of `cells`, (M, n+1) int64, with the last two nodes swapped where the signed volume is negative."""
+    """Copy of `cells`, (M, n+1) int64, with the last two nodes swapped where the signed volume
+    is negative.
+    """
     turned = np.array(cells, dtype=np.int64)
     is_negative = volumes(points, cells) < 0.0
     turned[is_negative, -2:] = turned[is_negative, :-3:-1]
@@ -72,14 +86,19 @@ def squared_edges(points: Points, cells: Cells) -> NDArray[np.float64]:
 
 
 def facet_areas(points: Points, cells: Cells) -> NDArray[np.float64]:
-    """Areas (edge lengths in 2-D) of each cell's facets, (M, n+1) float64, mm^(n-1); column i is opposite node i."""
-    return np.stack([np.sqrt(_dot(normal, normal)) for normal in _facet_normals(points, cells)], axis=1)
+    """Areas (edge lengths in 2-D) of each cell's facets, (M, n+1) float64, mm^(n-1); column i is
+    opposite node i.
+    """
+    return np.stack(
+        [np.sqrt(_dot(normal, normal)) for normal in _facet_normals(points, cells)], axis=1
+    )
 
 
 def area_normals(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     """Normals (K, n) of facets with corners (K, n, n), as long as their areas, mm^2 (in 2-D mm).
 
-    They point to the side from which three corners turn anticlockwise; in 2-D to the right of first to second.
+    They point to the side from which three corners turn anticlockwise; in 2-D to the right of first
+    to second.
     """
     edges = corners[:, 1:] - corners[:, :1]
     if corners.shape[2] == 3:
@@ -117,13 +136,16 @@ def _cross(a: Vectors, b: Vectors) -> Vectors:
 
 
 def _facet_normals(points: Points, cells: Cells) -> list[Vectors]:
-    """Outward normals of positively oriented cells, as long as their facet's area, by the node opposite."""
+    """Outward normals of positively oriented cells, as long as their facet's area, by the node
+    opposite.
+    """
     corners = _corners(points, cells)
     if points.shape[1] == 2:
         along = [_minus(corners[b], corners[a]) for a, b in ((1, 2), (2, 0), (0, 1))]
         return [[y, -x] for x, y in along]
     normals = []
-    for a, b, c in ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)):  # ordered so that the product points outwards
+    # ordered so that the product points outwards
+    for a, b, c in ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)):
         product = _cross(_minus(corners[b], corners[a]), _minus(corners[c], corners[a]))
         normals.append([0.5 * x for x in product])
     return normals
@@ -132,20 +154,23 @@ def _facet_normals(points: Points, cells: Cells) -> list[Vectors]:
 def volume_gradients(points: Points, cells: Cells) -> NDArray[np.float64]:
     """Gradient of each cell's volume by each of its nodes, (M, n+1, n) float64, mm^(n-1).
 
-    Moving node i along a vector d changes the volume by (area of the opposite facet) x (height gained) / n,
-    so the gradient is minus the outward area normal over n.
+    Moving node i along a vector d changes the volume by (area of the opposite facet) x (height
+    gained) / n, so the gradient is minus the outward area normal over n.
     """
-    normals = np.stack([np.stack(normal, axis=1) for normal in _facet_normals(points, cells)], axis=1)
+    normals = np.stack(
+        [np.stack(normal, axis=1) for normal in _facet_normals(points, cells)], axis=1
+    )
     return -normals / points.shape[1]
 
 
 def rho(points: Points, cells: Cells) -> NDArray[np.float64]:
-    """Inradius over circumradius, (M,) float64 in [0, 1/n]: 1/n for the regular simplex, 0 for a flat one.
+    """Inradius over circumradius, (M,) float64 in [0, 1/n]: 1/n for the regular simplex, 0 for a
+    flat one.
 
-    The shape measure of Section 2.1. The inradius is n v / (sum of facet areas). In 2-D the circumradius is
-    abc / 4v; in 3-D it is |a^2 (b x c) + b^2 (c x a) + c^2 (a x b)| / 12 v with the edges a, b, c from one node.
-    Their quotient has v^2 in the numerator, so flat cells need no special case. Inverted cells get the value of
-    their mirror image.
+    The shape measure of Section 2.1. The inradius is n v / (sum of facet areas). In 2-D the
+    circumradius is abc / 4v; in 3-D it is |a^2 (b x c) + b^2 (c x a) + c^2 (a x b)| / 12 v with the
+    edges a, b, c from one node. Their quotient has v^2 in the numerator, so flat cells need no
+    special case. Inverted cells get the value of their mirror image.
     """
     v = volumes(points, cells)
     if points.shape[1] == 2:
@@ -164,17 +189,20 @@ def rho(points: Points, cells: Cells) -> NDArray[np.float64]:
 
 
 def dihedral_angles(points: Points, cells: Cells) -> NDArray[np.float64]:
-    """Angles between facets, degrees: (M, 6) float64 in 3-D, by `edge_pairs`; (M, 3) in 2-D, by node.
+    """Angles between facets, degrees: (M, 6) float64 in 3-D, by `edge_pairs`; (M, 3) in 2-D, by
+    node.
 
-    In 3-D entry k is the angle inside the cell at edge k; in 2-D entry i is the triangle's angle at node i.
-    Flat cells have angles 0 and 180.
+    In 3-D entry k is the angle inside the cell at edge k; in 2-D entry i is the triangle's angle at
+    node i. Flat cells have angles 0 and 180.
     """
     n = points.shape[1]
     normals = _facet_normals(points, cells)
     if n == 2:
-        pairs = [(1, 2), (2, 0), (0, 1)]  # the two edges that meet in node i lie opposite the two others
+        # the two edges that meet in node i lie opposite the two others
+        pairs = [(1, 2), (2, 0), (0, 1)]
     else:
-        pairs = edge_pairs(3)[::-1]  # the facets at an edge lie opposite the two nodes it leaves out
+        # the facets at an edge lie opposite the two nodes it leaves out
+        pairs = edge_pairs(3)[::-1]
     angles = np.empty((len(cells), len(pairs)))
     for column, (i, j) in enumerate(pairs):
         p, q = normals[i], normals[j]
@@ -183,5 +211,6 @@ def dihedral_angles(points: Points, cells: Cells) -> NDArray[np.float64]:
         else:
             product = _cross(p, q)
             sine = np.sqrt(_dot(product, product))
-        angles[:, column] = np.degrees(np.arctan2(sine, -_dot(p, q)))  # exact near 0 and 180, where arccos is not
+        # exact near 0 and 180, where arccos is not
+        angles[:, column] = np.degrees(np.arctan2(sine, -_dot(p, q)))
     return angles

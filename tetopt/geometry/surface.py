@@ -1,10 +1,11 @@
 """The boundary of a set of tetrahedra as a watertight triangle surface.
 
-Cells of the set that touch only in an edge or a node leave an edge with four triangles, or a node with several fans of
-triangles. This module parts them: each sheet of the surface gets its own copy, and copies are moved apart slightly,
-since readers of surface files weld nodes by their position.
+Cells of the set that touch only in an edge or a node leave an edge with four triangles, or a node
+with several fans of triangles. This module parts them: each sheet of the surface gets its own copy,
+and copies are moved apart slightly, since readers of surface files weld nodes by their position.
 
-Half-edge 3 t + k runs from corner k of triangle t to the next one; it and the corner it leaves share that number.
+Half-edge 3 t + k runs from corner k of triangle t to the next one; it and the corner it leaves
+share that number.
 """
 
 from __future__ import annotations
@@ -28,12 +29,13 @@ SHIFT_SPACINGS = 16
 # but never by more than this fraction of that height, so that no cell turns inside out.
 LARGEST_SHIFT_FRACTION = 0.1
 
-# Steps of the search for a direction inwards of a whole fan: with the mean of the normals instead, sheets of random
-# sets of cells cross fifteen times as often; with three steps, about as rarely.
+# Steps of the search for a direction inwards of a whole fan: with the mean of the normals instead,
+# sheets of random sets of cells cross fifteen times as often; with three steps, about as rarely.
 SEARCH_STEPS = 20
 
 FOLDED_MESSAGE = (
-    "surface: expected a conforming mesh, but some of the chosen cells overlap; see `tetopt quality --check`"
+    "surface: expected a conforming mesh, but some of the chosen cells overlap; "
+    "see `tetopt quality --check`"
 )
 
 
@@ -72,9 +74,12 @@ class _Skin(NamedTuple):
     points: NDArray[np.float64]  # (N, 3), all nodes of the mesh
     triangles: NDArray[np.int64]  # (K, 3)
     normals: NDArray[np.float64]  # (K, 3), unit vectors, outwards
-    partner: NDArray[np.int64]  # (3K,), the half-edge on the other side, met by walking through the solid
-    angle: NDArray[np.float64]  # (3K,), radians, 0 to 2 pi, between the two triangles through the solid
-    height: NDArray[np.float64]  # (N,), mm, the smallest height of the chosen cells around each node
+    # (3K,), the half-edge on the other side, met by walking through the solid
+    partner: NDArray[np.int64]
+    # (3K,), radians, 0 to 2 pi, between the two triangles through the solid
+    angle: NDArray[np.float64]
+    # (N,), mm, the smallest height of the chosen cells around each node
+    height: NDArray[np.float64]
 
 
 class _Sheets(NamedTuple):
@@ -82,19 +87,24 @@ class _Sheets(NamedTuple):
 
     points: NDArray[np.float64]  # (S, 3), equal where `place` is
     place: NDArray[np.int64]  # (S,)
-    inside: NDArray[np.float64]  # (S,), the fraction of all directions that go into the solid, 0 to 1
+    # (S,), the fraction of all directions that go into the solid, 0 to 1
+    inside: NDArray[np.float64]
     height: NDArray[np.float64]  # (S,), mm, of the cells around
     normals: NDArray[np.float64]  # (C, 3), unit vectors, of the triangles of all sheets
     sheet: NDArray[np.int64]  # (C,), the sheet of each normal, ascending
 
 
-def extract_surface(points: NDArray[np.float64], cells: NDArray[np.integer], chosen: ArrayLike) -> Surface:
-    """The boundary of the chosen tetrahedra: closed, two triangles at each edge, one fan at each node.
+def extract_surface(
+    points: NDArray[np.float64], cells: NDArray[np.integer], chosen: ArrayLike
+) -> Surface:
+    """The boundary of the chosen tetrahedra: closed, two triangles at each edge, one fan at each
+    node.
 
-    Where chosen cells touch only in a node or an edge, the sheets of the surface are separated. The flattest keeps its
-    place; the others move into the narrower of their two sides, the narrowest farthest, by 1/500 of the smallest
-    height of the surrounding cells, or as far as float32 requires. So the solid separates there, and a ring closed
-    only by an edge opens. A cavity's wall is a separate surface, with normals into the cavity.
+    Where chosen cells touch only in a node or an edge, the sheets of the surface are separated. The
+    flattest keeps its place; the others move into the narrower of their two sides, the narrowest
+    farthest, by 1/500 of the smallest height of the surrounding cells, or as far as float32
+    requires. So the solid separates there, and a ring closed only by an edge opens. A cavity's wall
+    is a separate surface, with normals into the cavity.
 
     Parameters
     ----------
@@ -113,8 +123,8 @@ def extract_surface(points: NDArray[np.float64], cells: NDArray[np.integer], cho
     Raises
     ------
     InputError
-        Triangles in the plane, no cell chosen, a mask of the wrong length, indices that are out of range or not
-        integers, or overlapping cells.
+        Triangles in the plane, no cell chosen, a mask of the wrong length, indices that are out of
+        range or not integers, or overlapping cells.
 
     See Also
     --------
@@ -146,19 +156,27 @@ def extract_surface(points: NDArray[np.float64], cells: NDArray[np.integer], cho
 def _chosen_cells(points: NDArray, cells: NDArray, chosen: ArrayLike) -> NDArray[np.int64]:
     if points.shape[1] != 3 or cells.shape[1] != 4:
         raise InputError(
-            f"surface: expected tetrahedra in space, got cells of {cells.shape[1]} nodes; mesh a 3-D image"
+            f"surface: expected tetrahedra in space, got cells of {cells.shape[1]} nodes; mesh a "
+            "3-D image"
         )
     chosen = np.asarray(chosen)
     if chosen.dtype == np.bool_:
         if chosen.shape != (len(cells),):
-            raise InputError(f"surface: expected a mask of {len(cells)} cells, got shape {chosen.shape}")
+            raise InputError(
+                f"surface: expected a mask of {len(cells)} cells, got shape {chosen.shape}"
+            )
         chosen = np.flatnonzero(chosen)
     if chosen.size == 0:
-        raise InputError("surface: expected at least one cell, got none; choose another threshold or label")
+        raise InputError(
+            "surface: expected at least one cell, got none; choose another threshold or label"
+        )
     if not np.issubdtype(chosen.dtype, np.integer):
         raise InputError(f"surface: expected cells as a mask or as indices, got {chosen.dtype}")
     if chosen.min() < 0 or chosen.max() >= len(cells):
-        raise InputError(f"surface: cell indices must lie in 0..{len(cells) - 1}, got {chosen.min()}..{chosen.max()}")
+        raise InputError(
+            f"surface: cell indices must lie in 0..{len(cells) - 1}, got "
+            f"{chosen.min()}..{chosen.max()}"
+        )
     is_chosen = np.zeros(len(cells), dtype=bool)
     is_chosen[chosen] = True
     return cells[is_chosen].astype(np.int64)
@@ -181,16 +199,22 @@ def _skin(points: NDArray[np.float64], cells: NDArray[np.int64]) -> _Skin:
 def _partners(
     cells: NDArray[np.int64], shared: Facets, triangles: NDArray[np.int64], facet: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """The half-edge paired with each one, (3K,); `facet` is each triangle's number among the facets."""
+    """The half-edge paired with each one, (3K,); `facet` is each triangle's number among the
+    facets.
+    """
     start, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
     n_nodes = int(cells.max()) + 1
-    key, edge, count = np.unique(_pair_key(start, end, n_nodes), return_inverse=True, return_counts=True)
+    key, edge, count = np.unique(
+        _pair_key(start, end, n_nodes), return_inverse=True, return_counts=True
+    )
     walk = np.zeros(len(start), dtype=np.int64)
     is_crowded = count[edge] > 2
     if is_crowded.any():
         crowded = np.flatnonzero(count > 2)
         where = np.searchsorted(crowded, edge[is_crowded])
-        walk[is_crowded] = _walks(cells, shared, key[crowded], n_nodes, np.repeat(facet, 3)[is_crowded], where)
+        walk[is_crowded] = _walks(
+            cells, shared, key[crowded], n_nodes, np.repeat(facet, 3)[is_crowded], where
+        )
     one, other = np.lexsort((walk, edge)).reshape(-1, 2).T
     partner = np.empty(len(start), dtype=np.int64)
     partner[one], partner[other] = other, one
@@ -207,14 +231,17 @@ def _walks(
     facet: NDArray[np.int64],
     edge: NDArray[np.int64],
 ) -> NDArray[np.int64]:
-    """Number of the walk around an edge, from cell to cell through facets, that ends in each requested facet.
+    """Number of the walk around an edge, from cell to cell through facets, that ends in each
+    requested facet.
 
-    `crowded` are the edges' keys, ascending, and `edge` are indices into it. Every walk has two ends.
+    `crowded` are the edges' keys, ascending, and `edge` are indices into it. Every walk has two
+    ends.
     """
     is_end = np.zeros(n_nodes, dtype=bool)
     is_end[crowded // n_nodes] = is_end[crowded % n_nodes] = True
     steps = []
-    # A cell leads from one facet at its edge to the other: they lie opposite its two nodes that are not on the edge.
+    # A cell leads from one facet at its edge to the other: they lie opposite its two nodes that are
+    # not on the edge.
     for (i, j), (k, m) in zip(edge_pairs(3), reversed(edge_pairs(3)), strict=True):
         near = np.flatnonzero(is_end[cells[:, i]] & is_end[cells[:, j]])
         key = _pair_key(cells[near, i], cells[near, j], n_nodes)
@@ -227,7 +254,10 @@ def _walks(
 
 
 def _inner_angles(
-    points: NDArray[np.float64], triangles: NDArray[np.int64], normals: NDArray[np.float64], partner: NDArray[np.int64]
+    points: NDArray[np.float64],
+    triangles: NDArray[np.int64],
+    normals: NDArray[np.float64],
+    partner: NDArray[np.int64],
 ) -> NDArray[np.float64]:
     """`_Skin.angle`: pi where flat, less where the edge is convex."""
     along = (points[np.roll(triangles, -1, axis=1)] - points[triangles]).reshape(-1, 3)
@@ -245,7 +275,9 @@ def _smallest_heights(points: NDArray[np.float64], cells: NDArray[np.int64]) -> 
 
 
 def _fans(partner: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The fan of each corner, (3K,), numbered from 0: the corners met while turning around a node."""
+    """The fan of each corner, (3K,), numbered from 0: the corners met while turning around a
+    node.
+    """
     corner = np.arange(len(partner))
     before = corner - corner % 3 + (corner + 2) % 3
     return linked(corner, partner[before], len(corner))[1]
@@ -260,19 +292,29 @@ def _split_nodes(skin: _Skin, fan: NDArray[np.int64]) -> tuple[NDArray[np.int64]
     corners = np.flatnonzero(is_split[fan])
     corners = corners[np.argsort(fan[corners], kind="stable")]
     # Girard: the solid angle of a cone is the sum of the angles at its edges, less (edges - 2) pi.
-    solid = np.asarray(np.bincount(fan, weights=skin.angle - np.pi), dtype=np.float64)[copies] + 2.0 * np.pi
+    solid = (
+        np.asarray(np.bincount(fan, weights=skin.angle - np.pi), dtype=np.float64)[copies]
+        + 2.0 * np.pi
+    )
     place = node[copies]
     sheet = np.searchsorted(copies, fan[corners])
     return copies, _Sheets(
-        skin.points[place], place, solid / (4.0 * np.pi), skin.height[place], skin.normals[corners // 3], sheet
+        skin.points[place],
+        place,
+        solid / (4.0 * np.pi),
+        skin.height[place],
+        skin.normals[corners // 3],
+        sheet,
     )
 
 
 def _split_edges(skin: _Skin, fan: NDArray[np.int64]) -> tuple[NDArray[np.int64], _Sheets]:
-    """Half-edges, one per pair, whose two ends another pair joins as well, (S,), and these as sheets.
+    """Half-edges, one per pair, whose two ends another pair joins as well, (S,), and these as
+    sheets.
 
-    Where a ring of cells closes in an edge, and cells around each end of the edge close it, too, neither end has
-    several fans, but four triangles share the edge. A separate middle for each pair parts them.
+    Where a ring of cells closes in an edge, and cells around each end of the edge close it, too,
+    neither end has several fans, but four triangles share the edge. A separate middle for each pair
+    parts them.
     """
     half = np.flatnonzero(np.arange(len(fan)) < skin.partner)
     key = _pair_key(fan[half], fan[skin.partner[half]], fan.max() + 1)
@@ -294,8 +336,8 @@ def _split_edges(skin: _Skin, fan: NDArray[np.int64]) -> tuple[NDArray[np.int64]
 def _moved_apart(sheets: _Sheets) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """New positions of the sheets, (S, 3), and their displacements, (S,), mm.
 
-    The narrower sides of two sheets that do not cross are disjoint or nested. So each sheet may move into its own
-    side if nested ones move farther, and the widest need not move at all.
+    The narrower sides of two sheets that do not cross are disjoint or nested. So each sheet may
+    move into its own side if nested ones move farther, and the widest need not move at all.
     """
     if len(sheets.place) == 0:
         return sheets.points, np.zeros(0)
@@ -314,9 +356,11 @@ def _moved_apart(sheets: _Sheets) -> tuple[NDArray[np.float64], NDArray[np.float
 
 
 def _outwards(normals: NDArray[np.float64], sheet: NDArray[np.int64]) -> NDArray[np.float64]:
-    """For each sheet, the unit vector that maximises the smallest dot product with its normals, (S, 3).
+    """For each sheet, the unit vector that maximises the smallest dot product with its normals, (S,
+    3).
 
-    It points to the point of their convex hull nearest to the origin, which Frank-Wolfe steps approach.
+    It points to the point of their convex hull nearest to the origin, which Frank-Wolfe steps
+    approach.
     """
     start = np.flatnonzero(np.diff(sheet, prepend=-1))
     nearest = np.add.reduceat(normals, start) / np.diff(start, append=len(sheet))[:, None]
@@ -327,7 +371,9 @@ def _outwards(normals: NDArray[np.float64], sheet: NDArray[np.int64]) -> NDArray
         lowest[sheet[is_lowest]] = np.flatnonzero(is_lowest)
         towards = normals[lowest] - nearest
         square = (towards**2).sum(axis=1)
-        way = np.divide(-(nearest * towards).sum(axis=1), square, out=np.zeros_like(square), where=square > 0.0)
+        way = np.divide(
+            -(nearest * towards).sum(axis=1), square, out=np.zeros_like(square), where=square > 0.0
+        )
         nearest += np.clip(way, 0.0, 1.0)[:, None] * towards
     length = np.linalg.norm(nearest, axis=1, keepdims=True)
     # If the hull contains the origin, no direction is outwards of all normals, and any will do.
@@ -344,14 +390,17 @@ def _with_middles(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Insert middles of half-edges and their partners into points and triangles.
 
-    Their triangles are split from the centroid to every corner and middle, whether they have one, two or three.
+    Their triangles are split from the centroid to every corner and middle, whether they have one,
+    two or three.
     """
     of_half = np.full(triangles.size, -1, dtype=np.int64)
     of_half[half] = of_half[partner] = len(points) + np.arange(len(middles))
     is_cut = (of_half.reshape(-1, 3) >= 0).any(axis=1)
     corner, middle = triangles[is_cut], of_half.reshape(-1, 3)[is_cut]
     after = np.roll(corner, -1, axis=1)
-    centre = np.broadcast_to(len(points) + len(middles) + np.arange(len(corner))[:, None], corner.shape)
+    centre = np.broadcast_to(
+        len(points) + len(middles) + np.arange(len(corner))[:, None], corner.shape
+    )
     has_middle = middle >= 0
     parts = np.stack([corner, np.where(has_middle, middle, after), centre], axis=-1).reshape(-1, 3)
     more = np.stack([middle, after, centre], axis=-1)[has_middle]

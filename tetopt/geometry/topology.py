@@ -32,7 +32,8 @@ class Facets(NamedTuple):
     cells: NDArray[np.int64]  # (F, 2), the second is -1 on the boundary
     n_cells: NDArray[np.int64]  # (F,), number of cells that share it: 1 or 2 in a conforming mesh
     of_cell: NDArray[np.int64]  # (M, n+1), the facet opposite each local node
-    sign: NDArray[np.int64]  # (M, n+1), +1 where the facet's nodes as listed face out of the cell, else -1
+    # (M, n+1), +1 where the facet's nodes as listed face out of the cell, else -1
+    sign: NDArray[np.int64]
 
 
 def stars(cells: NDArray[np.integer], n_nodes: int) -> Stars:
@@ -57,7 +58,9 @@ def _by_number(numbers: NDArray, n: int) -> tuple[NDArray, NDArray]:
 
 
 def compact(cells: NDArray[np.int64], n_nodes: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The nodes, out of `n_nodes`, that cells use, ascending, and the cells with nodes numbered among these."""
+    """The nodes, out of `n_nodes`, that cells use, ascending, and the cells with nodes numbered
+    among these.
+    """
     is_used = np.zeros(n_nodes, dtype=bool)
     is_used[cells] = True
     return np.flatnonzero(is_used), (np.cumsum(is_used) - 1)[cells]
@@ -66,9 +69,12 @@ def compact(cells: NDArray[np.int64], n_nodes: int) -> tuple[NDArray[np.int64], 
 def facets(cells: NDArray[np.integer]) -> Facets:
     """Distinct facets of positively oriented cells (M, n+1).
 
-    A facet (a, b) faces the side to the right of a -> b in 2-D; (a, b, c) the side of (b - a) x (c - a) in 3-D.
+    A facet (a, b) faces the side to the right of a -> b in 2-D; (a, b, c) the side of (b - a) x (c
+    - a) in 3-D.
     """
-    rows, sign = _facet_rows(np.ascontiguousarray(cells, dtype=np.int64), np.array(facet_nodes(cells.shape[1] - 1)))
+    rows, sign = _facet_rows(
+        np.ascontiguousarray(cells, dtype=np.int64), np.array(facet_nodes(cells.shape[1] - 1))
+    )
     order, is_first = lexicographic_order(rows)
     n_cells = np.diff(np.append(np.flatnonzero(is_first), len(order)))
     nodes, sides, of_cell = _listed_facets(order, is_first, rows, sign)
@@ -77,7 +83,8 @@ def facets(cells: NDArray[np.integer]) -> Facets:
 
 @njit(cache=True, nogil=True)
 def _facet_rows(cells: NDArray, local: NDArray) -> tuple[NDArray, NDArray]:
-    """The nodes of all facets, each row ascending, (M (n+1), n), and the signs (M, n+1) of `Facets`.
+    """The nodes of all facets, each row ascending, (M (n+1), n), and the signs (M, n+1) of
+    `Facets`.
 
     Facet k of a positively oriented simplex, its nodes in local order, faces outwards for even k.
     """
@@ -106,10 +113,11 @@ def lexicographic_order(rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDA
 
 @njit(cache=True, nogil=True)
 def _sorted_within(order: NDArray, start: NDArray, rows: NDArray) -> NDArray:
-    """Sort rows that begin with the same number by the others, in place; return the first of each kind, (K,).
+    """Sort rows that begin with the same number by the others, in place; return the first of each
+    kind, (K,).
 
-    Insertion sort of about a dozen rows each; with the counting sort of the first numbers it takes a fifth of the time
-    of sorting all.
+    Insertion sort of about a dozen rows each; with the counting sort of the first numbers it takes
+    a fifth of the time of sorting all.
     """
     is_first, base = np.ones(len(order), dtype=np.bool_), rows.max() + 1 if len(rows) > 0 else 1
     key = np.zeros(max(np.diff(start).max(), 1) if len(start) > 1 else 1, dtype=np.int64)
@@ -134,8 +142,12 @@ def _sorted_within(order: NDArray, start: NDArray, rows: NDArray) -> NDArray:
 
 
 @njit(cache=True, nogil=True)
-def _listed_facets(order: NDArray, is_first: NDArray, rows: NDArray, sign: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Nodes, cells and facets by cell, as in `Facets`, from the order of the facets of all cells."""
+def _listed_facets(
+    order: NDArray, is_first: NDArray, rows: NDArray, sign: NDArray
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Nodes, cells and facets by cell, as in `Facets`, from the order of the facets of all
+    cells.
+    """
     n_facets, n = is_first.sum(), rows.shape[1]
     nodes, of_cell = np.empty((n_facets, n), dtype=np.int64), np.empty(sign.shape, dtype=np.int64)
     sides, facet, n_here = np.full((n_facets, 2), -1, dtype=np.int64), -1, 0
@@ -153,21 +165,24 @@ def _listed_facets(order: NDArray, is_first: NDArray, rows: NDArray, sign: NDArr
 
 
 def folded(cells: NDArray[np.integer], shared: Facets | None = None) -> NDArray[np.int64]:
-    """Groups of cells that do not lie on opposite sides of the facet they share, (K, 2) int64, by facet.
+    """Groups of cells that do not lie on opposite sides of the facet they share, (K, 2) int64, by
+    facet.
 
-    Positively oriented cells do so where the mesh folds over itself, or where three or more share a facet. Empty for a
-    conforming mesh. `shared` are the cells' facets, if already known.
+    Positively oriented cells do so where the mesh folds over itself, or where three or more share a
+    facet. Empty for a conforming mesh. `shared` are the cells' facets, if already known.
     """
     shared = facets(cells) if shared is None else shared
-    sides = np.bincount(shared.of_cell.ravel(), weights=shared.sign.ravel(), minlength=len(shared.nodes))
+    sides = np.bincount(
+        shared.of_cell.ravel(), weights=shared.sign.ravel(), minlength=len(shared.nodes)
+    )
     return shared.cells[(shared.n_cells > 2) | ((shared.n_cells == 2) & (sides != 0.0))]
 
 
 def boundary_facets(cells: NDArray[np.integer], shared: Facets | None = None) -> NDArray[np.int64]:
     """Nodes of the facets that belong to one cell only, (B, n) int64, turned to face outwards.
 
-    For positively oriented cells the normals of the returned triangles (edges in 2-D) point outwards. `shared` are the
-    cells' facets, if already known.
+    For positively oriented cells the normals of the returned triangles (edges in 2-D) point
+    outwards. `shared` are the cells' facets, if already known.
     """
     shared = facets(cells) if shared is None else shared
     is_outer = shared.n_cells == 1
@@ -183,12 +198,14 @@ def boundary_facets(cells: NDArray[np.integer], shared: Facets | None = None) ->
 def greedy_colours(cells: NDArray, start: NDArray, star_cells: NDArray) -> NDArray:
     """A colour for each node, (N,) int64 from 0, such that no two nodes of one cell share one.
 
-    `start` and `star_cells` are the rows of `Stars`, cells int64 and contiguous. Greedy in node order, so that the same
-    mesh always gets the same colours. Nodes of one colour can move at the same time: their stars share no cell.
+    `start` and `star_cells` are the rows of `Stars`, cells int64 and contiguous. Greedy in node
+    order, so that the same mesh always gets the same colours. Nodes of one colour can move at the
+    same time: their stars share no cell.
     """
     n_nodes = len(start) - 1
     colours = np.full(n_nodes, -1, dtype=np.int64)
-    taken_by = np.full(n_nodes + 1, -1, dtype=np.int64)  # the last node with a neighbour of this colour
+    # the last node with a neighbour of this colour
+    taken_by = np.full(n_nodes + 1, -1, dtype=np.int64)
     for node in range(n_nodes):
         for r in range(start[node], start[node + 1]):
             for k in range(cells.shape[1]):
@@ -202,8 +219,12 @@ def greedy_colours(cells: NDArray, start: NDArray, star_cells: NDArray) -> NDArr
     return colours
 
 
-def linked(one: NDArray[np.int64], other: NDArray[np.int64], n: int) -> tuple[int, NDArray[np.int64]]:
-    """Number of connected sets of n items linked in pairs one[i], other[i], and the set of each item, (n,)."""
+def linked(
+    one: NDArray[np.int64], other: NDArray[np.int64], n: int
+) -> tuple[int, NDArray[np.int64]]:
+    """Number of connected sets of n items linked in pairs one[i], other[i], and the set of each
+    item, (n,).
+    """
     graph = scipy.sparse.coo_array((np.ones(len(one), dtype=np.int8), (one, other)), shape=(n, n))
     count, number = scipy.sparse.csgraph.connected_components(graph, directed=False)
     return int(count), number.astype(np.int64)
@@ -212,7 +233,8 @@ def linked(one: NDArray[np.int64], other: NDArray[np.int64], n: int) -> tuple[in
 def components(cells: NDArray[np.integer], shared: Facets | None = None) -> NDArray[np.int64]:
     """The connected set of each cell, (M,) int64; cells that share a facet are connected.
 
-    Sets are numbered from 0 in the order of their first cell. `shared` are the cells' facets, if already known.
+    Sets are numbered from 0 in the order of their first cell. `shared` are the cells' facets, if
+    already known.
     """
     sides = (facets(cells) if shared is None else shared).cells
     sides = sides[sides[:, 1] >= 0]
@@ -223,8 +245,11 @@ def components(cells: NDArray[np.integer], shared: Facets | None = None) -> NDAr
     return rank[inverse]
 
 
-def largest_component(cells: NDArray[np.integer], is_chosen: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Indices of the largest facet-connected set among the chosen cells, ascending; the first of equal sets.
+def largest_component(
+    cells: NDArray[np.integer], is_chosen: NDArray[np.bool_]
+) -> NDArray[np.int64]:
+    """Indices of the largest facet-connected set among the chosen cells, ascending; the first of
+    equal sets.
 
     The paper displays the ventricles so, Fig. 3(f), choosing cells with a mean below a threshold.
     """

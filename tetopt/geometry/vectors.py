@@ -1,7 +1,8 @@
-"""Vectors of three numbers as tuples, so that kernels need not spell out every coordinate; integers stay integers.
+"""Vectors of three numbers as tuples, so that kernels need not spell out every coordinate; integers
+stay integers.
 
-LLVM inlines these functions. Inlined by numba, before type inference, they were as fast, but all kernels took a fifth
-longer to compile.
+LLVM inlines these functions. Inlined by numba, before type inference, they were as fast, but all
+kernels took a fifth longer to compile.
 """
 
 from __future__ import annotations

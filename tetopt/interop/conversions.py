@@ -1,4 +1,5 @@
-"""Conversion of meshes to and from other libraries, on plain arrays, so that `tetopt.mesh` and file readers share it.
+"""Conversion of meshes to and from other libraries, on plain arrays, so that `tetopt.mesh` and file
+readers share it.
 
 The libraries are imported only where they are needed: a mesh by itself needs none of them.
 """
@@ -27,25 +28,49 @@ if TYPE_CHECKING:
     from vtkmodules.vtkCommonDataModel import vtkFieldData, vtkUnstructuredGrid
 
 # The dimension of each cell type that a mesh may contain, or that may lie on it.
-CELL_DIMENSIONS = {"vertex": 0, "poly_vertex": 0, "line": 1, "poly_line": 1, "triangle": 2, "tetra": 3}
-# The linear type of each quadratic cell type, by the names of pyvista and meshio. All number nodes as VTK does.
+CELL_DIMENSIONS = {
+    "vertex": 0,
+    "poly_vertex": 0,
+    "line": 1,
+    "poly_line": 1,
+    "triangle": 2,
+    "tetra": 3,
+}
+# The linear type of each quadratic cell type, by the names of pyvista and meshio. All number nodes
+# as VTK does.
 CORNER_KINDS = {
-    "quadratic_edge": "line", "quadratic_triangle": "triangle", "quadratic_tetra": "tetra",
-    "line3": "line", "triangle6": "triangle", "tetra10": "tetra",
-}  # fmt: skip
-# VTK's arbitrary-order types with their number of nodes, as dolfinx writes them, and the equivalent fixed-order types.
+    "quadratic_edge": "line",
+    "quadratic_triangle": "triangle",
+    "quadratic_tetra": "tetra",
+    "line3": "line",
+    "triangle6": "triangle",
+    "tetra10": "tetra",
+}
+# VTK's arbitrary-order types with their number of nodes, as dolfinx writes them, and the equivalent
+# fixed-order types.
 LAGRANGE_KINDS = {
-    "lagrange_curve 2": "line", "lagrange_triangle 3": "triangle", "lagrange_tetrahedron 4": "tetra",
-    "lagrange_curve 3": "quadratic_edge", "lagrange_triangle 6": "quadratic_triangle",
+    "lagrange_curve 2": "line",
+    "lagrange_triangle 3": "triangle",
+    "lagrange_tetrahedron 4": "tetra",
+    "lagrange_curve 3": "quadratic_edge",
+    "lagrange_triangle 6": "quadratic_triangle",
     "lagrange_tetrahedron 10": "quadratic_tetra",
-}  # fmt: skip
-# Nodes per cell of the types with a fixed number; pyvista's other types are missing here and are rejected by name.
+}
+# Nodes per cell of the types with a fixed number; pyvista's other types are missing here and are
+# rejected by name.
 NODES_OF_KIND = {
-    "vertex": 1, "line": 2, "triangle": 3, "tetra": 4,
-    "quadratic_edge": 3, "quadratic_triangle": 6, "quadratic_tetra": 10,
-}  # fmt: skip
-VTK_KINDS = {(2, 1): 5, (3, 1): 10, (2, 2): 22, (3, 2): 24}  # VTK's cell types, by dimension and order
-MESHIO_KINDS = {(2, 1): "triangle", (3, 1): "tetra", (2, 2): "triangle6", (3, 2): "tetra10"}  # and meshio's
+    "vertex": 1,
+    "line": 2,
+    "triangle": 3,
+    "tetra": 4,
+    "quadratic_edge": 3,
+    "quadratic_triangle": 6,
+    "quadratic_tetra": 10,
+}
+# VTK's cell types, by dimension and order
+VTK_KINDS = {(2, 1): 5, (3, 1): 10, (2, 2): 22, (3, 2): 24}
+# and meshio's
+MESHIO_KINDS = {(2, 1): "triangle", (3, 1): "tetra", (2, 2): "triangle6", (3, 2): "tetra10"}
 PACKAGES = {"skfem": "scikit-fem"}  # libraries whose package name differs from their import name
 
 Fields = Mapping[str, ArrayLike]  # by name, one row per cell or per node
@@ -66,7 +91,9 @@ def library(name: str, caller: str) -> Any:
         return importlib.import_module(name)
     except ImportError as error:
         package = PACKAGES.get(name, name)
-        raise InputError(f"{caller}: {package} is not installed; {install_hint(package)}") from error
+        raise InputError(
+            f"{caller}: {package} is not installed; {install_hint(package)}"
+        ) from error
 
 
 # --- from others
@@ -79,7 +106,8 @@ def corner_kinds(kinds: Collection[str]) -> dict[str, str]:
 
 
 def kind_of_cells(kinds: Collection[str]) -> str:
-    """Return "tetra" or "triangle", the type of highest dimension; quadratic types are renamed by `corner_kinds`.
+    """Return "tetra" or "triangle", the type of highest dimension; quadratic types are renamed by
+    `corner_kinds`.
 
     Raises
     ------
@@ -88,12 +116,18 @@ def kind_of_cells(kinds: Collection[str]) -> str:
     """
     unknown = sorted(set(kinds) - set(CELL_DIMENSIONS))
     if both := sorted(CORNER_KINDS[name] for name in unknown if name in CORNER_KINDS):
-        raise InputError(f"expected cells of one order, found {both[0]} cells of both order 1 and order 2")
+        raise InputError(
+            f"expected cells of one order, found {both[0]} cells of both order 1 and order 2"
+        )
     if unknown:
-        raise InputError(f"expected tetrahedra or triangles, of order 1 or 2, found {', '.join(unknown)}")
+        raise InputError(
+            f"expected tetrahedra or triangles, of order 1 or 2, found {', '.join(unknown)}"
+        )
     kind = max(kinds, key=lambda name: CELL_DIMENSIONS[name], default="none")
     if kind not in ("tetra", "triangle"):
-        raise InputError(f"expected tetrahedra or triangles, found {', '.join(sorted(kinds)) or 'no cells'}")
+        raise InputError(
+            f"expected tetrahedra or triangles, found {', '.join(sorted(kinds)) or 'no cells'}"
+        )
     return kind
 
 
@@ -119,9 +153,14 @@ def simplices_of(
     n = cells.shape[1] - 1
     nodes = cells if middles is None else np.column_stack([cells, middles])
     if nodes.min() < 0 or nodes.max() >= len(points):
-        raise InputError(f"its cells use nodes {nodes.min()}..{nodes.max()}, but it has 0..{len(points) - 1}; damaged?")
+        raise InputError(
+            f"its cells use nodes {nodes.min()}..{nodes.max()}, but it has 0..{len(points) - 1}; "
+            "damaged?"
+        )
     if n == 2 and np.any(points[nodes, 2] != 0.0):
-        raise InputError("a triangle mesh must lie in the plane z = 0; surfaces in space are not supported")
+        raise InputError(
+            "a triangle mesh must lie in the plane z = 0; surfaces in space are not supported"
+        )
     used, compact = np.unique(cells, return_inverse=True)
     corners, compact = points[used, :n], compact.reshape(cells.shape)
     with np.errstate(invalid="ignore"):  # infinite coordinates, which Mesh rejects with a message
@@ -129,7 +168,9 @@ def simplices_of(
     return Simplices(corners, turned, used, int((turned != compact).any(axis=1).sum()))
 
 
-def rows_by_kind(sizes: NDArray[np.int64], cell_types: NDArray[np.uint8]) -> dict[str, NDArray[np.int64]]:
+def rows_by_kind(
+    sizes: NDArray[np.int64], cell_types: NDArray[np.uint8]
+) -> dict[str, NDArray[np.int64]]:
     """Group cells, given their numbers of nodes and VTK types, by pyvista's names of the types.
 
     Cells of arbitrary order are grouped with the fixed-size type that they are equivalent to.
@@ -151,22 +192,29 @@ def rows_by_kind(sizes: NDArray[np.int64], cell_types: NDArray[np.uint8]) -> dic
 
 
 def cells_of_rows(
-    connectivity: NDArray[np.int64], offsets: NDArray[np.int64], rows_of_kind: Mapping[str, NDArray[np.int64]]
+    connectivity: NDArray[np.int64],
+    offsets: NDArray[np.int64],
+    rows_of_kind: Mapping[str, NDArray[np.int64]],
 ) -> dict[str, NDArray[np.int64]]:
-    """Return the nodes of VTK's cells, (M, w) for each type; polylines of varying length keep their first nodes."""
+    """Return the nodes of VTK's cells, (M, w) for each type; polylines of varying length keep
+    their first nodes.
+    """
     sizes, cells = np.diff(offsets), {}
     for kind, chosen in rows_of_kind.items():
         width = int(sizes[chosen].min())
         if kind in NODES_OF_KIND and (sizes[chosen] != NODES_OF_KIND[kind]).any():
             raise InputError(
-                f"damaged: {kind} cells have {NODES_OF_KIND[kind]} nodes each, but some have a different number"
+                f"damaged: {kind} cells have {NODES_OF_KIND[kind]} nodes each, but some have a "
+                "different number"
             )
         cells[kind] = connectivity[offsets[chosen][:, None] + np.arange(width)]
     return cells
 
 
 def _picked(caller: str, points: ArrayLike, cells: Mapping[str, NDArray[np.int64]]) -> Simplices:
-    """Select the tetrahedra, or else the triangles, from cells by type; cells of order 2 by their corners."""
+    """Select the tetrahedra, or else the triangles, from cells by type; cells of order 2 by
+    their corners.
+    """
     try:
         places = np.asarray(points)
         places = np.asarray(places, dtype=None if places.dtype.kind == "c" else np.float64)
@@ -182,11 +230,18 @@ def _picked(caller: str, points: ArrayLike, cells: Mapping[str, NDArray[np.int64
         kind = kind_of_cells([renamed.get(name, name) for name in cells])
         name = next(name for name in cells if renamed.get(name, name) == kind)
         n_corners = CELL_DIMENSIONS[kind] + 1
-        width = n_corners if name == kind else n_corners * (n_corners + 1) // 2  # one mid-edge node per edge
+        # one mid-edge node per edge
+        width = n_corners if name == kind else n_corners * (n_corners + 1) // 2
         nodes = np.asarray(cells[name])
-        if nodes.dtype.kind not in "iu" or nodes.ndim != 2 or nodes.shape[1] != width or len(nodes) == 0:
+        if (
+            nodes.dtype.kind not in "iu"
+            or nodes.ndim != 2
+            or nodes.shape[1] != width
+            or len(nodes) == 0
+        ):
             raise InputError(
-                f"expected {name} cells of {width} integers each, got {nodes.dtype} of shape {nodes.shape}"
+                f"expected {name} cells of {width} integers each, got {nodes.dtype} of shape "
+                f"{nodes.shape}"
             )
         nodes = nodes.astype(np.int64)
         return simplices_of(in_space, nodes[:, :n_corners], nodes[:, n_corners:])
@@ -203,13 +258,17 @@ def from_pyvista(grid: Any) -> Simplices:
     if not isinstance(grid, vtkDataSet):
         raise InputError(f"from_pyvista: expected a pyvista or VTK grid, got {type(grid).__name__}")
     shown = pyvista.wrap(grid)
-    whole = shown if isinstance(shown, pyvista.UnstructuredGrid) else shown.cast_to_unstructured_grid()
+    whole = (
+        shown if isinstance(shown, pyvista.UnstructuredGrid) else shown.cast_to_unstructured_grid()
+    )
     if whole.n_cells == 0:
         raise InputError("from_pyvista: expected tetrahedra or triangles, found no cells")
     listed = whole.GetCells()
     offsets = vtk_to_numpy(listed.GetOffsetsArray()).astype(np.int64)
     rows = rows_by_kind(np.diff(offsets), np.asarray(whole.celltypes))
-    cells = cells_of_rows(vtk_to_numpy(listed.GetConnectivityArray()).astype(np.int64), offsets, rows)
+    cells = cells_of_rows(
+        vtk_to_numpy(listed.GetConnectivityArray()).astype(np.int64), offsets, rows
+    )
     return _picked("from_pyvista", whole.points, cells)
 
 
@@ -217,7 +276,10 @@ def from_meshio(mesh: Any) -> Simplices:
     """Return the simplices of a `meshio.Mesh`; see `tetopt.mesh.Mesh.from_meshio`."""
     meshio = library("meshio", "from_meshio")
     if not isinstance(mesh, meshio.Mesh):
-        raise InputError(f"from_meshio: expected a meshio.Mesh, got {type(mesh).__name__}; meshio.read(path) reads one")
+        raise InputError(
+            f"from_meshio: expected a meshio.Mesh, got {type(mesh).__name__}; meshio.read(path) "
+            "reads one"
+        )
     cells: dict[str, NDArray[np.int64]] = {}
     for block in mesh.cells:
         if len(block.data):
@@ -229,7 +291,11 @@ def from_meshio(mesh: Any) -> Simplices:
 def from_skfem(mesh: Any) -> Simplices:
     """Return the simplices of a scikit-fem mesh; see `tetopt.mesh.Mesh.from_skfem`."""
     skfem = library("skfem", "from_skfem")
-    if not isinstance(mesh, skfem.Mesh) or len(mesh.t) != mesh.dim() + 1 or mesh.dim() not in (2, 3):
+    if (
+        not isinstance(mesh, skfem.Mesh)
+        or len(mesh.t) != mesh.dim() + 1
+        or mesh.dim() not in (2, 3)
+    ):
         kind = type(mesh).__name__
         raise InputError(f"from_skfem: expected a scikit-fem MeshTri or MeshTet, got {kind}")
     return _picked("from_skfem", mesh.p.T, {"tetra" if mesh.dim() == 3 else "triangle": mesh.t.T})
@@ -238,8 +304,12 @@ def from_skfem(mesh: Any) -> Simplices:
 # --- to others
 
 
-def checked_fields(what: str, fields: Fields | None, n_rows: int | None = None) -> dict[str, NDArray]:
-    """Return arrays of numbers by name; InputError unless each has `n_rows` rows, by default any number."""
+def checked_fields(
+    what: str, fields: Fields | None, n_rows: int | None = None
+) -> dict[str, NDArray]:
+    """Return arrays of numbers by name; InputError unless each has `n_rows` rows, by default any
+    number.
+    """
     if not isinstance(fields, Mapping | None):
         raise InputError(f"{what}: expected a dict of arrays by name, got {type(fields).__name__}")
     arrays: dict[str, NDArray] = {}
@@ -280,7 +350,8 @@ def vtk_grid(
     nodes.SetData(numpy_to_vtk(places, deep=True))
     listed = vtkCellArray()
     listed.SetData(
-        cells.shape[1], numpy_to_vtkIdTypeArray(np.ascontiguousarray(cells, dtype=np.int64).ravel(), deep=True)
+        cells.shape[1],
+        numpy_to_vtkIdTypeArray(np.ascontiguousarray(cells, dtype=np.int64).ravel(), deep=True),
     )
     grid = vtkUnstructuredGrid()
     grid.SetPoints(nodes)
@@ -297,11 +368,14 @@ def add_array(fields: vtkFieldData, name: str, values: NDArray) -> None:
     from vtkmodules.vtkCommonDataModel import vtkDataSetAttributes
 
     values = np.asarray(values)
-    # VTK assumes the machine's byte order, whatever the dtype says, and floats of four or eight bytes.
+    # VTK assumes the machine's byte order, whatever the dtype says, and floats of four or eight
+    # bytes.
     is_odd = values.dtype.kind == "f" and values.dtype.itemsize not in (4, 8)
     values = values.astype(np.float64 if is_odd else values.dtype.newbyteorder("="), copy=False)
     values = values.reshape(len(values), math.prod(values.shape[1:])) if values.ndim > 1 else values
-    array = numpy_to_vtk(np.ascontiguousarray(values.view(np.uint8) if values.dtype == bool else values), deep=True)
+    array = numpy_to_vtk(
+        np.ascontiguousarray(values.view(np.uint8) if values.dtype == bool else values), deep=True
+    )
     array.SetName(name)
     fields.AddArray(array)
     if isinstance(fields, vtkDataSetAttributes) and fields.GetScalars() is None:
@@ -309,9 +383,12 @@ def add_array(fields: vtkFieldData, name: str, values: NDArray) -> None:
 
 
 def to_pyvista(
-    points: NDArray[np.float64], cells: NDArray[np.int64], kind: int, cell_data: Fields | None,
+    points: NDArray[np.float64],
+    cells: NDArray[np.int64],
+    kind: int,
+    cell_data: Fields | None,
     point_data: Fields | None,
-) -> Any:  # fmt: skip
+) -> Any:
     """Convert cells of one VTK type and their data to a `pyvista.UnstructuredGrid`."""
     pyvista = library("pyvista", "to_pyvista")
     on_cells = checked_fields("cell_data", cell_data, len(cells))
@@ -320,9 +397,12 @@ def to_pyvista(
 
 
 def to_meshio(
-    points: NDArray[np.float64], cells: NDArray[np.int64], kind: str, cell_data: Fields | None,
+    points: NDArray[np.float64],
+    cells: NDArray[np.int64],
+    kind: str,
+    cell_data: Fields | None,
     point_data: Fields | None,
-) -> Any:  # fmt: skip
+) -> Any:
     """Convert cells of one meshio type and their data to a `meshio.Mesh`; arrays are copied."""
     meshio = library("meshio", "to_meshio")
     on_cells = checked_fields("cell_data", cell_data, len(cells))
@@ -351,12 +431,18 @@ def to_trimesh(points: NDArray[np.float64], triangles: NDArray[np.int64]) -> Any
 
 
 def show_grid(
-    grid: Any, name: str | None, screenshot: str | Path | None, off_screen: bool | None, look: dict[str, Any]
+    grid: Any,
+    name: str | None,
+    screenshot: str | Path | None,
+    off_screen: bool | None,
+    look: dict[str, Any],
 ) -> Any:
     """Show a pyvista grid, coloured by the named field; see `tetopt.mesh.Mesh.plot`."""
     pyvista = library("pyvista", "plot")
     if off_screen is None:
-        has_none = sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+        has_none = sys.platform == "linux" and not (
+            os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+        )
         off_screen = pyvista.OFF_SCREEN or (has_none and not in_kernel())
     plotter = pyvista.Plotter(off_screen=off_screen or screenshot is not None)
     colour = {"scalars": name} if name is not None else {"color": "lightblue"}
@@ -365,7 +451,9 @@ def show_grid(
         plotter.view_xy()
     if off_screen or screenshot is not None:
         try:
-            return plotter.screenshot(None if screenshot is None else str(screenshot), return_img=True)
+            return plotter.screenshot(
+                None if screenshot is None else str(screenshot), return_img=True
+            )
         except (OSError, ValueError) as error:  # no such folder, or an unknown picture format
             words = " ".join(str(error).split())
             raise InputError(f"plot: {screenshot}: cannot write the picture ({words})") from error

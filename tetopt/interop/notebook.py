@@ -1,7 +1,8 @@
-"""Display of meshes, images and results in notebooks: numbers, a small picture, and the progress of a run.
+"""Display of meshes, images and results in notebooks: numbers, a small picture, and the progress of
+a run.
 
-Functions take plain arrays, so that any class can use them. Pillow draws the pictures, which take a few kilobytes
-whatever the number of cells.
+Functions take plain arrays, so that any class can use them. Pillow draws the pictures, which take a
+few kilobytes whatever the number of cells.
 """
 
 from __future__ import annotations
@@ -31,26 +32,34 @@ DRAWN_SCALE = 2  # pictures are drawn at this scale and reduced, for smooth edge
 PICTURE_COLOURS = 32  # size of the palette: half of the bytes that 256 colours take
 MARGIN_PIXELS = 4  # around the cells
 MANY_SECTIONED = 4000  # cells in a section beyond which edges would hide them
-# The colour of cells without values, and an edge colour that stands out from all greys on light and dark pages.
+# The colour of cells without values, and an edge colour that stands out from all greys on light and
+# dark pages.
 CELL_COLOUR, EDGE_COLOUR = (150, 190, 225, 255), (40, 90, 160, 255)
-DARKEST_GREY, BRIGHTEST_GREY = 30, 245  # range of drawn values, distinct from the page's black and white
-GREY_QUANTILES = (0.01, 0.99)  # quantiles drawn as these two greys, so that single cells do not reduce the contrast
+# range of drawn values, distinct from the page's black and white
+DARKEST_GREY, BRIGHTEST_GREY = 30, 245
+# quantiles drawn as these two greys, so that single cells do not reduce the contrast
+GREY_QUANTILES = (0.01, 0.99)
 TABLE_STYLE = "border-collapse:collapse;margin:0;color:inherit"
-CELL_STYLE = "text-align:left;padding:0.15em 0.8em 0.15em 0;vertical-align:top;background:none;color:inherit"
+CELL_STYLE = (
+    "text-align:left;padding:0.15em 0.8em 0.15em 0;vertical-align:top;background:none;color:inherit"
+)
 
 
 def card_html(title: str, rows: Iterable[tuple[str, str]], picture: str = "") -> str:
-    """Return HTML with a title, rows of names and values, and a picture next to them, in the colours of the page.
+    """Return HTML with a title, rows of names and values, and a picture next to them, in the
+    colours of the page.
 
     Title and rows may be any text; they are escaped. `picture` is HTML.
     """
     lines = "".join(
-        f'<tr><th style="{CELL_STYLE}">{_escaped(name)}</th><td style="{CELL_STYLE}">{_escaped(value)}</td></tr>'
+        f'<tr><th style="{CELL_STYLE}">{_escaped(name)}</th><td '
+        f'style="{CELL_STYLE}">{_escaped(value)}</td></tr>'
         for name, value in rows
     )
     return (
         '<div style="display:flex;flex-wrap:wrap;gap:1em;align-items:flex-start">'
-        f'<div><strong>{_escaped(title)}</strong><table style="{TABLE_STYLE}">{lines}</table></div>{picture}</div>'
+        f"<div><strong>{_escaped(title)}</strong><table "
+        f'style="{TABLE_STYLE}">{lines}</table></div>{picture}</div>'
     )
 
 
@@ -69,7 +78,10 @@ def mesh_rows(points: NDArray[np.float64], cells: NDArray[np.int64]) -> list[tup
         ("tetrahedra" if n == 3 else "triangles", f"{len(cells):,}"),
         ("extent", extent_words(points)),
         ("mean rho", f"{shape.mean():.3f} (1/{n} is regular)"),
-        ("dihedral angles" if n == 3 else "angles", f"{angles.min():.1f} to {angles.max():.1f} degrees"),
+        (
+            "dihedral angles" if n == 3 else "angles",
+            f"{angles.min():.1f} to {angles.max():.1f} degrees",
+        ),
     ]
 
 
@@ -81,8 +93,11 @@ def extent_words(points: NDArray[np.float64]) -> str:
 # --- pictures
 
 
-def section_html(points: NDArray[np.float64], cells: NDArray[np.int64], values: NDArray | None = None) -> str:
-    """Return a picture of a mesh as HTML: in 3-D its section at half height in z, x to the right and y upwards.
+def section_html(
+    points: NDArray[np.float64], cells: NDArray[np.int64], values: NDArray | None = None
+) -> str:
+    """Return a picture of a mesh as HTML: in 3-D its section at half height in z, x to the right
+    and y upwards.
 
     With one value per cell, (M,), cells are shaded by it; otherwise all have one colour.
     """
@@ -90,12 +105,18 @@ def section_html(points: NDArray[np.float64], cells: NDArray[np.int64], values: 
     if points.shape[1] == 3:
         middle = 0.5 * (points[:, 2].min() + points[:, 2].max())
         cut = plane_cut(points, cells, points[:, 2] - middle)
-        corners, owner, where = cut.corners[:, :, :2], cut.cells, f"the section at z = {middle:.4g} mm"
+        corners, owner, where = (
+            cut.corners[:, :, :2],
+            cut.cells,
+            f"the section at z = {middle:.4g} mm",
+        )
     else:
         corners, owner, where = points[cells], np.arange(len(cells)), "the mesh"
     if len(owner) == 0:  # separate components on both sides of the plane
         return ""
-    return _picture_html(_drawn(corners, None if values is None else values[owner]), f"{where}: its cells")
+    return _picture_html(
+        _drawn(corners, None if values is None else values[owner]), f"{where}: its cells"
+    )
 
 
 def _drawn(corners: NDArray[np.float64], values: NDArray | None) -> PIL.Image.Image:
@@ -112,32 +133,47 @@ def _drawn(corners: NDArray[np.float64], values: NDArray | None) -> PIL.Image.Im
     picture = PIL.Image.new("RGBA", (width, height), (0, 0, 0, 0))
     pen = PIL.ImageDraw.Draw(picture)
     edge = EDGE_COLOUR if len(corners) <= MANY_SECTIONED or values is None else None
-    colours = [CELL_COLOUR] * len(corners) if values is None else [(k, k, k, 255) for k in greys(values).tolist()]
+    colours = (
+        [CELL_COLOUR] * len(corners)
+        if values is None
+        else [(k, k, k, 255) for k in greys(values).tolist()]
+    )
     for place, colour in zip(places.reshape(len(places), -1).tolist(), colours, strict=True):
         pen.polygon(place, fill=colour, outline=edge)
-    return picture.resize((max(width // DRAWN_SCALE, 1), max(height // DRAWN_SCALE, 1)), PIL.Image.Resampling.BOX)
+    return picture.resize(
+        (max(width // DRAWN_SCALE, 1), max(height // DRAWN_SCALE, 1)), PIL.Image.Resampling.BOX
+    )
 
 
 def greys(values: NDArray) -> NDArray[np.int64]:
     """Map numbers to greys between the darkest and the brightest; NaN becomes the darkest."""
     finite = values[np.isfinite(values)]
     low, high = np.quantile(finite, GREY_QUANTILES) if finite.size else (0.0, 0.0)
-    fraction = np.clip((values - low) / (high - low), 0.0, 1.0) if high > low else np.full(values.shape, 0.5)
+    fraction = (
+        np.clip((values - low) / (high - low), 0.0, 1.0)
+        if high > low
+        else np.full(values.shape, 0.5)
+    )
     fraction = np.where(np.isfinite(fraction), fraction, 0.0)
     return np.rint(DARKEST_GREY + fraction * (BRIGHTEST_GREY - DARKEST_GREY)).astype(np.int64)
 
 
 def slice_html(data: NDArray, affine: NDArray[np.float64]) -> str:
-    """Return a picture of an image's voxels as HTML: in 3-D the middle slice along the last axis."""
+    """Return a picture of an image's voxels as HTML: in 3-D the middle slice along the last
+    axis.
+    """
     import PIL.Image
 
     flat = data[:, :, data.shape[2] // 2] if data.ndim == 3 else data
-    sides = np.sqrt((affine[:2, :2] ** 2).sum(axis=0) if data.ndim == 2 else (affine[:3, :2] ** 2).sum(axis=0))
+    sides = np.sqrt(
+        (affine[:2, :2] ** 2).sum(axis=0) if data.ndim == 2 else (affine[:3, :2] ** 2).sum(axis=0)
+    )
     size = np.array(flat.shape) * sides
     width, height = np.maximum(np.rint(PICTURE_PIXELS * size / size.max()), 1).astype(int).tolist()
     step = np.maximum(np.array(flat.shape) // PICTURE_PIXELS, 1)
     grey = greys(np.asarray(flat[:: step[0], :: step[1]], dtype=np.float64))
-    pixels = np.ascontiguousarray(grey.T[::-1].astype(np.uint8))  # the first axis to the right, the second upwards
+    # the first axis to the right, the second upwards
+    pixels = np.ascontiguousarray(grey.T[::-1].astype(np.uint8))
     picture = PIL.Image.fromarray(pixels).resize((width, height), PIL.Image.Resampling.NEAREST)
     where = f"slice k = {data.shape[2] // 2}" if data.ndim == 3 else "the image"
     return _picture_html(picture, f"{where}: i to the right, j upwards")
@@ -149,7 +185,10 @@ def _picture_html(picture: PIL.Image.Image, words: str) -> str:
     few = picture.quantize(PICTURE_COLOURS) if picture.mode == "RGBA" else picture
     few.save(file, "PNG", optimize=True)
     data = base64.b64encode(file.getvalue()).decode("ascii")
-    return f'<img alt="{_escaped(words)}" title="{_escaped(words)}" src="data:image/png;base64,{data}">'
+    return (
+        f'<img alt="{_escaped(words)}" title="{_escaped(words)}" '
+        f'src="data:image/png;base64,{data}">'
+    )
 
 
 # --- the kernel
@@ -173,12 +212,18 @@ class Bar:
 
     def __call__(self, record: Any) -> None:
         """Show one row of the history."""
-        words = f"iteration {record.iteration} of {self.iterations}, E {record.E:.3f}, {record.seconds:.1f} s"
+        words = (
+            f"iteration {record.iteration} of {self.iterations}, E {record.E:.3f}, "
+            f"{record.seconds:.1f} s"
+        )
         self._update(words, record.iteration)
 
     def end(self, record: Any, ended: str) -> None:
         """Show why the run ended, with its last row."""
-        words = f"ended after {record.iteration} iterations ({ended}), E {record.E:.3f}, {record.seconds:.1f} s"
+        words = (
+            f"ended after {record.iteration} iterations ({ended}), E {record.E:.3f}, "
+            f"{record.seconds:.1f} s"
+        )
         self._update(words, self.iterations)
 
     def _update(self, words: str, iteration: int) -> None:
@@ -188,13 +233,18 @@ class Bar:
     def _shown(self, words: str, iteration: int = 0) -> dict[str, str]:
         most = max(self.iterations, 1)
         bar = f'<progress value="{iteration}" max="{most}" style="width:20em"></progress>'
-        return {"text/plain": f"tetopt: {words}", "text/html": f"<div>{bar} {_escaped(words)}</div>"}
+        return {
+            "text/plain": f"tetopt: {words}",
+            "text/html": f"<div>{bar} {_escaped(words)}</div>",
+        }
 
 
 def with_bar(function: Callable[..., R]) -> Callable[..., R]:
-    """Decorate a function that takes a `callback` so that it shows a progress bar in a notebook by default.
+    """Decorate a function that takes a `callback` so that it shows a progress bar in a notebook by
+    default.
 
-    The function takes `iterations` and `callback` by name, and its result has `history` and `ended`.
+    The function takes `iterations` and `callback` by name, and its result has `history` and
+    `ended`.
     """
     default = inspect.signature(function).parameters["iterations"].default
 

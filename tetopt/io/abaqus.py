@@ -14,7 +14,14 @@ from tetopt.io.tags import check_apart, named_materials, without_data
 from tetopt.io.text import blocks, comment_lines, plain, rows
 from tetopt.mesh import Mesh
 from tetopt.model.fields import node_field
-from tetopt.model.loads import Load, count_of_steps, facet_forces, in_step, load_words, spring_constants
+from tetopt.model.loads import (
+    Load,
+    count_of_steps,
+    facet_forces,
+    in_step,
+    load_words,
+    spring_constants,
+)
 from tetopt.model.materials import Materials, cells_of, without_moduli
 from tetopt.model.model import Model, described, element_facets, elements, mass_densities
 from tetopt.model.sets import Sets
@@ -22,16 +29,21 @@ from tetopt.system.incoming import regular_file
 
 ALL_ELEMENTS = "all_cells"  # the set for which results are requested
 SPRING_PREFIX = "spring-"  # of sets of one spring each; springs are elements after the cells
-HOTTEST_DEGREES = 1000.0  # for the largest modulus; CalculiX rounds temperatures to about 1e-8 degrees
-# Between adjacent temperatures, where 1 / modulus is interpolated linearly: an error of at most 5e-5.
+# for the largest modulus; CalculiX rounds temperatures to about 1e-8 degrees
+HOTTEST_DEGREES = 1000.0
+# Between adjacent temperatures, where 1 / modulus is interpolated linearly: an error of at most
+# 5e-5.
 TEMPERATURE_RATIO = 1.02
-# The number of the face opposite each local node: S1 is 1-2-3, S2 is 1-4-2, S3 is 2-4-3, S4 is 3-4-1.
+# The number of the face opposite each local node: S1 is 1-2-3, S2 is 1-4-2, S3 is 2-4-3, S4 is
+# 3-4-1.
 FACE_NUMBERS = np.array([3, 4, 2, 1])
-# In a number: Abaqus allows no more, and CalculiX reads only the first 20, so that 1.234567890123456e-05 becomes 1.23.
+# In a number: Abaqus allows no more, and CalculiX reads only the first 20, so that
+# 1.234567890123456e-05 becomes 1.23.
 NUMBER_CHARACTERS = 20
 COMMENT_CHARACTERS = 120  # in a comment line; Abaqus reads lines of up to 256
 
-# Requests that both solvers know. Only CalculiX has TOTALS=ONLY, which would omit the energy of each cell.
+# Requests that both solvers know. Only CalculiX has TOTALS=ONLY, which would omit the energy of
+# each cell.
 OUTPUT_REQUESTS = f"""\
 ** Displacement, stress and strain (CalculiX .frd, Abaqus .fil)
 *NODE FILE
@@ -47,32 +59,38 @@ ELSE
 def abaqus(model: Model) -> bytes:
     """Return an Abaqus input file (.inp), for Abaqus/Standard and CalculiX.
 
-    Linear (C3D4) or quadratic (C3D10) tetrahedra. Each facet set becomes a surface and a node set of its name, the
-    latter including midside nodes; each cell set becomes an element set. "all_cells" contains all elements. Materials
-    and their element sets are named after labels (`tetopt.io.tags.named_materials`). A modulus that varies within
-    cells becomes a material with a temperature-dependent modulus: the temperature at each node is the modulus in
-    thousandths of the largest; both solvers interpolate it linearly between corners, and there is no expansion.
+    Linear (C3D4) or quadratic (C3D10) tetrahedra. Each facet set becomes a surface and a node set
+    of its name, the latter including midside nodes; each cell set becomes an element set.
+    "all_cells" contains all elements. Materials and their element sets are named after labels
+    (`tetopt.io.tags.named_materials`). A modulus that varies within cells becomes a material with a
+    temperature-dependent modulus: the temperature at each node is the modulus in thousandths of the
+    largest; both solvers interpolate it linearly between corners, and there is no expansion.
 
-    Each step of the loads becomes a static step, a separate load case, whose strain energy and reaction forces both
-    solvers print: pressure on faces, tractions as nodal forces and springs from nodes to the ground by
-    `tetopt.model.loads.facet_weights`, and gravity on all cells. Steps of a nonlinear model request large deformation
-    with a neo-Hookean material, because linear elasticity in Green's strain collapses under pressure.
+    Each step of the loads becomes a static step, a separate load case, whose strain energy and
+    reaction forces both solvers print: pressure on faces, tractions as nodal forces and springs
+    from nodes to the ground by `tetopt.model.loads.facet_weights`, and gravity on all cells. Steps
+    of a nonlinear model request large deformation with a neo-Hookean material, because linear
+    elasticity in Green's strain collapses under pressure.
 
-    Numbers read back unchanged, except those of more than 20 characters, which neither solver reads: they are rounded
-    to the 13 to 16 digits that fit. Among coordinates, this affects some of those within 0.1 mm of 0.
+    Numbers read back unchanged, except those of more than 20 characters, which neither solver
+    reads: they are rounded to the 13 to 16 digits that fit. Among coordinates, this affects some of
+    those within 0.1 mm of 0.
 
     Raises
     ------
     InputError
-        The model is 2-D; loads have no materials; springs are in only some steps; a set has a name that the file uses
-        itself.
+        The model is 2-D; loads have no materials; springs are in only some steps; a set has a name
+        that the file uses itself.
     """
     if model.materials is not None and model.node_young is not None:
         model = model._replace(materials=without_moduli(model.materials))
     _check(model)
     parts = [_head(model), *_mesh(model)]
     parts += [f"*ELSET, ELSET={name}\n{_list(cells)}" for name, cells in model.sets.cells.items()]
-    parts += [f"*SURFACE, NAME={name}, TYPE=ELEMENT\n{_faces(members)}" for name, members in model.sets.facets.items()]
+    parts += [
+        f"*SURFACE, NAME={name}, TYPE=ELEMENT\n{_faces(members)}"
+        for name, members in model.sets.facets.items()
+    ]
     parts += _materials(model)
     if model.loads:
         parts += _springs(model)
@@ -85,17 +103,25 @@ def _check(model: Model) -> None:
     if model.mesh.ndim == 2:
         raise InputError("abaqus: expected a tetrahedral mesh, got triangles; use .vtu")
     if model.loads and model.materials is None:
-        raise InputError("abaqus: loads need materials; give a modulus mapping (`young`) or omit the loads")
-    if count_of_steps(model.loads) > 1 and (some := [x for x in model.loads if x.kind == "spring" and x.step]):
         raise InputError(
-            f"abaqus: expected springs in all steps, got {load_words(some[0])}; omit the step or write several files"
+            "abaqus: loads need materials; give a modulus mapping (`young`) or omit the loads"
+        )
+    if count_of_steps(model.loads) > 1 and (
+        some := [x for x in model.loads if x.kind == "spring" and x.step]
+    ):
+        raise InputError(
+            f"abaqus: expected springs in all steps, got {load_words(some[0])}; omit the step or "
+            "write several files"
         )
     if model.is_nonlinear and (count := count_of_steps(model.loads)) > 1:
         raise InputError(
-            f"abaqus: expected one nonlinear step, got {count} (each would continue from the previous one); write a "
+            f"abaqus: expected one nonlinear step, got {count} (each would continue from the "
+            "previous one); write a "
             "file for each"
         )
-    others = {name: cells for name, cells in model.sets.cells.items() if name not in _shared_sets(model)}
+    others = {
+        name: cells for name, cells in model.sets.cells.items() if name not in _shared_sets(model)
+    }
     check_apart([ALL_ELEMENTS, *named_materials(model)], others)
 
 
@@ -104,7 +130,9 @@ def _shared_sets(model: Model) -> set[str]:
     if model.materials is None:
         return set()
     of_material = zip(named_materials(model), cells_of(model.materials), strict=True)
-    return {name for name, cells in of_material if np.array_equal(model.sets.cells.get(name, -1), cells)}
+    return {
+        name for name, cells in of_material if np.array_equal(model.sets.cells.get(name, -1), cells)
+    }
 
 
 def _head(model: Model) -> str:
@@ -151,7 +179,11 @@ def _law(model: Model, materials: Materials, k: int) -> str:
         young = materials.young[k : k + 1]
     else:
         low, high = float(model.node_young.min()), float(model.node_young.max())
-        count = 1 + int(np.ceil(np.log(high / low) / np.log(TEMPERATURE_RATIO))) if model.is_nonlinear else 2
+        count = (
+            1 + int(np.ceil(np.log(high / low) / np.log(TEMPERATURE_RATIO)))
+            if model.is_nonlinear
+            else 2
+        )
         young = np.unique(np.geomspace(low, high, count).clip(low, high))
     temperatures = () if model.node_young is None else (_fitting(_temperatures(model, young)),)
     if not model.is_nonlinear:
@@ -159,7 +191,10 @@ def _law(model: Model, materials: Materials, k: int) -> str:
         return f"*ELASTIC\n{rows(*map(_fitting, constants), *temperatures, separator=', ')}"
     # C10 = mu / 2 and D1 = 2 / bulk modulus, so that the response at small strains is the same.
     constants = (young / (4.0 + 4.0 * nu), 6.0 * (1.0 - 2.0 * nu) / young)
-    return f"*HYPERELASTIC, NEO HOOKE\n{rows(*map(_fitting, constants), *temperatures, separator=', ')}"
+    return (
+        "*HYPERELASTIC, NEO "
+        f"HOOKE\n{rows(*map(_fitting, constants), *temperatures, separator=', ')}"
+    )
 
 
 def _temperatures(model: Model, young: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -194,12 +229,15 @@ def _step(model: Model, step: int) -> list[str]:
     loads = in_step(model.loads, step)
     new = ", OP=NEW" if count_of_steps(model.loads) > 1 else ""
     cards = {
-        "*BOUNDARY": _conditions(loads), "*CLOAD": _forces(model, loads),
+        "*BOUNDARY": _conditions(loads),
+        "*CLOAD": _forces(model, loads),
         "*DLOAD": _weight(loads) + _pressures(model, loads),
-    }  # fmt: skip
+    }
     displaced = dict.fromkeys(load.set_name for load in loads if load.kind == "displacement")
     return [
-        "*STEP, NLGEOM, INC=1000\n*STATIC\n0.1, 1.0, 1e-05, 0.25\n" if model.is_nonlinear else "*STEP\n*STATIC\n",
+        "*STEP, NLGEOM, INC=1000\n*STATIC\n0.1, 1.0, 1e-05, 0.25\n"
+        if model.is_nonlinear
+        else "*STEP\n*STATIC\n",
         *(f"{card}{new}\n{lines}" for card, lines in cards.items() if lines or new),
         OUTPUT_REQUESTS,
         "** Reaction forces and their sums\n" if displaced else "",
@@ -231,13 +269,17 @@ def _forces(model: Model, loads: tuple[Load, ...]) -> str:
 
 
 def _pressures(model: Model, loads: tuple[Load, ...]) -> str:
-    """Return pressures on faces of cells; CalculiX does not support OP=NEW for pressures on surfaces."""
+    """Return pressures on faces of cells; CalculiX does not support OP=NEW for pressures on
+    surfaces.
+    """
     pressed = [load for load in loads if load.kind == "pressure"]
     if not pressed:
         return ""
     members = [model.sets.facets[load.set_name] for load in pressed]
     faces, which = np.unique(np.concatenate(members), axis=0, return_inverse=True)
-    values = np.repeat([float(load.numbers[0]) for load in pressed], [len(each) for each in members])
+    values = np.repeat(
+        [float(load.numbers[0]) for load in pressed], [len(each) for each in members]
+    )
     total: NDArray[np.float64] = np.bincount(which.ravel(), weights=values).astype(np.float64)
     lines = zip(_faces(faces, "P").splitlines(), _fitting(total).tolist(), strict=True)
     return "".join(f"{face}, {value!r}\n" for face, value in lines)
@@ -249,7 +291,10 @@ def _weight(loads: tuple[Load, ...]) -> str:
     size = float(np.linalg.norm(acceleration))
     if size == 0.0:
         return ""
-    return f"{ALL_ELEMENTS}, GRAV, {', '.join(_number(float(x)) for x in (size, *(acceleration / size)))}\n"
+    return (
+        f"{ALL_ELEMENTS}, GRAV, "
+        f"{', '.join(_number(float(x)) for x in (size, *(acceleration / size)))}\n"
+    )
 
 
 def _list(numbers: NDArray[np.int64]) -> str:
@@ -284,7 +329,9 @@ def _shortened(value: float) -> float:
 
 
 def input_sets(path: Path, mesh: Mesh) -> Sets | None:
-    """Read the sets of an input file of tetopt's, except materials and "all_cells"; None for other files and meshes."""
+    """Read the sets of an input file of tetopt's, except materials and "all_cells"; None for
+    other files and meshes.
+    """
     text = regular_file(path, "Abaqus file").read_text("utf-8", "replace")
     facets, cells, own = {}, {}, {ALL_ELEMENTS}
     if not text.startswith("** tetopt"):

@@ -1,9 +1,11 @@
-"""Reading untrusted files in a separate process, by compiled libraries that damaged files can crash.
+"""Reading untrusted files in a separate process, by compiled libraries that damaged files can
+crash.
 
-The child is ``python -P -m tetopt.io.apart``: it gets its job by standard input and returns arrays by standard output,
-as a line of JSON and their bytes, so that nothing is executed here (no pickle). Its memory is limited (RLIMIT_AS), so
-that excessive sizes in a header are rejected and not allocated; its time is limited, too. It costs a third of a second,
-most of it for loading the library, which the parent then need not load.
+The child is ``python -P -m tetopt.io.apart``: it gets its job by standard input and returns arrays
+by standard output, as a line of JSON and their bytes, so that nothing is executed here (no pickle).
+Its memory is limited (RLIMIT_AS), so that excessive sizes in a header are rejected and not
+allocated; its time is limited, too. It costs a third of a second, most of it for loading the
+library, which the parent then need not load.
 """
 
 from __future__ import annotations
@@ -30,9 +32,12 @@ from tetopt.system.budget import address_bytes
 from tetopt.system.child import limit_self, signal_words, started
 from tetopt.system.interpreter import python_command, python_environment
 
-LEAST_BYTES = 2**31  # of memory for any file, after loading libraries: their buffers and small files
-BYTES_A_BYTE = 64  # of additional memory per byte of the file: text grows eightfold, zlib on meshes tenfold
-BYTES_A_VALUE_BYTE = 4  # of memory per byte of voxels by the header: copies of the library, numpy and reordering
+# of memory for any file, after loading libraries: their buffers and small files
+LEAST_BYTES = 2**31
+# of additional memory per byte of the file: text grows eightfold, zlib on meshes tenfold
+BYTES_A_BYTE = 64
+# of memory per byte of voxels by the header: copies of the library, numpy and reordering
+BYTES_A_VALUE_BYTE = 4
 LEAST_SECONDS = 60.0  # for any file, also on a busy machine
 SECONDS_A_BYTE = 1e-6  # 1 MB/s, a twentieth of the speed for the slowest of these files
 ARRAY_MARK = "\0array"  # a name that no file contains
@@ -40,21 +45,27 @@ DEFLATE_RATIO = 1032  # zlib's maximum compression: a header that declares more 
 
 
 def read_apart(
-    read: Callable[..., Any], path: Path, *rest: Any, size: int | None = None, value_bytes: int = 0, library: str
+    read: Callable[..., Any],
+    path: Path,
+    *rest: Any,
+    size: int | None = None,
+    value_bytes: int = 0,
+    library: str,
 ) -> Any:
     """Call ``read(str(path), *rest)`` in a child process.
 
     Parameters
     ----------
     read : function
-        A function of a module. Returns numbers, texts, None, arrays of numbers or texts, and lists, tuples and dicts of
-        these; tuples come back as lists.
+        A function of a module. Returns numbers, texts, None, arrays of numbers or texts, and lists,
+        tuples and dicts of these; tuples come back as lists.
     path : Path
         The file or folder.
     *rest
         Values that JSON supports.
     size : int, optional
-        Number of bytes to read, which determines the limits on memory and time; by default that of the file.
+        Number of bytes to read, which determines the limits on memory and time; by default that of
+        the file.
     value_bytes : int
         Size of the values by the header, checked by the caller, if known.
     library : str
@@ -69,12 +80,20 @@ def read_apart(
     most_bytes = LEAST_BYTES + BYTES_A_BYTE * size + BYTES_A_VALUE_BYTE * value_bytes
     seconds = LEAST_SECONDS + SECONDS_A_BYTE * (size + value_bytes)
     name = f"{read.__module__}:{read.__qualname__}"
-    job = {"read": name, "path": str(path), "rest": rest, "bytes": most_bytes, "seconds": int(seconds)}
+    job = {
+        "read": name,
+        "path": str(path),
+        "rest": rest,
+        "bytes": most_bytes,
+        "seconds": int(seconds),
+    }
     deadline = time.monotonic() + seconds
     answer, code = _of_child(job, seconds)
     if answer is None:
         if time.monotonic() >= deadline or code == -getattr(signal, "SIGXCPU", 0):
-            raise InputError(f"{library} did not read it within {seconds:.0f} s; it may be damaged or malicious")
+            raise InputError(
+                f"{library} did not read it within {seconds:.0f} s; it may be damaged or malicious"
+            )
         ending = (signal_words(code) or f"exit code {code}").rpartition(", ")[2]
         raise InputError(
             f"{library} crashed on this file ({ending}; memory limit {most_bytes / 1e9:.1f} GB); "
@@ -86,7 +105,9 @@ def read_apart(
 
 
 def _of_child(job: dict[str, Any], seconds: float) -> tuple[dict[str, Any] | None, int]:
-    """Return the answer of a child, None if it is incomplete, and its exit code; kill it after some seconds."""
+    """Return the answer of a child, None if it is incomplete, and its exit code; kill it after
+    some seconds.
+    """
     with started(
         python_command("-m", "tetopt.io.apart"),
         python_environment(),
@@ -158,10 +179,16 @@ def _answer(job: dict[str, Any]) -> dict[str, Any]:
     except InputError as error:
         return {"refused": str(error)}
     except MemoryError:
-        return {"refused": f"reading it needs more than {job['bytes'] / 1e9:.1f} GB of memory; is it damaged?"}
+        return {
+            "refused": f"reading it needs more than {job['bytes'] / 1e9:.1f} GB of memory; is it "
+            "damaged?"
+        }
     except Exception as error:  # libraries raise any error on damaged files
         words = " ".join(str(error).split())
-        return {"refused": f"truncated or damaged; copy it again ({type(error).__name__}: {words[:200]})"}
+        return {
+            "refused": f"truncated or damaged; copy it again ({type(error).__name__}: "
+            f"{words[:200]})"
+        }
 
 
 def main() -> None:

@@ -1,6 +1,7 @@
 """Warnings of headers that state the place, side or size of their voxels twice, differently.
 
-Each reader's library uses one of the statements, by a rule of its format. The other one may be the true one.
+Each reader's library uses one of the statements, by a rule of its format. The other one may be the
+true one.
 """
 
 from __future__ import annotations
@@ -17,10 +18,17 @@ from tetopt.errors import InputError
 from tetopt.io.text import plain
 
 SAME_VOXELS = 0.05  # of a voxel's shortest edge: positions this close are equal
-SAME_FRACTION = 2e-3  # of a distance: quaternions in 32 bits turn an image by up to 7e-4 near half a turn
+# of a distance: quaternions in 32 bits turn an image by up to 7e-4 near half a turn
+SAME_FRACTION = 2e-3
 SAME_SIZE = 1e-3  # relative: rounded voxel sizes
 # NIfTI's codes of spaces.
-SPACES_OF_NIFTI = {1: "scanner space", 2: "aligned space", 3: "Talairach space", 4: "MNI space", 5: "template space"}
+SPACES_OF_NIFTI = {
+    1: "scanner space",
+    2: "aligned space",
+    3: "Talairach space",
+    4: "MNI space",
+    5: "template space",
+}
 # Fields of MetaImage that state the same; MetaIO uses the first that is there.
 META_FIELDS = (
     ("voxel sizes", ("ElementSpacing", "ElementSize")),
@@ -28,14 +36,23 @@ META_FIELDS = (
     ("directions", ("TransformMatrix", "Rotation", "Orientation")),
 )
 SPACES_OF_ITK = (  # of NRRD: ITK turns their coordinates to LPS and takes all others as LPS
-    "left-posterior-superior", "lps", "right-anterior-superior", "ras", "left-anterior-superior", "las",
-)  # fmt: skip
+    "left-posterior-superior",
+    "lps",
+    "right-anterior-superior",
+    "ras",
+    "left-anterior-superior",
+    "las",
+)
 
 
 def notes_of_places(
-    names: tuple[str, str], used: NDArray[np.float64], other: NDArray[np.float64], shape: Sequence[int]
+    names: tuple[str, str],
+    used: NDArray[np.float64],
+    other: NDArray[np.float64],
+    shape: Sequence[int],
 ) -> list[str]:
-    """Return a warning if two affines, (n+1, n+1), mm, place the voxels of a `shape` differently, beyond rounding.
+    """Return a warning if two affines, (n+1, n+1), mm, place the voxels of a `shape` differently,
+    beyond rounding.
 
     A sheared affine agrees with a rotated one next to it, because quaternions have no shear.
     """
@@ -46,16 +63,26 @@ def notes_of_places(
         return []  # refused later
     left, _, right = np.linalg.svd(columns / steps)
     shear = columns - left @ right * steps
-    corners = np.stack(np.meshgrid(*([0.0, size - 1.0] for size in shape[:n])), axis=-1).reshape(-1, n)
+    corners = np.stack(np.meshgrid(*([0.0, size - 1.0] for size in shape[:n])), axis=-1).reshape(
+        -1, n
+    )
     apart = np.linalg.norm(corners @ (columns - others).T + used[:n, n] - other[:n, n], axis=1)
     slack = SAME_VOXELS * steps.min() + SAME_FRACTION * np.linalg.norm(corners @ columns.T, axis=1)
     slack += 2.0 * np.linalg.norm(corners @ shear.T, axis=1)
-    words = [f"place it differently, by up to {apart.max():.3g} mm"] if (apart > slack).any() else []
+    words = (
+        [f"place it differently, by up to {apart.max():.3g} mm"] if (apart > slack).any() else []
+    )
     if np.linalg.det(columns) * np.linalg.det(others) < 0.0:
         words.append("are mirror images of each other (left/right)")
-    if (np.abs(steps - other_steps) > (SAME_SIZE + 2.0 * np.abs(shear).max() / steps.min()) * steps).any():
+    if (
+        np.abs(steps - other_steps) > (SAME_SIZE + 2.0 * np.abs(shear).max() / steps.min()) * steps
+    ).any():
         words.append(f"have voxels of {sizes_words(steps)} and {sizes_words(other_steps)} mm")
-    return [f"{names[0]} and {names[1]} {', and '.join(words)}; {names[0]} is used, check it"] if words else []
+    return (
+        [f"{names[0]} and {names[1]} {', and '.join(words)}; {names[0]} is used, check it"]
+        if words
+        else []
+    )
 
 
 def notes_of_nifti(header: Any, shape: Sequence[int]) -> list[str]:
@@ -70,27 +97,43 @@ def notes_of_nifti(header: Any, shape: Sequence[int]) -> list[str]:
             else [f" ({SPACES_OF_NIFTI.get(k, k)})" for k in (sform_code, qform_code)]
         )
         names = (f"the sform{spaces[0]}", f"the qform{spaces[1]}")
-        notes += notes_of_places(names, sform.astype(np.float64), qform.astype(np.float64), [*shape[:3], 1, 1][:3])
+        notes += notes_of_places(
+            names, sform.astype(np.float64), qform.astype(np.float64), [*shape[:3], 1, 1][:3]
+        )
     elif sform is not None:
         n = min(len(shape), 3)
-        steps, sizes = np.linalg.norm(sform[:3, :n], axis=0), np.array(header["pixdim"][1 : n + 1], dtype=np.float64)
+        steps, sizes = (
+            np.linalg.norm(sform[:3, :n], axis=0),
+            np.array(header["pixdim"][1 : n + 1], dtype=np.float64),
+        )
         if (np.abs(sizes - steps) > SAME_SIZE * steps).any():
-            of_each = f"its sform has voxels of {sizes_words(steps)} mm, its pixdim {sizes_words(sizes)} mm"
+            of_each = (
+                f"its sform has voxels of {sizes_words(steps)} mm, its pixdim "
+                f"{sizes_words(sizes)} mm"
+            )
             notes.append(f"{of_each}; the sform is used, check it")
     elif qform is None and header.get_sform()[:3, :3].any():
         notes.append("its sform has code 0 (unset) and is ignored; give it a code if it is right")
     n_axes = len(shape)
     if any(size > 1 for size in header["dim"][n_axes + 1 :]):
-        notes.append(f"its dim lists {header['dim'][1:].tolist()} voxels, but only {n_axes} axes (dim[0]) are read")
+        notes.append(
+            f"its dim lists {header['dim'][1:].tolist()} voxels, but only {n_axes} axes (dim[0]) "
+            "are read"
+        )
     return notes
 
 
 def notes_of_rest(rest: int, sizes: Sequence[int], value_bytes: int) -> list[str]:
-    """Return a warning if a file goes on for a slice or more after the voxels that its header declares."""
+    """Return a warning if a file goes on for a slice or more after the voxels that its header
+    declares.
+    """
     if rest < value_bytes * math.prod(sizes[:2]):
         return []
     words = " x ".join(map(str, sizes))
-    return [f"its header declares {words} voxels, but the file has {rest} more bytes after them; check its sizes"]
+    return [
+        f"its header declares {words} voxels, but the file has {rest} more bytes after them; "
+        "check its sizes"
+    ]
 
 
 def notes_of_metaimage(stated: Sequence[tuple[str, str]]) -> list[str]:
@@ -98,42 +141,57 @@ def notes_of_metaimage(stated: Sequence[tuple[str, str]]) -> list[str]:
     fields, notes = dict(stated), []
     for key, value in stated:
         if value.split() != fields[key].split():
-            notes.append(f"states {key} twice, {plain(value)} and {plain(fields[key])}; the last is used, check it")
+            notes.append(
+                f"states {key} twice, {plain(value)} and {plain(fields[key])}; the last is used, "
+                "check it"
+            )
     for what, keys in META_FIELDS:
         used, *others = [key for key in keys if key in fields] or [""]
         notes += [
-            f"states two {what}, {used} = {plain(fields[used])} and {key} = {plain(fields[key])}; the first is used, "
+            f"states two {what}, {used} = {plain(fields[used])} and {key} = "
+            f"{plain(fields[key])}; the first is used, "
             "check it"
             for key in others
             if not _is_alike(_numbers(fields[used]), _numbers(fields[key]))
         ]
     if "ElementSpacing" not in fields and "ElementSize" not in fields:
         notes.append("has no voxel size: assuming 1 mm")
-    matrix = next((_numbers(fields[key]) for key in META_FIELDS[2][1] if key in fields), np.zeros(0))
-    directions = matrix.reshape(3, 3) if len(matrix) == 9 else np.eye(3)  # a row per axis of the voxels
+    matrix = next(
+        (_numbers(fields[key]) for key in META_FIELDS[2][1] if key in fields), np.zeros(0)
+    )
+    # a row per axis of the voxels
+    directions = matrix.reshape(3, 3) if len(matrix) == 9 else np.eye(3)
     lengths = np.linalg.norm(directions, axis=1)
     if not _is_alike(lengths, np.ones(3)):
         notes.append(
-            f"its directions have lengths {sizes_words(lengths)}, not 1, and scale its voxel sizes; check them"
+            f"its directions have lengths {sizes_words(lengths)}, not 1, and scale its voxel "
+            "sizes; check them"
         )
     letters = fields.get("AnatomicalOrientation", "").upper()
     if _is_other_orientation(letters, directions):
         notes.append(
-            f"its AnatomicalOrientation {letters} contradicts its directions, {'x'.join(_along(directions, 'LPS'))}; "
+            f"its AnatomicalOrientation {letters} contradicts its directions, "
+            f"{'x'.join(_along(directions, 'LPS'))}; "
             "the second is used, check left and right"
         )
     return notes
 
 
 def _along(directions: NDArray[np.float64], ends: str) -> list[str]:
-    """Return a letter per row, of the end of the world axis that it runs along, by the ends of +x, +y and +z."""
+    """Return a letter per row, of the end of the world axis that it runs along, by the ends of
+    +x, +y and +z.
+    """
     opposite = dict(zip("LRPASI", "RLAPIS", strict=True))
     rows = np.arange(3), np.abs(directions).argmax(axis=1)
-    return [ends[k] if sign > 0.0 else opposite[ends[k]] for k, sign in zip(rows[1], directions[rows], strict=True)]
+    return [
+        ends[k] if sign > 0.0 else opposite[ends[k]]
+        for k, sign in zip(rows[1], directions[rows], strict=True)
+    ]
 
 
 def _is_other_orientation(letters: str, directions: NDArray[np.float64]) -> bool:
-    """Return whether MetaImage's three letters fit the directions neither as ends nor as beginnings of the axes.
+    """Return whether MetaImage's three letters fit the directions neither as ends nor as beginnings
+    of the axes.
 
     MetaIO's documents mean the ends, and ITK writes the beginnings.
     """
@@ -143,7 +201,8 @@ def _is_other_orientation(letters: str, directions: NDArray[np.float64]) -> bool
 
 
 def notes_of_nrrd(fields: Mapping[str, str], sizes: Sequence[int]) -> list[str]:
-    """Return warnings of the fields of an NRRD header, whose names are in lower case without blanks.
+    """Return warnings of the fields of an NRRD header, whose names are in lower case without
+    blanks.
 
     Raises
     ------
@@ -155,7 +214,9 @@ def notes_of_nrrd(fields: Mapping[str, str], sizes: Sequence[int]) -> list[str]:
         ("space", ("spacedimension",)),
     ):
         for other in others:
-            if one in fields and re.search("[0-9a-z]", re.sub("nan|none", "", fields.get(other, "").lower())):
+            if one in fields and re.search(
+                "[0-9a-z]", re.sub("nan|none", "", fields.get(other, "").lower())
+            ):
                 raise InputError(
                     f'its header has both "{one}" ({plain(fields[one])[:60]}) and "{other}" '
                     f"({plain(fields[other])[:60]}), which NRRD excludes; remove the wrong one"
@@ -163,11 +224,15 @@ def notes_of_nrrd(fields: Mapping[str, str], sizes: Sequence[int]) -> list[str]:
     space, notes = fields.get("space", ""), []
     if "spacedirections" in fields and space.lower() not in SPACES_OF_ITK:
         words = f'its space "{plain(space)}"' if space else "it has no space, which"
-        notes.append(f"{words} does not tell left from right: assuming left-posterior-superior, as ITK does")
+        notes.append(
+            f"{words} does not tell left from right: assuming left-posterior-superior, as ITK does"
+        )
     if "spacedirections" in fields:
         return notes
     if space:
-        raise InputError(f'its header has the space "{plain(space)}" but no "space directions"; add them')
+        raise InputError(
+            f'its header has the space "{plain(space)}" but no "space directions"; add them'
+        )
     spacings = _numbers(fields.get("spacings", ""))
     mins, maxs = (_numbers(fields.get(key, "")) for key in ("axismins", "axismaxs"))
     n_axes = min(len(sizes), 3)  # a fourth axis, of components or times, may have none
@@ -175,14 +240,23 @@ def notes_of_nrrd(fields: Mapping[str, str], sizes: Sequence[int]) -> list[str]:
     if n_unknown > 0:
         along = "" if n_unknown == n_axes else f" along {n_unknown} of {n_axes} axes"
         notes.append(f"has no voxel size{along}: assuming 1 mm")
-    spacings = np.where(np.isfinite(spacings), spacings, 1.0) if len(spacings) else np.ones(len(sizes))
+    spacings = (
+        np.where(np.isfinite(spacings), spacings, 1.0) if len(spacings) else np.ones(len(sizes))
+    )
     if len(mins) == len(maxs) == len(spacings) == len(sizes):
-        steps = [(maxs - mins) / np.maximum(np.array(sizes) - k, 1) for k in (0, 1)]  # of cells, of nodes
+        # of cells, of nodes
+        steps = [(maxs - mins) / np.maximum(np.array(sizes) - k, 1) for k in (0, 1)]
         if not any(_is_alike(each, spacings) for each in steps):
             words = f"{'are' if n_unknown == 0 else 'are taken as'} {sizes_words(spacings)}"
-            words += f", but {sizes_words(steps[0])} by its axis mins and maxs; the spacings are used, check them"
+            words += (
+                f", but {sizes_words(steps[0])} by its axis mins and maxs; the spacings "
+                "are used, check them"
+            )
             notes.append(f"its spacings {words}")
-    notes.append("it has no space, which leaves left and right open: assuming left-posterior-superior, as ITK does")
+    notes.append(
+        "it has no space, which leaves left and right open: assuming left-posterior-superior, as "
+        "ITK does"
+    )
     return notes
 
 

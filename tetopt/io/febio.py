@@ -1,6 +1,7 @@
 """FEBio input files, febio_spec 4.0: mesh, sets, materials, cell data and a static step.
 
-Based on the sources and manuals of FEBio 4 and FEBio Studio 2, and read back with pyfebio; not yet verified in FEBio.
+Based on the sources and manuals of FEBio 4 and FEBio Studio 2, and read back with pyfebio; not yet
+verified in FEBio.
 """
 
 from __future__ import annotations
@@ -15,20 +16,31 @@ from tetopt.io.tags import named_materials
 from tetopt.io.text import rows, xml_attribute, xml_comment
 from tetopt.model.loads import Load, count_of_steps, facet_forces, spring_constants
 from tetopt.model.materials import cells_of, density_of
-from tetopt.model.model import STRESS_UNITS, Model, described, element_facets, elements, mass_densities
+from tetopt.model.model import (
+    STRESS_UNITS,
+    Model,
+    described,
+    element_facets,
+    elements,
+    mass_densities,
+)
 
 MOST_MATERIAL_PARTS = 100  # with more, FEBio Studio's list of parts is unusable
-STUDIO_UNITS = {"kPa": "mm-kg-s", "MPa": "mm-N-s", "Pa": "SI"}  # FEBio's names of consistent systems of units
-# Names of sets have no spaces, so that these names, and those of parts ("cells of liver"), never clash with them.
+# FEBio's names of consistent systems of units
+STUDIO_UNITS = {"kPa": "mm-kg-s", "MPa": "mm-N-s", "Pa": "SI"}
+# Names of sets have no spaces, so that these names, and those of parts ("cells of liver"), never
+# clash with them.
 ALL_NODES, ALL_CELLS = "all nodes", "all cells"
 YOUNG_MAP, NU_MAP, DENSITY_MAP = "E", "v", "density"  # maps, named after their parameters
-DEAD_FORCES = "dead forces"  # the set of nodes with forces from tractions and weight, and the map of these forces
+# the set of nodes with forces from tractions and weight, and the map of these forces
+DEAD_FORCES = "dead forces"
 GROUND_NODES = "ground nodes"  # the far ends of springs
-# FEBio's springs act along their length, so that three of them represent one isotropic spring. With this length, in
-# sizes of the mesh, transverse movement hardly stretches them.
+# FEBio's springs act along their length, so that three of them represent one isotropic spring. With
+# this length, in sizes of the mesh, transverse movement hardly stretches them.
 SPRING_LENGTHS = 1000.0
 
-# The settings of FEBio Studio, except for equal increments up to the whole displacement, which the solver may halve.
+# The settings of FEBio Studio, except for equal increments up to the whole displacement, which the
+# solver may halve.
 CONTROL_SECTION = """\
 <Control>
 <analysis>STATIC</analysis>
@@ -57,7 +69,13 @@ RAMP_SECTION = """\
 </load_controller>
 </LoadData>
 """
-PLOT_VARIABLES = ("displacement", "stress", "Lagrange strain", "strain energy density", "reaction forces")
+PLOT_VARIABLES = (
+    "displacement",
+    "stress",
+    "Lagrange strain",
+    "strain energy density",
+    "reaction forces",
+)
 
 
 class _Part(NamedTuple):
@@ -74,25 +92,30 @@ class _Part(NamedTuple):
 def febio(model: Model) -> bytes:
     """Return an FEBio input file (.feb), febio_spec 4.0.
 
-    Linear (tet4) or quadratic (tet10) tetrahedra. Each facet set becomes a surface and a node set of its name, the
-    latter including midside nodes; each cell set becomes an element set. A cell's id is its number in the mesh plus 1.
+    Linear (tet4) or quadratic (tet10) tetrahedra. Each facet set becomes a surface and a node set
+    of its name, the latter including midside nodes; each cell set becomes an element set. A cell's
+    id is its number in the mesh plus 1.
 
-    Up to 100 materials become separate parts, named after their labels (`tetopt.io.tags.named_materials`): material
-    "liver", part "cells of liver". Cells are written part by part. More materials become a single part, "all cells",
-    with E, and v if it varies, mapped by element data. Cell data are written as element data, too, to be shown in FEBio
-    Studio or mapped to parameters.
+    Up to 100 materials become separate parts, named after their labels
+    (`tetopt.io.tags.named_materials`): material "liver", part "cells of liver". Cells are written
+    part by part. More materials become a single part, "all cells", with E, and v if it varies,
+    mapped by element data. Cell data are written as element data, too, to be shown in FEBio Studio
+    or mapped to parameters.
 
-    The material is neo-Hookean: at small strains it equals linear elasticity with these moduli, as solved by `tetopt
-    fem`, and it withstands large compression, where FEBio's "isotropic elastic" (St. Venant-Kirchhoff) softens until
-    cells collapse. Loads are applied in a static step of ten increments with large deformation. Pressures follow their
-    surfaces; tractions and weight are nodal forces by `tetopt.model.loads.facet_weights`, with constant direction; the
-    springs of a set are three long springs at each of its nodes. The plot file includes the strain energy density,
-    whose integral over the undeformed volume is the total. Without loads there is no step; add one in FEBio Studio.
+    The material is neo-Hookean: at small strains it equals linear elasticity with these moduli, as
+    solved by `tetopt fem`, and it withstands large compression, where FEBio's "isotropic elastic"
+    (St. Venant-Kirchhoff) softens until cells collapse. Loads are applied in a static step of ten
+    increments with large deformation. Pressures follow their surfaces; tractions and weight are
+    nodal forces by `tetopt.model.loads.facet_weights`, with constant direction; the springs of a
+    set are three long springs at each of its nodes. The plot file includes the strain energy
+    density, whose integral over the undeformed volume is the total. Without loads there is no step;
+    add one in FEBio Studio.
 
     Raises
     ------
     InputError
-        The model is 2-D, has no materials or several steps, or has cell data with the name of a map.
+        The model is 2-D, has no materials or several steps, or has cell data with the name of a
+        map.
     """
     _check(model)
     parts = _parts(model)
@@ -120,7 +143,9 @@ def _check(model: Model) -> None:
     if model.materials is None:
         raise InputError("febio: a part needs a material; give a modulus mapping (`young`)")
     if (count := count_of_steps(model.loads)) > 1:  # each would continue from the previous one
-        raise InputError(f"febio: expected one step, got {count}; write a file for each step with only its loads")
+        raise InputError(
+            f"febio: expected one step, got {count}; write a file for each step with only its loads"
+        )
 
 
 def _parts(model: Model) -> list[_Part]:
@@ -136,14 +161,17 @@ def _parts(model: Model) -> list[_Part]:
     rows = zip(named_materials(model), young.tolist(), nu.tolist(), density.tolist(), strict=True)
     return [
         _Part(f"cells of {name}", name, repr(young_of), repr(nu_of), repr(density_of), members)
-        for (name, young_of, nu_of, density_of), members in zip(rows, cells_of(model.materials), strict=True)
+        for (name, young_of, nu_of, density_of), members in zip(
+            rows, cells_of(model.materials), strict=True
+        )
         if len(members)
     ]
 
 
 def _head(model: Model) -> str:
     return (
-        f'<?xml version="1.0" encoding="UTF-8"?>\n{xml_comment(described(model))}<febio_spec version="4.0">\n'
+        f'<?xml version="1.0" encoding="UTF-8"?>\n{xml_comment(described(model))}<febio_spec '
+        'version="4.0">\n'
         f'<Module type="solid">\n<units>{STUDIO_UNITS[model.units]}</units>\n</Module>\n'
     )
 
@@ -183,18 +211,25 @@ def _mesh(model: Model, parts: list[_Part]) -> list[str]:
             f'<Surface name="{name}">\n{_items(f"tri{nodes.shape[1]}", nodes + 1)}</Surface>\n'
             for name, nodes in surfaces.items()
         ),
-        *(f'<ElementSet name="{name}">{_list(members)}</ElementSet>\n' for name, members in model.sets.cells.items()),
-        *(f'<NodeSet name="{name}">{_list(np.unique(nodes))}</NodeSet>\n' for name, nodes in surfaces.items()),
+        *(
+            f'<ElementSet name="{name}">{_list(members)}</ElementSet>\n'
+            for name, members in model.sets.cells.items()
+        ),
+        *(
+            f'<NodeSet name="{name}">{_list(np.unique(nodes))}</NodeSet>\n'
+            for name, nodes in surfaces.items()
+        ),
         *_force_and_spring_sets(model, points),
         "</Mesh>\n",
     ]
 
 
 def _mesh_data(model: Model, parts: list[_Part]) -> list[str]:
-    """Return moduli by part, which FEBio joins by name: `lid` follows the order of the part's cells.
+    """Return moduli by part, which FEBio joins by name: `lid` follows the order of the part's
+    cells.
 
-    FEBio reads no other element data, which would be nine tenths of a head's file. A set of all cells would not work:
-    across parts, FEBio uses their order and not that of the set.
+    FEBio reads no other element data, which would be nine tenths of a head's file. A set of all
+    cells would not work: across parts, FEBio uses their order and not that of the set.
     """
     assert model.materials is not None
     young, nu, of_cell = model.materials.young, model.materials.nu, model.materials.of_cell
@@ -220,7 +255,8 @@ def _loads(model: Model) -> list[str]:
     if not model.loads:
         return []
     pushes = [
-        f'<surface_load name="pressure {load.set_name}" type="pressure" surface="{load.set_name}">\n'
+        f'<surface_load name="pressure {load.set_name}" type="pressure" '
+        f'surface="{load.set_name}">\n'
         f'<pressure lc="1">{float(load.numbers[0])!r}</pressure>\n<linear>0</linear>\n'
         "<symmetric_stiffness>1</symmetric_stiffness>\n</surface_load>\n"
         for load in model.loads
@@ -252,9 +288,11 @@ def _dead_forces(model: Model) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
             total[nodes] += forces
         elif load.kind == "gravity" and (table := model.materials) is not None:
             density = density_of(table)[table.of_cell]
-            from tetopt.fem.solution import weight_forces  # imported here, as it loads scipy's solvers
+            # imported here, as it loads scipy's solvers
+            from tetopt.fem.solution import weight_forces
 
-            units = STRESS_UNITS[model.units]  # u mm make the numbers those of u^4 mN; a unit of force is u^2 kPa mm2
+            # u mm make the numbers those of u^4 mN; a unit of force is u^2 kPa mm2
+            units = STRESS_UNITS[model.units]
             forces = weight_forces(model.mesh, density, load.numbers, model.order)
             total += forces * (units.mm**2 / units.kPa)
     nodes = np.flatnonzero(total.any(axis=1))
@@ -273,7 +311,9 @@ def _springs(model: Model) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
 
 
 def _ground(model: Model, points: NDArray[np.float64]) -> list[str]:
-    """Return the far ends of springs, numbered after the nodes: along x, y and z from each node on springs."""
+    """Return the far ends of springs, numbered after the nodes: along x, y and z from each node
+    on springs.
+    """
     nodes = _springs(model)[0]
     if len(nodes) == 0:
         return []
@@ -290,7 +330,9 @@ def _force_and_spring_sets(model: Model, points: NDArray[np.float64]) -> list[st
         return sets
     ends = len(points) + np.arange(3 * len(sprung))
     sets.append(f'<NodeSet name="{GROUND_NODES}">{_list(ends)}</NodeSet>\n')
-    for k, (node, three) in enumerate(zip(sprung.tolist(), ends.reshape(-1, 3).tolist(), strict=True), start=1):
+    for k, (node, three) in enumerate(
+        zip(sprung.tolist(), ends.reshape(-1, 3).tolist(), strict=True), start=1
+    ):
         pairs = "".join(f"<delem>{node + 1},{end + 1}</delem>\n" for end in three)
         sets.append(f'<DiscreteSet name="spring {k}">\n{pairs}</DiscreteSet>\n')
     return sets
@@ -299,32 +341,41 @@ def _force_and_spring_sets(model: Model, points: NDArray[np.float64]) -> list[st
 def _discrete(constants: NDArray[np.float64]) -> list[str]:
     """Return a material for each node on springs, and the assignment of springs to materials."""
     materials = [
-        f'<discrete_material id="{k}" name="spring {k}" type="linear spring">\n<E>{constant!r}</E>\n'
+        f'<discrete_material id="{k}" name="spring {k}" type="linear '
+        f'spring">\n<E>{constant!r}</E>\n'
         "</discrete_material>\n"
         for k, constant in enumerate(constants.tolist(), start=1)
     ]
-    return materials + [f'<discrete dmat="{k}" discrete_set="spring {k}"/>\n' for k in range(1, len(constants) + 1)]
+    return materials + [
+        f'<discrete dmat="{k}" discrete_set="spring {k}"/>\n' for k in range(1, len(constants) + 1)
+    ]
 
 
 def _condition(load: Load) -> str:
     if (load.numbers == 0.0).all():
         return (
-            f'<bc name="hold {load.set_name}" type="zero displacement" node_set="{load.set_name}">\n'
+            f'<bc name="hold {load.set_name}" type="zero displacement" '
+            f'node_set="{load.set_name}">\n'
             "<x_dof>1</x_dof>\n<y_dof>1</y_dof>\n<z_dof>1</z_dof>\n</bc>\n"
         )
     return "".join(
-        f'<bc name="move {load.set_name} {dof}" type="prescribed displacement" node_set="{load.set_name}">\n'
+        f'<bc name="move {load.set_name} {dof}" type="prescribed displacement" '
+        f'node_set="{load.set_name}">\n'
         f'<dof>{dof}</dof>\n<value lc="1">{value!r}</value>\n<relative>0</relative>\n</bc>\n'
         for dof, value in zip("xyz", load.numbers.tolist(), strict=True)
         if not np.isnan(value)
     )
 
 
-def _items(tag: str, array: NDArray, ids: NDArray[np.int64] | None = None, number: str = "id") -> str:
+def _items(
+    tag: str, array: NDArray, ids: NDArray[np.int64] | None = None, number: str = "id"
+) -> str:
     """Return a line for each row of an array, numbered from 1 or by `ids`."""
     lines = rows(array, separator=",").splitlines()
     numbers = range(1, len(lines) + 1) if ids is None else ids.tolist()
-    return "".join(f'<{tag} {number}="{k}">{line}</{tag}>\n' for k, line in zip(numbers, lines, strict=True))
+    return "".join(
+        f'<{tag} {number}="{k}">{line}</{tag}>\n' for k, line in zip(numbers, lines, strict=True)
+    )
 
 
 def _list(numbers: NDArray[np.int64]) -> str:

@@ -37,11 +37,14 @@ class Format(NamedTuple):
     what: str
     write: Callable[[Model], bytes | str]
     has_quadratic: bool = False
-    runs: bool = False  # whether loads become a step that the solver runs; otherwise they are only text in the file
+    # whether loads become a step that the solver runs; otherwise they are only text in the file
+    runs: bool = False
     is_surface: bool = False  # contains only the boundary
-    has_node_moduli: bool = False  # otherwise a modulus that varies within cells is averaged over each
+    # otherwise a modulus that varies within cells is averaged over each
+    has_node_moduli: bool = False
     has_large: bool = False  # whether a step can request large deformation
-    fields: str = "all"  # those of `FIELDS` that commands write by default, "" if the format has no place for them
+    # those of `FIELDS` that commands write by default, "" if the format has no place for them
+    fields: str = "all"
 
 
 FORMATS = {
@@ -51,7 +54,13 @@ FORMATS = {
     ".msh": Format("gmsh 4.1", gmsh41, has_quadratic=True, fields="none"),
     ".msh2": Format("gmsh 2.2", gmsh22, has_quadratic=True, fields=""),
     ".inp": Format(
-        "Abaqus, CalculiX", abaqus, has_quadratic=True, runs=True, has_node_moduli=True, has_large=True, fields=""
+        "Abaqus, CalculiX",
+        abaqus,
+        has_quadratic=True,
+        runs=True,
+        has_node_moduli=True,
+        has_large=True,
+        fields="",
     ),
     ".feb": Format("FEBio 4.0", febio, has_quadratic=True, runs=True, has_large=True, fields=""),
     ".mfem": Format("MFEM mesh", mfem, has_quadratic=True, fields=""),
@@ -60,7 +69,8 @@ FORMATS = {
     ".ply": Format("the boundary as PLY", boundary_ply, is_surface=True, fields=""),
 }
 FIELDS = ("none", "mean", "all")  # of cells, besides labels and results
-EXACT_INTEGERS = (".vtu", ".xdmf")  # formats of 64-bit integers; others convert large ones to float64
+# formats of 64-bit integers; others convert large ones to float64
+EXACT_INTEGERS = (".vtu", ".xdmf")
 MOST_OF_FLOATS = 2**53  # float64 holds all integers up to this one
 # How formats whose readers limit names of data to `MOST_NAME_CHARACTERS` show them.
 SHOWN_NAMES = {".vtk": legacy_name, ".msh": short_name, ".feb": short_name}
@@ -70,25 +80,36 @@ BUILT_IN = tuple(FORMATS)
 
 
 def register_format(
-    suffix: str, write: Callable[[Model], bytes | str], what: str = "another format", *, has_quadratic: bool = False,
-    runs: bool = False, has_node_moduli: bool = False, has_large: bool = False,
-) -> None:  # fmt: skip
-    """Register a format for writing models in this process, for `save_model`, `run` and the command.
+    suffix: str,
+    write: Callable[[Model], bytes | str],
+    what: str = "another format",
+    *,
+    has_quadratic: bool = False,
+    runs: bool = False,
+    has_node_moduli: bool = False,
+    has_large: bool = False,
+) -> None:
+    """Register a format for writing models in this process, for `save_model`, `run` and the
+    command.
 
     Parameters
     ----------
     suffix : str
         Suffix of its files, such as ".scn"; case is ignored.
     write : callable
-        Converts a `Model`, in the units and axes of the file, to its content; text is encoded as UTF-8.
+        Converts a `Model`, in the units and axes of the file, to its content; text is encoded as
+        UTF-8.
     what : str
         Name of the format, for messages.
     has_quadratic : bool
-        True if it supports models of order 2; otherwise they are rejected, or written with linear cells.
+        True if it supports models of order 2; otherwise they are rejected, or written with linear
+        cells.
     runs : bool
-        True if loads become a step that the solver runs; otherwise the command notes that they are only text.
+        True if loads become a step that the solver runs; otherwise the command notes that they are
+        only text.
     has_node_moduli : bool
-        True if it supports moduli that vary within cells; otherwise the command notes that cells have their mean.
+        True if it supports moduli that vary within cells; otherwise the command notes that cells
+        have their mean.
     has_large : bool
         True if a step can request large deformation.
 
@@ -108,9 +129,13 @@ def register_format(
     """
     suffix = suffix.lower()
     if not re.fullmatch(r"\.[a-z0-9_]+", suffix):
-        raise InputError(f'suffix: expected a dot, then letters and digits, such as .scn, got "{plain(suffix)}"')
+        raise InputError(
+            f'suffix: expected a dot, then letters and digits, such as .scn, got "{plain(suffix)}"'
+        )
     if suffix in BUILT_IN:
-        raise InputError(f"suffix: {suffix} is a built-in format ({FORMATS[suffix].what}); choose another suffix")
+        raise InputError(
+            f"suffix: {suffix} is a built-in format ({FORMATS[suffix].what}); choose another suffix"
+        )
     FORMATS[suffix] = Format(what, write, has_quadratic, runs, False, has_node_moduli, has_large)
 
 
@@ -134,10 +159,10 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
 
     The file is read back and compared before it takes its name.
 
-    Names of data and of the image are written as `tetopt.io.text.plain` shows them, escaped in XML; gmsh files have
-    apostrophes instead of their quotes, and gmsh, legacy VTK and FEBio files only their first 240 characters.
-    Names that become equal are numbered, and a warning lists the changes. Replaces an existing file; call
-    `tetopt.system.files.checked_output` first.
+    Names of data and of the image are written as `tetopt.io.text.plain` shows them, escaped in XML;
+    gmsh files have apostrophes instead of their quotes, and gmsh, legacy VTK and FEBio files only
+    their first 240 characters. Names that become equal are numbered, and a warning lists the
+    changes. Replaces an existing file; call `tetopt.system.files.checked_output` first.
 
     Parameters
     ----------
@@ -146,22 +171,25 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
     model : Model
         The result of `build_model`.
     space : {"ras", "lps"}
-        Convention of the file's coordinates; NIfTI's is RAS+, DICOM's, ITK's and 3D Slicer's files' LPS+.
+        Convention of the file's coordinates; NIfTI's is RAS+, DICOM's, ITK's and 3D Slicer's files'
+        LPS+.
     units : {"kPa", "MPa", "Pa"}
         Unit of stress in the file: with mm and mN, mm and N, or m and N.
 
     Raises
     ------
     InputError
-        The suffix is unknown; the format does not support the model; names of sets are not supported by all formats;
-        data, sets or materials do not fit the mesh. Nothing is written then.
+        The suffix is unknown; the format does not support the model; names of sets are not
+        supported by all formats; data, sets or materials do not fit the mesh. Nothing is written
+        then.
     OSError
         For the reasons of `tetopt.io.readback.save_checked`.
 
     Warns
     -----
     UserWarning
-        Data are renamed in the file; a solver's file has linear cells with a Poisson's ratio of 0.45 or more.
+        Data are renamed in the file; a solver's file has linear cells with a Poisson's ratio of
+        0.45 or more.
 
     See Also
     --------
@@ -191,11 +219,13 @@ def save_mesh(
     point_data: dict[str, NDArray] | None = None,
     order: int = 1,
 ) -> None:
-    """Write a mesh and its data in the format of the file's suffix (`FORMATS`), whole or not at all.
+    """Write a mesh and its data in the format of the file's suffix (`FORMATS`), whole or not at
+    all.
 
-    Points are in world coordinates, mm (RAS+); cells are positively oriented and of order 1 or 2. In VTK's formats each
-    entry of `about` becomes a string in the field data, as JSON unless it is one already. `save_model` also writes
-    sets, materials and loads. Replaces an existing file; call `tetopt.system.files.checked_output` first.
+    Points are in world coordinates, mm (RAS+); cells are positively oriented and of order 1 or 2.
+    In VTK's formats each entry of `about` becomes a string in the field data, as JSON unless it is
+    one already. `save_model` also writes sets, materials and loads. Replaces an existing file; call
+    `tetopt.system.files.checked_output` first.
 
     Parameters
     ----------
@@ -231,7 +261,15 @@ def save_mesh(
     ['max', 'mean', 'min', 'min_dihedral', 'n_voxels', 'rho', 'variance', 'volume']
     """
     save_model(
-        path, Model(mesh, cell_data or {}, Sets({}, {}), order=order, about=about or {}, point_data=point_data or {})
+        path,
+        Model(
+            mesh,
+            cell_data or {},
+            Sets({}, {}),
+            order=order,
+            about=about or {},
+            point_data=point_data or {},
+        ),
     )
 
 
@@ -259,7 +297,8 @@ def _ready(path: Path, model: Model, space: str, units: str) -> Model:
 
 
 def _checked(path: Path, model: Model) -> Model:
-    """Return the model with arrays of numbers for all data; InputError for data that do not fit the mesh or format.
+    """Return the model with arrays of numbers for all data; InputError for data that do not fit the
+    mesh or format.
 
     Models are records that anyone can build, and no writer checks them.
     """
@@ -272,14 +311,24 @@ def _checked(path: Path, model: Model) -> Model:
     for name, values in (cell_data | point_data).items():
         most = np.iinfo(np.int64).max if path.suffix.lower() in EXACT_INTEGERS else MOST_OF_FLOATS
         if values.dtype.kind in "iu" and (values.max() > most or values.min() < -most):
-            raise InputError(f"{path}: expected integers up to {most} in {plain(name)!r}, got {values.max()}; use .vtu")
+            raise InputError(
+                f"{path}: expected integers up to {most} in {plain(name)!r}, got {values.max()}; "
+                "use .vtu"
+            )
         if path.suffix.lower() == ".feb" and not np.isfinite(values).all():
-            raise InputError(f"{path}: expected finite numbers in {plain(name)!r}; remove this field, or use .vtu")
+            raise InputError(
+                f"{path}: expected finite numbers in {plain(name)!r}; remove this field, or use "
+                ".vtu"
+            )
     try:
         json.dumps(dict(model.about))
     except (TypeError, ValueError) as error:
-        raise InputError(f"{path}: about: expected strings, or values in JSON's types, by name ({error})") from error
-    facets = _checked_sets(path, model.sets.facets, (n_cells, mesh.ndim + 1), "facets as rows (cell, opposite node)")
+        raise InputError(
+            f"{path}: about: expected strings, or values in JSON's types, by name ({error})"
+        ) from error
+    facets = _checked_sets(
+        path, model.sets.facets, (n_cells, mesh.ndim + 1), "facets as rows (cell, opposite node)"
+    )
     cells = _checked_sets(path, model.sets.cells, (n_cells,), "cells by number")
     for load in model.loads:
         if load.set_name:
@@ -287,15 +336,21 @@ def _checked(path: Path, model: Model) -> Model:
     if model.materials is not None:
         _check_materials(path, model.materials, n_cells)
     for moduli, n_rows in ((model.node_young, len(mesh.points)), (model.gauss_young, n_cells)):
-        if moduli is not None and (len(moduli) != n_rows or not (np.isfinite(moduli) & (moduli > 0.0)).all()):
-            raise InputError(f"{path}: expected {n_rows} rows of moduli above 0 that vary within cells")
+        if moduli is not None and (
+            len(moduli) != n_rows or not (np.isfinite(moduli) & (moduli > 0.0)).all()
+        ):
+            raise InputError(
+                f"{path}: expected {n_rows} rows of moduli above 0 that vary within cells"
+            )
     return model._replace(cell_data=cell_data, point_data=point_data, sets=Sets(facets, cells))
 
 
 def _checked_sets(
     path: Path, sets: Mapping[str, ArrayLike], ends: tuple[int, ...], what: str
 ) -> dict[str, NDArray[np.int64]]:
-    """Return the sets as arrays; InputError unless each has ascending rows of integers from 0 to below `ends`."""
+    """Return the sets as arrays; InputError unless each has ascending rows of integers from 0 to
+    below `ends`.
+    """
     arrays = {}
     for name, rows in sets.items():
         values = np.asarray(rows)
@@ -306,7 +361,8 @@ def _checked_sets(
             or not is_set(values, ends)
         ):
             raise InputError(
-                f"{path}: set {plain(str(name))!r}: expected {what}, distinct integers from 0 to {ends[0] - 1} in "
+                f"{path}: set {plain(str(name))!r}: expected {what}, distinct integers from 0 to "
+                f"{ends[0] - 1} in "
                 f"ascending order, got {values.dtype} of shape {values.shape}"
             )
         arrays[name] = values.astype(np.int64)
@@ -318,11 +374,16 @@ def _check_materials(path: Path, table: Materials, n_cells: int) -> None:
     of_cell, n_kinds = np.asarray(table.of_cell), len(table.young)
     is_index = of_cell.dtype.kind in "iu" and of_cell.shape == (n_cells,)
     if not is_index or of_cell.min() < 0 or of_cell.max() >= n_kinds:
-        raise InputError(f"{path}: materials: expected a number from 0 to {n_kinds - 1} for each of {n_cells} cells")
+        raise InputError(
+            f"{path}: materials: expected a number from 0 to {n_kinds - 1} for each of {n_cells} "
+            "cells"
+        )
     for name in ("young", "nu", "density"):
         values = getattr(table, name)
         if values is not None and (np.shape(values) != (n_kinds,) or not np.isfinite(values).all()):
-            raise InputError(f"{path}: materials: expected a finite {name} for each of {n_kinds} materials")
+            raise InputError(
+                f"{path}: materials: expected a finite {name} for each of {n_kinds} materials"
+            )
 
 
 def _named(path: Path, model: Model) -> Model:
@@ -338,7 +399,11 @@ def _named(path: Path, model: Model) -> Model:
         words = f"letters, digits, _ or -, the first a letter, got {plain(odd[0])!r}"
         raise InputError(f"{path}: expected set names of up to {MOST_LETTERS} {words}")
     if len({name.lower() for name in sets}) < len(sets):
-        twice = next(name for k, name in enumerate(sets) if name.lower() in {each.lower() for each in sets[:k]})
+        twice = next(
+            name
+            for k, name in enumerate(sets)
+            if name.lower() in {each.lower() for each in sets[:k]}
+        )
         raise InputError(f"{path}: two sets have the name {twice}; rename one of them")
     shown = SHOWN_NAMES.get(path.suffix.lower(), file_name)
     names = [names_apart(data, shown) for data in (model.cell_data, model.point_data, model.about)]

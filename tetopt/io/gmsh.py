@@ -1,32 +1,36 @@
 """Meshes for gmsh and programs that read its files: MSH 4.1 and 2.2, as text.
 
-Cells: each cell is in one physical group, as dolfinx requires. If cells have labels, the number of the group is the
-label, and its name is that of the label's set; gmsh has no group 0, so label 0 gets the number after the largest label.
-If a label exceeds 99,999,999, groups number the labels from 1, and the $Comments list the label of each group.
-Otherwise the group is that of its material, "material_1", ..., or without materials that of its cell set, or "unnamed"
-without a set; a cell set that overlaps a previous one, or has the name of a facet set, then has no group (dolfinx and
-meshio know groups only by name). An entity has the number of its group; only if sets, or in 2.2 materials, divide a
-group does it have several entities, numbered after all groups. The $Comments list the entities of each set.
+Cells: each cell is in one physical group, as dolfinx requires. If cells have labels, the number of
+the group is the label, and its name is that of the label's set; gmsh has no group 0, so label 0
+gets the number after the largest label. If a label exceeds 99,999,999, groups number the labels
+from 1, and the $Comments list the label of each group. Otherwise the group is that of its material,
+"material_1", ..., or without materials that of its cell set, or "unnamed" without a set; a cell set
+that overlaps a previous one, or has the name of a facet set, then has no group (dolfinx and meshio
+know groups only by name). An entity has the number of its group; only if sets, or in 2.2 materials,
+divide a group does it have several entities, numbered after all groups. The $Comments list the
+entities of each set.
 
-Facets: each facet is one element, in an entity that belongs to the groups of all of its sets. The numbers of facet
-groups differ from those of cell groups. For a given R, those of the box's faces, "mask_surface" and "boundary", up to
-2 R - 1, are the same for every mesh; interfaces and other sets are numbered from R + 1 in order, so that their numbers
-depend on the sets of the mesh. R is 1000, or a power of ten above all labels. An entity lists the smallest set first,
-the only one that meshio shows as "gmsh:physical". In 2.2 an element has only one group, that of its smallest set: a
-group such as "boundary" then lacks facets that are also in a smaller set, and the $Comments describe the whole set.
-dolfinx keeps one group of each facet, that with the smallest number; the XDMF files lose nothing there. A facet inside
-the mesh that two sets hold from opposite sides is oriented as in the first of them. The nodes of a group are those of
-its elements.
+Facets: each facet is one element, in an entity that belongs to the groups of all of its sets. The
+numbers of facet groups differ from those of cell groups. For a given R, those of the box's faces,
+"mask_surface" and "boundary", up to 2 R - 1, are the same for every mesh; interfaces and other sets
+are numbered from R + 1 in order, so that their numbers depend on the sets of the mesh. R is 1000,
+or a power of ten above all labels. An entity lists the smallest set first, the only one that meshio
+shows as "gmsh:physical". In 2.2 an element has only one group, that of its smallest set: a group
+such as "boundary" then lacks facets that are also in a smaller set, and the $Comments describe the
+whole set. dolfinx keeps one group of each facet, that with the smallest number; the XDMF files lose
+nothing there. A facet inside the mesh that two sets hold from opposite sides is oriented as in the
+first of them. The nodes of a group are those of its elements.
 
-Views ($ElementData), only in 4.1, as meshio 5.3.5 cannot read 2.2 files with views: the cell data, and "young" and
-"nu" of the materials instead of cell data of these names. Facets have the values of the cell that they belong to,
-because meshio requires views of all elements. $NodeData contains the point data. Data with 3 columns are vectors, by
-which gmsh deforms the mesh, with 9 columns tensors; others become one view per column.
+Views ($ElementData), only in 4.1, as meshio 5.3.5 cannot read 2.2 files with views: the cell data,
+and "young" and "nu" of the materials instead of cell data of these names. Facets have the values of
+the cell that they belong to, because meshio requires views of all elements. $NodeData contains the
+point data. Data with 3 columns are vectors, by which gmsh deforms the mesh, with 9 columns tensors;
+others become one view per column.
 
 More than 1000 materials are only views, not groups; in 2.2 they are rejected.
 
-The $Comments also contain coordinates, units, each material's constants, and the loads, for which MSH has no place.
-tetopt's own reader uses them, see `own_comments`.
+The $Comments also contain coordinates, units, each material's constants, and the loads, for which
+MSH has no place. tetopt's own reader uses them, see `own_comments`.
 """
 
 from __future__ import annotations
@@ -58,14 +62,17 @@ from tetopt.model.file import MASK_TEXT
 from tetopt.model.model import Model, element_facets, elements
 from tetopt.model.sets import facet_triples
 
-# gmsh's numbers for elements by dimension and order: line, triangle, tetrahedron of order 1, then of order 2.
+# gmsh's numbers for elements by dimension and order: line, triangle, tetrahedron of order 1, then
+# of order 2.
 ELEMENT_TYPES = {(1, 1): 1, (2, 1): 2, (3, 1): 4, (1, 2): 8, (2, 2): 9, (3, 2): 11}
-TET10_ORDER = np.array([0, 1, 2, 3, 4, 5, 6, 7, 9, 8])  # gmsh lists the midpoint of edge (2, 3) before that of (1, 3)
+# gmsh lists the midpoint of edge (2, 3) before that of (1, 3)
+TET10_ORDER = np.array([0, 1, 2, 3, 4, 5, 6, 7, 9, 8])
 VIEW_SHAPES = ((3,), (9,))  # of a row: views can hold vectors and tensors
 LABEL_COMMENT = "physical groups of cells are the labels; label 0 is {}"
 NUMBER_COMMENT = "physical group {} is label {}"
 TEXTS = (MASK_TEXT, "violated")  # JSON in the comments
-MOST_MATERIAL_GROUPS = 1000  # with 200,000, gmsh takes minutes to open a 2.2 file, and meshio hours for a 4.1 file
+# with 200,000, gmsh takes minutes to open a 2.2 file, and meshio hours for a 4.1 file
+MOST_MATERIAL_GROUPS = 1000
 
 
 class OwnComments(NamedTuple):
@@ -93,7 +100,9 @@ def own_comments(lines: list[str]) -> OwnComments | None:
         if match := re.fullmatch(r"units: m+, (\w+), .*", line):
             texts["units"] = match[1]
         elif match := re.fullmatch(r"image: (.*), sha256 (\w+)", line):
-            texts |= {"image": match[1]} | ({} if match[2] == "unknown" else {"image_sha256": match[2]})
+            texts |= {"image": match[1]} | (
+                {} if match[2] == "unknown" else {"image_sha256": match[2]}
+            )
         elif match := re.fullmatch(r"(material_\d+): young (\S+) \w+, nu (\S+)", line):
             constants[match[1]] = float(match[2]), float(match[3])
         elif match := re.fullmatch(r"entity of (cells|facets) (\d+): (.*)", line):
@@ -113,7 +122,10 @@ def incomplete_groups(model: Model) -> list[str]:
     """Return the facet sets whose group in 2.2 lacks facets that are also in a smaller set."""
     _, facets = numbered_parts(model)
     in_several = [groups[1:] for groups in facets.groups_of.values()]
-    return [facets.names[number] for number in sorted({each for groups in in_several for each in groups})]
+    return [
+        facets.names[number]
+        for number in sorted({each for groups in in_several for each in groups})
+    ]
 
 
 def gmsh41(model: Model) -> bytes:
@@ -129,9 +141,13 @@ def gmsh41(model: Model) -> bytes:
     grouped, comments = model, []
     if _n_materials(model) > MOST_MATERIAL_GROUPS:
         grouped = model._replace(materials=None)
-        comments = [f"{_n_materials(model)} materials: in the views young, {model.units}, and nu; not groups"]
+        comments = [
+            f"{_n_materials(model)} materials: in the views young, {model.units}, and nu; not "
+            "groups"
+        ]
     labels = group_labels(model)
-    if labels is not None and not _is_of_labels(grouped, labels):  # entities are labels, and moduli are views
+    # entities are labels, and moduli are views
+    if labels is not None and not _is_of_labels(grouped, labels):
         grouped = grouped._replace(materials=None)
     points, cells = _geometry(model)
     parts = [_by_entity(part) for part in _parts(grouped)]
@@ -150,7 +166,8 @@ def gmsh41(model: Model) -> bytes:
         ),
         _section(
             "Nodes",
-            f"1 {len(points)} 1 {len(points)}\n{model.mesh.ndim} {min(parts[0].groups_of)} 0 {len(points)}\n",
+            f"1 {len(points)} 1 {len(points)}\n{model.mesh.ndim} {min(parts[0].groups_of)} 0 "
+            f"{len(points)}\n",
             rows(np.arange(1, len(points) + 1)),
             rows(points),
         ),
@@ -175,7 +192,8 @@ def gmsh22(model: Model) -> bytes:
     """
     if _n_materials(model) > MOST_MATERIAL_GROUPS:
         raise InputError(
-            f"gmsh 2.2: expected at most {MOST_MATERIAL_GROUPS} materials, as each becomes a group, got "
+            f"gmsh 2.2: expected at most {MOST_MATERIAL_GROUPS} materials, as each becomes a "
+            "group, got "
             f"{_n_materials(model)}; group them with `bins` 32, or use .msh"
         )
     points, cells = _geometry(model)
@@ -199,9 +217,14 @@ def gmsh22(model: Model) -> bytes:
 
 
 def _text_comments(model: Model) -> list[str]:
-    """Return comments on the mask that the mesh was built within, and on requirements that its run violated, if any."""
+    """Return comments on the mask that the mesh was built within, and on requirements that its
+    run violated, if any.
+    """
     texts = {name: model.about[name] for name in TEXTS if name in model.about}
-    return [f"{name}: {text if isinstance(text, str) else json.dumps(text)}" for name, text in texts.items()]
+    return [
+        f"{name}: {text if isinstance(text, str) else json.dumps(text)}"
+        for name, text in texts.items()
+    ]
 
 
 def _n_materials(model: Model) -> int:
@@ -209,7 +232,11 @@ def _n_materials(model: Model) -> int:
 
 
 def _file(header: str, comments: list[str], parts: list[Part], *sections: str) -> bytes:
-    names = [f'{part.dim} {number} "{name}"\n' for part in reversed(parts) for number, name in part.names.items()]
+    names = [
+        f'{part.dim} {number} "{name}"\n'
+        for part in reversed(parts)
+        for number, name in part.names.items()
+    ]
     return "".join(
         [
             _section("MeshFormat", f"{header}\n"),
@@ -265,7 +292,9 @@ def _entity_comments(model: Model, parts: list[Part]) -> list[str]:
 
 def _by_entity(part: Part) -> Part:
     order = np.argsort(part.entities, kind="stable")
-    return part._replace(numbers=part.numbers[order], rows=part.rows[order], entities=part.entities[order])
+    return part._replace(
+        numbers=part.numbers[order], rows=part.rows[order], entities=part.entities[order]
+    )
 
 
 # Sections
@@ -279,13 +308,17 @@ def _starts(part: Part) -> NDArray[np.int64]:
 def _entity_lines(model: Model, part: Part) -> str:
     """Return lines of number, bounding box, physical groups, and no bounding entities."""
     mesh = model.mesh
-    corners = mesh.points[mesh.cells[part.rows] if part.rows.ndim == 1 else facet_triples(mesh.cells, part.rows)]
+    corners = mesh.points[
+        mesh.cells[part.rows] if part.rows.ndim == 1 else facet_triples(mesh.cells, part.rows)
+    ]
     boxes = np.zeros((len(part.groups_of), 2, 3))
     boxes[:, 0, : mesh.ndim] = np.minimum.reduceat(corners.min(axis=1), _starts(part))
     boxes[:, 1, : mesh.ndim] = np.maximum.reduceat(corners.max(axis=1), _starts(part))
     return "".join(
         f"{tag} {' '.join(map(repr, box))} {len(groups)} {' '.join(map(str, groups))} 0\n"
-        for (tag, groups), box in zip(part.groups_of.items(), boxes.reshape(-1, 6).tolist(), strict=True)
+        for (tag, groups), box in zip(
+            part.groups_of.items(), boxes.reshape(-1, 6).tolist(), strict=True
+        )
     )
 
 
@@ -304,28 +337,51 @@ def _element_lines(model: Model, cells: NDArray[np.int64], part: Part) -> str:
     kind = np.full(len(part.numbers), ELEMENT_TYPES[part.dim, model.order])
     place = np.searchsorted(list(part.groups_of), part.entities)
     group = np.array([groups[0] for groups in part.groups_of.values()])[place]
-    return rows(part.numbers, kind, np.full_like(kind, 2), group, part.entities, _nodes(model, cells, part) + 1)
+    return rows(
+        part.numbers,
+        kind,
+        np.full_like(kind, 2),
+        group,
+        part.entities,
+        _nodes(model, cells, part) + 1,
+    )
 
 
 def _views(model: Model, parts: list[Part]) -> list[str]:
-    """Return the $ElementData sections, with elements in the order of the file, on which meshio relies."""
+    """Return the $ElementData sections, with elements in the order of the file, on which meshio
+    relies.
+    """
     numbers = np.concatenate([part.numbers for part in parts])
-    of_cell = np.concatenate([part.rows if part.rows.ndim == 1 else part.rows[:, 0] for part in parts])
-    of_cells = [_view("ElementData", name, numbers, values[of_cell]) for name, values in _fields(model).items()]
-    at_nodes = {name: node_field(values, model.mesh, model.order) for name, values in model.point_data.items()}
+    of_cell = np.concatenate(
+        [part.rows if part.rows.ndim == 1 else part.rows[:, 0] for part in parts]
+    )
+    of_cells = [
+        _view("ElementData", name, numbers, values[of_cell])
+        for name, values in _fields(model).items()
+    ]
+    at_nodes = {
+        name: node_field(values, model.mesh, model.order)
+        for name, values in model.point_data.items()
+    }
     points = np.arange(1, len(elements(model)[0]) + 1)
-    return of_cells + [_view("NodeData", name, points, values) for name, values in _view_columns(at_nodes).items()]
+    return of_cells + [
+        _view("NodeData", name, points, values) for name, values in _view_columns(at_nodes).items()
+    ]
 
 
 def _view(section: str, name: str, numbers: NDArray[np.int64], values: NDArray) -> str:
     n_columns = values[0].size
-    return _section(section, f'1\n"{name}"\n1\n0.0\n3\n0\n{n_columns}\n{len(numbers)}\n', rows(numbers, values))
+    return _section(
+        section, f'1\n"{name}"\n1\n0.0\n3\n0\n{n_columns}\n{len(numbers)}\n', rows(numbers, values)
+    )
 
 
 def _view_columns(fields: dict[str, NDArray]) -> dict[str, NDArray[np.float64]]:
     """Convert fields to views: numbers, vectors and tensors; others column by column."""
     names = names_apart(fields, lambda name: name.replace('"', "'"))  # gmsh cannot escape quotes
-    return as_columns({names[name]: values.astype(np.float64) for name, values in fields.items()}, VIEW_SHAPES)
+    return as_columns(
+        {names[name]: values.astype(np.float64) for name, values in fields.items()}, VIEW_SHAPES
+    )
 
 
 def _fields(model: Model) -> dict[str, NDArray[np.float64]]:

@@ -1,4 +1,6 @@
-"""Reading of images: NIfTI, MGZ, NRRD, MetaImage, DICOM and 2-D pictures, each to an `Image` in RAS+ millimetres."""
+"""Reading of images: NIfTI, MGZ, NRRD, MetaImage, DICOM and 2-D pictures, each to an `Image` in
+RAS+ millimetres.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,15 @@ from tetopt.io.volumes import (
     one_line,
     volume_index,
 )
-from tetopt.io.zarr_images import ZARR_SUFFIX, check_chunks, is_zarr, open_zarr, read_chunks, save_zarr, zarr_levels
+from tetopt.io.zarr_images import (
+    ZARR_SUFFIX,
+    check_chunks,
+    is_zarr,
+    open_zarr,
+    read_chunks,
+    save_zarr,
+    zarr_levels,
+)
 from tetopt.system.files import check_suffix
 from tetopt.system.incoming import irregular
 
@@ -57,7 +67,14 @@ _NIBABEL_SUFFIXES = (".nii.gz", ".nii", ".mgz", ".mgh")
 
 # Errors that the two libraries raise for damaged files.
 _READER_ERRORS = (OSError, EOFError, ValueError, TypeError, KeyError)
-_NIBABEL_HEADER_ERRORS = (*_READER_ERRORS, ImageFileError, HeaderDataError, WrapStructError, OverflowError, MGHError)
+_NIBABEL_HEADER_ERRORS = (
+    *_READER_ERRORS,
+    ImageFileError,
+    HeaderDataError,
+    WrapStructError,
+    OverflowError,
+    MGHError,
+)
 GZIP_LEVEL = 1  # nibabel's compression level
 MOST_OF_NIFTI_1 = 32767  # voxels along an axis, of 16 bits; NIfTI-2 allows more
 HEAD_BYTES_NIFTI = 1024  # read from a file: the longest header has 540
@@ -78,33 +95,36 @@ def load_image(
 ) -> Image:
     """Read an image from a file, or from a folder of Zarr or of DICOM slices, in RAS+ millimetres.
 
-    The suffix, in any case, decides the format: nibabel reads NIfTI and MGZ; SimpleITK (the extra ``tetopt[itk]``)
-    reads NRRD and MetaImage; pydicom (``tetopt[dicom]``) reads DICOM; Pillow reads 2-D pictures and folders with one of
-    them per slice, tifffile (``tetopt[tiff]``) TIFF stacks with the calibration of ImageJ or OME; zarr
-    (``tetopt[zarr]``) reads OME-Zarr and Zarr arrays, and only the requested part;
-    `tetopt.io.stored_images.open_stored` describes their placement. Axes of length 1 beyond the third are dropped.
+    The suffix, in any case, decides the format: nibabel reads NIfTI and MGZ; SimpleITK (the extra
+    ``tetopt[itk]``) reads NRRD and MetaImage; pydicom (``tetopt[dicom]``) reads DICOM; Pillow reads
+    2-D pictures and folders with one of them per slice, tifffile (``tetopt[tiff]``) TIFF stacks
+    with the calibration of ImageJ or OME; zarr (``tetopt[zarr]``) reads OME-Zarr and Zarr arrays,
+    and only the requested part; `tetopt.io.stored_images.open_stored` describes their placement.
+    Axes of length 1 beyond the third are dropped.
 
-    NIfTI's scaling, its sform (or else qform) and its spatial unit are applied. ITK's LPS coordinates are converted to
-    RAS. The slices of a DICOM series, and the frames of a DICOM file, are sorted and placed by their own positions, so
-    that the shear of a tilted gantry is kept; each is rescaled as it states. A DICOM segmentation gives the numbers of
-    its segments, 0 elsewhere, in slices from its first to its last frame. A picture has 1 mm pixels, index (row,
-    column), world x to the right and y up, and y = 0 at the centres of its bottom row.
+    NIfTI's scaling, its sform (or else qform) and its spatial unit are applied. ITK's LPS
+    coordinates are converted to RAS. The slices of a DICOM series, and the frames of a DICOM file,
+    are sorted and placed by their own positions, so that the shear of a tilted gantry is kept; each
+    is rescaled as it states. A DICOM segmentation gives the numbers of its segments, 0 elsewhere,
+    in slices from its first to its last frame. A picture has 1 mm pixels, index (row, column),
+    world x to the right and y up, and y = 0 at the centres of its bottom row.
 
     Parameters
     ----------
     path : str or Path
         A file, a Zarr folder, or a folder with one DICOM series.
     volume : int, optional
-        The volume of a 4-D file or frame of a picture, from 0; only this one is held in memory. With more than four
-        axes the fourth varies fastest, as in the file; for Zarr the last of the non-spatial axes.
+        The volume of a 4-D file or frame of a picture, from 0; only this one is held in memory.
+        With more than four axes the fourth varies fastest, as in the file; for Zarr the last of the
+        non-spatial axes.
     slice_ : (axis, index), optional
         Return one slice of a 3-D volume as a 2-D image, see `image_slice`.
     crop : sequence of (start, stop), optional
-        Keep a box of voxels, see `cropped`; one range per axis of the volume.
-        Both `slice_` and `crop` count voxels of the uncropped volume, and the slice must lie inside the crop.
+        Keep a box of voxels, see `cropped`; one range per axis of the volume. Both `slice_` and
+        `crop` count voxels of the uncropped volume, and the slice must lie inside the crop.
     spacing_mm : float or sequence of float, optional
-        Voxel sizes, mm, of a TIFF stack or a folder of slices that states none, one number or one per axis (column,
-        row, slice); or the pixel size of a picture, by default 1 mm.
+        Voxel sizes, mm, of a TIFF stack or a folder of slices that states none, one number or one
+        per axis (column, row, slice); or the pixel size of a picture, by default 1 mm.
 
     Returns
     -------
@@ -114,19 +134,20 @@ def load_image(
     Raises
     ------
     InputError
-        ``"<path>: ..."``: the file is missing, unreadable, empty, of unknown format, truncated or damaged;
-        a library is needed and not installed; a folder has no DICOM series or several; DICOM slices or frames are not
-        parallel, evenly spaced and one per position, or do not state where they lie; `open_stored`
-        rejects a Zarr folder; a stack states no voxel size, or another than `spacing_mm`; slices are missing or
-        differ; there are several volumes and no `volume`, or it is out of range; `slice_` or `crop` is
-        invalid; values are RGB, complex, NaN or infinite; an axis is empty; the affine is singular.
+        ``"<path>: ..."``: the file is missing, unreadable, empty, of unknown format, truncated or
+        damaged; a library is needed and not installed; a folder has no DICOM series or several;
+        DICOM slices or frames are not parallel, evenly spaced and one per position, or do not state
+        where they lie; `open_stored` rejects a Zarr folder; a stack states no voxel size, or
+        another than `spacing_mm`; slices are missing or differ; there are several volumes and no
+        `volume`, or it is out of range; `slice_` or `crop` is invalid; values are RGB, complex, NaN
+        or infinite; an axis is empty; the affine is singular.
 
     Warns
     -----
     UserWarning
-        The image is constant, so its discretization error is 0 on every mesh; the file has no orientation; its header
-        was repaired; its box is longer than 3 m or shorter than 1 mm, except for pictures; chunks that stand for a
-        value are missing.
+        The image is constant, so its discretization error is 0 on every mesh; the file has no
+        orientation; its header was repaired; its box is longer than 3 m or shorter than 1 mm,
+        except for pictures; chunks that stand for a value are missing.
 
     See Also
     --------
@@ -172,9 +193,11 @@ def named_error(path: Path, error: InputError) -> InputError:
 
 
 def file_shape(path: str | Path) -> tuple[int, ...] | None:
-    """Return the lengths of all axes of a file's voxels, from its header; for NRRD they may include components.
+    """Return the lengths of all axes of a file's voxels, from its header; for NRRD they may include
+    components.
 
-    Returns None for a picture or DICOM, which would have to be read. For Zarr the three spatial axes come first.
+    Returns None for a picture or DICOM, which would have to be read. For Zarr the three spatial
+    axes come first.
 
     Raises
     ------
@@ -201,14 +224,16 @@ def file_shape(path: str | Path) -> tuple[int, ...] | None:
 
 
 def save_image(path: str | Path, image: Image) -> None:
-    """Write a NIfTI file (.nii or .nii.gz), whole or not at all, with the full affine as sform, in mm; or OME-Zarr.
+    """Write a NIfTI file (.nii or .nii.gz), whole or not at all, with the full affine as sform, in
+    mm; or OME-Zarr.
 
-    Whole numbers are stored as 8-, 16- or 32-bit integers if they fit, others as float32 or float64. An axis with more
-    voxels than NIfTI-1 supports makes it a NIfTI-2 file.
+    Whole numbers are stored as 8-, 16- or 32-bit integers if they fit, others as float32 or
+    float64. An axis with more voxels than NIfTI-1 supports makes it a NIfTI-2 file.
 
-    A 2-D image becomes a 2-D file in the plane z = 0, which `load_image` reads back unchanged. Replaces an existing
-    file; call `tetopt.system.files.checked_output` first. `tetopt.io.zarr_images.save_zarr` writes a Zarr folder
-    (.zarr) of a 3-D image, in chunks that `tetopt.io.stored_images.open_stored` reads one by one.
+    A 2-D image becomes a 2-D file in the plane z = 0, which `load_image` reads back unchanged.
+    Replaces an existing file; call `tetopt.system.files.checked_output` first.
+    `tetopt.io.zarr_images.save_zarr` writes a Zarr folder (.zarr) of a 3-D image, in chunks that
+    `tetopt.io.stored_images.open_stored` reads one by one.
 
     Parameters
     ----------
@@ -239,7 +264,8 @@ def save_image(path: str | Path, image: Image) -> None:
 
 
 def save_voxels(path: Path, values: NDArray, image: Image) -> None:
-    """Write the values (*shape) or vectors (*shape, K) of an image's voxels as NIfTI, like `save_image`, NaN included.
+    """Write the values (*shape) or vectors (*shape, K) of an image's voxels as NIfTI, like
+    `save_image`, NaN included.
 
     Vectors are along the fifth axis, with the intent "vector".
     """
@@ -262,20 +288,28 @@ def save_voxels(path: Path, values: NDArray, image: Image) -> None:
 
 
 def _for_file(data: NDArray[np.floating]) -> NDArray:
-    """Convert small whole numbers to integers, so that programs recognise labels; return other data unchanged."""
+    """Convert small whole numbers to integers, so that programs recognise labels; return other
+    data unchanged.
+    """
     low, high = data.min(), data.max()
     for dtype in (np.uint8, np.int16, np.int32):
-        if np.iinfo(dtype).min <= low and high <= np.iinfo(dtype).max and np.array_equal(np.rint(data), data):
+        if (
+            np.iinfo(dtype).min <= low
+            and high <= np.iinfo(dtype).max
+            and np.array_equal(np.rint(data), data)
+        ):
             return data.astype(dtype)
     return data
 
 
 def image_slice(image: Image, axis: int, index: int) -> Image:
-    """Return one slice of a 3-D image as a 2-D image, preserving all lengths and angles in the slice.
+    """Return one slice of a 3-D image as a 2-D image, preserving all lengths and angles in the
+    slice.
 
-    A slice in the plane of two world axes keeps these two world coordinates. Otherwise the frame of the plane is Q of
-    the QR factorisation of the affine's two in-plane columns, with each axis of Q signed so that its largest component
-    is positive; a voxel's 2-D coordinates are Q^T times its 3-D ones.
+    A slice in the plane of two world axes keeps these two world coordinates. Otherwise the frame of
+    the plane is Q of the QR factorisation of the affine's two in-plane columns, with each axis of Q
+    signed so that its largest component is positive; a voxel's 2-D coordinates are Q^T times its
+    3-D ones.
 
     Parameters
     ----------
@@ -303,7 +337,9 @@ def image_slice(image: Image, axis: int, index: int) -> Image:
     corner = np.zeros(3)
     corner[axis] = index
     columns = np.delete(image.affine[:3, :3], axis, axis=1)
-    return Image(np.take(image.data, index, axis=axis), _plane_affine(columns, image.to_world(corner)))
+    return Image(
+        np.take(image.data, index, axis=axis), _plane_affine(columns, image.to_world(corner))
+    )
 
 
 def _check_slice(shape: tuple[int, ...], axis: int, index: int) -> None:
@@ -312,7 +348,9 @@ def _check_slice(shape: tuple[int, ...], axis: int, index: int) -> None:
     if axis not in (0, 1, 2):
         raise InputError(f"slice: expected axis 0, 1 or 2, got {axis}")
     if not 0 <= index < shape[axis]:
-        raise InputError(f"slice: expected an index from 0 to {shape[axis] - 1} along axis {axis}, got {index}")
+        raise InputError(
+            f"slice: expected an index from 0 to {shape[axis] - 1} along axis {axis}, got {index}"
+        )
 
 
 def cropped(image: Image, bounds: Bounds) -> Image:
@@ -357,7 +395,8 @@ def parse_crop(text: str) -> list[tuple[int | None, int | None]]:
         match = re.fullmatch(r"\s*([0-9]{0,18})\s*:\s*([0-9]{0,18})\s*", part)
         if match is None:
             raise InputError(
-                f'crop: expected start:stop in voxels for each axis, such as "10:100,:,5:", got "{one_line(text)[:80]}"'
+                'crop: expected start:stop in voxels for each axis, such as "10:100,:,5:", got '
+                f'"{one_line(text)[:80]}"'
             )
         start, stop = (int(end) if end else None for end in match.groups())
         bounds.append((start, stop))
@@ -365,7 +404,8 @@ def parse_crop(text: str) -> list[tuple[int | None, int | None]]:
 
 
 def parse_slice(text: str) -> tuple[int, int]:
-    """Parse an array axis (0, 1, 2 or i, j, k) and voxel index from a command line, for `image_slice`.
+    """Parse an array axis (0, 1, 2 or i, j, k) and voxel index from a command line, for
+    `image_slice`.
 
     Raises
     ------
@@ -388,10 +428,12 @@ def parse_slice(text: str) -> tuple[int, int]:
 
 
 def sha256(path: str | Path) -> str:
-    """Return the SHA-256 of a file, or of the contents of a folder's files joined in the order of their names.
+    """Return the SHA-256 of a file, or of the contents of a folder's files joined in the order of
+    their names.
 
-    For a header with separate data files it includes these. For a Zarr folder it covers all files in it and its
-    subfolders, each after its name and length; `tetopt.io.stored_images.stored_checksum` is a cheaper checksum.
+    For a header with separate data files it includes these. For a Zarr folder it covers all files
+    in it and its subfolders, each after its name and length;
+    `tetopt.io.stored_images.stored_checksum` is a cheaper checksum.
 
     Raises
     ------
@@ -409,7 +451,8 @@ def sha256(path: str | Path) -> str:
 
 
 def image_files(path: Path) -> list[Path]:
-    """Return the files of an image other than Zarr: the file itself, data files of a header, or those in a folder.
+    """Return the files of an image other than Zarr: the file itself, data files of a header, or
+    those in a folder.
 
     Raises
     ------
@@ -417,7 +460,9 @@ def image_files(path: Path) -> list[Path]:
         With the path: it is neither a regular file nor a folder.
     """
     if (other := irregular(path)) not in (None, "a folder"):
-        raise InputError(f"{path}: expected a regular file, got {other}; copy its content into a file")
+        raise InputError(
+            f"{path}: expected a regular file, got {other}; copy its content into a file"
+        )
     # A DICOM series is read from the folder itself, not from its subfolders; so is its checksum.
     files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
     if path.name.lower().endswith(HEADED_SUFFIXES):
@@ -427,10 +472,11 @@ def image_files(path: Path) -> list[Path]:
 
 
 def folder_checksum(path: Path, is_read: Callable[[Path], bool]) -> str:
-    """Return the SHA-256 of the relative names, lengths and contents of all files in a folder, in order.
+    """Return the SHA-256 of the relative names, lengths and contents of all files in a folder, in
+    order.
 
-    For files that are not read, by `is_read`, the time of their last change replaces their contents. Links are
-    followed, but no folder is visited twice.
+    For files that are not read, by `is_read`, the time of their last change replaces their
+    contents. Links are followed, but no folder is visited twice.
     """
     digest, known = hashlib.sha256(), set()
     files: dict[str, Path] = {}
@@ -440,10 +486,15 @@ def folder_checksum(path: Path, is_read: Callable[[Path], bool]) -> str:
             folders.clear()
             continue
         known.add((status.st_dev, status.st_ino))
-        files |= {(Path(folder) / name).relative_to(path).as_posix(): Path(folder) / name for name in names}
+        files |= {
+            (Path(folder) / name).relative_to(path).as_posix(): Path(folder) / name
+            for name in names
+        }
     for name, file in sorted(files.items()):
         if (other := irregular(file)) is not None:
-            raise InputError(f"{file}: expected a regular file, got {other}; copy its content into a file")
+            raise InputError(
+                f"{file}: expected a regular file, got {other}; copy its content into a file"
+            )
         status = file.stat()
         digest.update(f"{name}\0{status.st_size}\0".encode("utf-8", "surrogateescape"))
         if is_read(file):
@@ -468,8 +519,10 @@ def _raised(error: OSError) -> None:
 
 def _read(
     path: Path, volume: int | None, notes: list[str], spacing_mm: float | Sequence[float] | None
-) -> tuple[NDArray, NDArray[np.float64]]:  # fmt: skip
-    """Return data and affine of the file, 2-D or 3-D; `Image` checks them. Warnings are added to `notes`."""
+) -> tuple[NDArray, NDArray[np.float64]]:
+    """Return data and affine of the file, 2-D or 3-D; `Image` checks them. Warnings are added to
+    `notes`.
+    """
     with os_errors_named():
         if path.is_dir() and (names := slice_files(path)):
             return read_slices(path, names, notes, spacing_mm)
@@ -482,12 +535,18 @@ def _read(
 
 
 def has_own_spacing(path: Path) -> bool:
-    """Return whether a file's format states voxel sizes: all do but pictures, stacks and folders of slices."""
+    """Return whether a file's format states voxel sizes: all do but pictures, stacks and folders
+    of slices.
+    """
     with os_errors_named(path):
-        return not (slice_files(path) if path.is_dir() else path.name.lower().endswith(PICTURE_SUFFIXES))
+        return not (
+            slice_files(path) if path.is_dir() else path.name.lower().endswith(PICTURE_SUFFIXES)
+        )
 
 
-def _read_placed(path: Path, volume: int | None, notes: list[str]) -> tuple[NDArray, NDArray[np.float64]]:
+def _read_placed(
+    path: Path, volume: int | None, notes: list[str]
+) -> tuple[NDArray, NDArray[np.float64]]:
     with os_errors_named():
         if path.is_dir():
             return read_dicom(path, volume, notes)
@@ -498,7 +557,9 @@ def _read_placed(path: Path, volume: int | None, notes: list[str]) -> tuple[NDAr
     if is_dicom(path):  # scanners name files without a suffix
         return read_dicom(path, volume, notes)
     known = ", ".join((*READERS, *PICTURE_SUFFIXES, ZARR_SUFFIX))
-    raise InputError(f"unknown image format; expected {known}, or a folder of DICOM files or of slices")
+    raise InputError(
+        f"unknown image format; expected {known}, or a folder of DICOM files or of slices"
+    )
 
 
 def check_beginning(path: Path) -> str:
@@ -521,7 +582,9 @@ def check_beginning(path: Path) -> str:
 
 @contextlib.contextmanager
 def os_errors_named(path: Path | None = None) -> Iterator[None]:
-    """Turn system errors into InputErrors; with `path`, they begin with the file's name or the path."""
+    """Turn system errors into InputErrors; with `path`, they begin with the file's name or the
+    path.
+    """
     try:
         yield
     except OSError as error:
@@ -536,13 +599,17 @@ def os_errors_named(path: Path | None = None) -> Iterator[None]:
 # NIfTI and MGZ
 
 
-def _read_nibabel(path: Path, volume: int | None, notes: list[str]) -> tuple[NDArray, NDArray[np.float64]]:
+def _read_nibabel(
+    path: Path, volume: int | None, notes: list[str]
+) -> tuple[NDArray, NDArray[np.float64]]:
     proxy, index, affine = nibabel_voxels(path, volume, notes)
     check_room(proxy.shape, proxy.dtype.itemsize)
     try:
         data = np.asanyarray(proxy[(slice(None),) * 3 + index] if index else proxy)
     except MemoryError as error:
-        raise InputError(f"its {proxy.shape} voxels do not fit into memory; resample it first") from error
+        raise InputError(
+            f"its {proxy.shape} voxels do not fit into memory; resample it first"
+        ) from error
     except (OSError, EOFError, zlib.error, ValueError, TypeError, OverflowError) as error:
         raise InputError(f"{DAMAGED_FILE} ({one_line(error)})") from error
     if data.ndim == 2:
@@ -561,12 +628,17 @@ READERS: dict[str, Callable[[Path, int | None, list[str]], tuple[NDArray, NDArra
 def nibabel_voxels(
     path: Path, volume: int | None, notes: list[str]
 ) -> tuple[Any, tuple[int, ...], NDArray[np.float64]]:
-    """Return nibabel's proxy of the voxels, the index beyond the third axis, and the affine in mm, (4, 4)."""
+    """Return nibabel's proxy of the voxels, the index beyond the third axis, and the affine in
+    mm, (4, 4).
+    """
     is_packed = path.name.lower().endswith((".gz", ".mgz"))
     head = _checked_head(path, is_packed)
     with _nibabel_heard() as words:
         file = _nibabel_file(path)
-    notes += [f"nibabel repaired its header ({word}); check its voxel sizes and position" for word in words]
+    notes += [
+        f"nibabel repaired its header ({word}); check its voxel sizes and position"
+        for word in words
+    ]
     notes += _notes_of_place(file, head)
     lengths = _units(file, notes)
     affine = np.array(file.affine, dtype=np.float64)
@@ -578,7 +650,8 @@ def nibabel_voxels(
 
 
 def _checked_head(path: Path, is_packed: bool) -> bytes:
-    """Return the file's first bytes, unpacked; InputError if it should be a gzip file, or has excessive extensions.
+    """Return the file's first bytes, unpacked; InputError if it should be a gzip file, or has
+    excessive extensions.
 
     nibabel reads extensions whole together with the header, before their sizes can be checked.
     """
@@ -620,7 +693,10 @@ def _notes_of_place(file: SpatialImage, head: bytes) -> list[str]:
     if isinstance(file, nibabel.MGHImage):
         if any(head[MGH_FLAG]):
             return []
-        return ["has no orientation: its voxel sizes (1 mm), position and left/right are nibabel's guess"]
+        return [
+            "has no orientation: its voxel sizes (1 mm), position and left/right are nibabel's "
+            "guess"
+        ]
     header: Any = file.header
     notes = notes_of_nifti(header, file.shape)
     if int(header["sform_code"]) or int(header["qform_code"]):
@@ -642,20 +718,27 @@ def _nibabel_file(path: Path) -> SpatialImage:
         raise
     except FileNotFoundError as error:
         # The file exists: nibabel looked for its suffix in another case.
-        raise InputError("nibabel cannot read a suffix in mixed case; rename it to lower case") from error
+        raise InputError(
+            "nibabel cannot read a suffix in mixed case; rename it to lower case"
+        ) from error
     except _NIBABEL_HEADER_ERRORS as error:
         raise InputError(f"{UNREADABLE_FILE} ({one_line(error)})") from error
     raise InputError(UNREADABLE_FILE)
 
 
-def _check_size(path: Path, file: SpatialImage, volume: int, is_packed: bool, notes: list[str]) -> None:
-    """Raise InputError unless the file can hold all volumes up to the requested one, before memory is allocated."""
+def _check_size(
+    path: Path, file: SpatialImage, volume: int, is_packed: bool, notes: list[str]
+) -> None:
+    """Raise InputError unless the file can hold all volumes up to the requested one, before
+    memory is allocated.
+    """
     proxy: Any = file.dataobj
     volume_bytes = math.prod(file.shape[:3]) * proxy.dtype.itemsize
     n_bytes, size = proxy.offset + (volume + 1) * volume_bytes, path.stat().st_size
     if min(file.shape) < 0 or n_bytes > size * (DEFLATE_RATIO if is_packed else 1):
         raise InputError(
-            f"{DAMAGED_FILE} (its header declares {' x '.join(str(each) for each in file.shape)} voxels, "
+            f"{DAMAGED_FILE} (its header declares {' x '.join(str(each) for each in file.shape)} "
+            "voxels, "
             f"{n_bytes:.4g} bytes, but the file has {size})"
         )
     whole = proxy.offset + math.prod(file.shape[3:]) * volume_bytes
@@ -668,7 +751,9 @@ def _check_size(path: Path, file: SpatialImage, volume: int, is_packed: bool, no
 
 
 def _check_gzip(path: Path, most: int) -> int:
-    """Unpack the whole file once, in blocks, and return its size: nibabel stops before the checksum at its end."""
+    """Unpack the whole file once, in blocks, and return its size: nibabel stops before the
+    checksum at its end.
+    """
     n_bytes = 0
     try:
         with gzip.open(path) as stream:
@@ -683,7 +768,9 @@ def _check_gzip(path: Path, most: int) -> int:
 
 def _of_gzip(error: Exception) -> InputError:
     if "Not a gzipped file" in str(error):
-        return InputError("not a gzip file; if it is not compressed, remove .gz (or z) from its name")
+        return InputError(
+            "not a gzip file; if it is not compressed, remove .gz (or z) from its name"
+        )
     return InputError(f"{DAMAGED_FILE} ({one_line(error)})")
 
 
@@ -695,7 +782,9 @@ def _units(file: SpatialImage, notes: list[str]) -> NDArray[np.float64] | None:
     try:
         unit = header.get_xyzt_units()[0]
     except KeyError:
-        notes.append(f"its unit of length has the unknown code {header['xyzt_units'] % 8}: assuming mm")
+        notes.append(
+            f"its unit of length has the unknown code {header['xyzt_units'] % 8}: assuming mm"
+        )
         return None
     return mm_of_axes([unit.replace("unknown", "")] * 3, "xyzt_units", notes)
 
@@ -704,7 +793,9 @@ def _units(file: SpatialImage, notes: list[str]) -> NDArray[np.float64] | None:
 
 
 def part_of(image: Image, slice_: tuple[int, int] | None, crop: Bounds | None) -> Image:
-    """Crop and slice an image; slices first, with the same result, so that indices need no shift."""
+    """Crop and slice an image; slices first, with the same result, so that indices need no
+    shift.
+    """
     if slice_ is None:
         return image if crop is None else cropped(image, crop)
     plane = image_slice(image, *slice_)
@@ -715,7 +806,9 @@ def part_of(image: Image, slice_: tuple[int, int] | None, crop: Bounds | None) -
     return cropped(plane, [each for axis, each in enumerate(bounds) if axis != slice_[0]])
 
 
-def _part_of_stored(image: Image, slice_: tuple[int, int] | None, crop: Bounds | None, notes: list[str]) -> Image:
+def _part_of_stored(
+    image: Image, slice_: tuple[int, int] | None, crop: Bounds | None, notes: list[str]
+) -> Image:
     """Do the same for a Zarr image, of which only this part is read."""
     bounds = checked_bounds(image.shape, [(None, None)] * 3 if crop is None else crop)
     if slice_ is not None:
@@ -731,7 +824,9 @@ def _part_of_stored(image: Image, slice_: tuple[int, int] | None, crop: Bounds |
 
 
 def cropped_in_file(image: Image, ranges: list[tuple[int, int]]) -> Image:
-    """Return the part of a stored image in a box of indices, start to stop; its voxels stay in their file."""
+    """Return the part of a stored image in a box of indices, start to stop; its voxels stay in
+    their file.
+    """
     affine = image.affine.copy()
     affine[:-1, -1] = image.to_world([start for start, _ in ranges])
     return Image.stored(image.voxels.within(ranges), affine)
@@ -740,7 +835,9 @@ def cropped_in_file(image: Image, ranges: list[tuple[int, int]]) -> Image:
 def _check_in_crop(bounds: list[tuple[int, int]], axis: int, index: int) -> None:
     start, stop = bounds[axis]
     if not start <= index < stop:
-        raise InputError(f"slice: index {index} along axis {axis} is outside the crop {start}:{stop}")
+        raise InputError(
+            f"slice: index {index} along axis {axis} is outside the crop {start}:{stop}"
+        )
 
 
 def checked_bounds(shape: tuple[int, ...], bounds: Bounds) -> list[tuple[int, int]]:
@@ -752,13 +849,17 @@ def checked_bounds(shape: tuple[int, ...], bounds: Bounds) -> list[tuple[int, in
         start = 0 if start is None else start
         stop = size if stop is None else stop
         if not 0 <= start < stop <= size:
-            raise InputError(f"crop: expected 0 <= start < stop <= {size} along axis {axis}, got {start}:{stop}")
+            raise InputError(
+                f"crop: expected 0 <= start < stop <= {size} along axis {axis}, got {start}:{stop}"
+            )
         ranges.append((start, stop))
     return ranges
 
 
 def _plane_affine(columns: NDArray[np.float64], origin: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the 2-D affine (3, 3) of a plane in 3-D with voxel steps `columns` (3, 2) and first voxel `origin`, mm."""
+    """Return the 2-D affine (3, 3) of a plane in 3-D with voxel steps `columns` (3, 2) and first
+    voxel `origin`, mm.
+    """
     if not np.isfinite(columns).all():
         raise InputError(f"affine: expected finite entries, got {columns.tolist()}")
     spanned = np.flatnonzero(columns.any(axis=1))

@@ -1,7 +1,8 @@
 """Checks of NRRD and MetaImage headers before SimpleITK reads the file: sizes and data files.
 
-ITK trusts headers: ``NDims = -1`` ends the process, memory is allocated before a file is found to be too short, and a
-header may name any file of the machine, whose bytes would become voxels of a mesh that goes back to the sender.
+ITK trusts headers: ``NDims = -1`` ends the process, memory is allocated before a file is found to
+be too short, and a header may name any file of the machine, whose bytes would become voxels of a
+mesh that goes back to the sender.
 """
 
 from __future__ import annotations
@@ -14,7 +15,14 @@ from typing import NamedTuple
 
 from tetopt.errors import InputError
 from tetopt.io.apart import DEFLATE_RATIO
-from tetopt.io.volumes import DAMAGED_FILE, TOO_LONG, TRAILING_BYTES, UNREADABLE_FILE, check_room, one_line
+from tetopt.io.volumes import (
+    DAMAGED_FILE,
+    TOO_LONG,
+    TRAILING_BYTES,
+    UNREADABLE_FILE,
+    check_room,
+    one_line,
+)
 from tetopt.system.incoming import irregular
 
 NRRD_SUFFIXES = (".nrrd", ".nhdr")
@@ -26,11 +34,29 @@ VALUE_LETTERS = 32  # letters of text per byte of a value, at most
 BLOCK_BYTES = 2**14  # unpacked at a time, to 17 MB at most
 BZIP2_RATIO = 50_000  # bzip2 compresses zeros 45,000 times
 VALUE_BYTES = {  # types of NRRD without "unsigned" and the like, and those of MetaImage
-    "char": 1, "int8": 1, "int8_t": 1, "short": 2, "short int": 2, "int16": 2, "int16_t": 2, "int": 4, "int32": 4,
-    "int32_t": 4, "long": 4, "longlong": 8, "long long": 8, "long long int": 8, "int64": 8, "int64_t": 8, "float": 4,
+    "char": 1,
+    "int8": 1,
+    "int8_t": 1,
+    "short": 2,
+    "short int": 2,
+    "int16": 2,
+    "int16_t": 2,
+    "int": 4,
+    "int32": 4,
+    "int32_t": 4,
+    "long": 4,
+    "longlong": 8,
+    "long long": 8,
+    "long long int": 8,
+    "int64": 8,
+    "int64_t": 8,
+    "float": 4,
     "double": 8,
-}  # fmt: skip
-READ_IN_PARTS = "crop or resample it first, or convert it to .zarr or uncompressed .nii, which are read in parts"
+}
+READ_IN_PARTS = (
+    "crop or resample it first, or convert it to .zarr or uncompressed .nii, which "
+    "are read in parts"
+)
 
 
 class VoxelHeader(NamedTuple):
@@ -52,8 +78,8 @@ def checked_header(path: Path) -> tuple[VoxelHeader, int]:
     Raises
     ------
     InputError
-        Without a leading path: the header cannot be read or declares more than the files contain; a data file is not
-        next to the header, or is not a regular file.
+        Without a leading path: the header cannot be read or declares more than the files contain; a
+        data file is not next to the header, or is not a regular file.
     """
     header = read_header(path)
     n_bytes = _checked_bytes(path, header)
@@ -64,7 +90,9 @@ def checked_header(path: Path) -> tuple[VoxelHeader, int]:
 
 
 def _checked_bytes(path: Path, header: VoxelHeader) -> int:
-    """Return the number of bytes of all files of the image; InputError if its header declares more, or far fewer."""
+    """Return the number of bytes of all files of the image; InputError if its header declares
+    more, or far fewer.
+    """
     n_bytes = sum(file.stat().st_size for file in (path, *_data_files(path, header)))
     if header.value_bytes > n_bytes * header.ratio:
         sizes = " x ".join(str(size) for size in header.sizes)
@@ -81,7 +109,9 @@ def _checked_bytes(path: Path, header: VoxelHeader) -> int:
 
 
 def _check_packed(path: Path, header: VoxelHeader) -> None:
-    """Raise InputError if a MetaImage has fewer packed bytes than declared: ITK returns what was in memory for them."""
+    """Raise InputError if a MetaImage has fewer packed bytes than declared: ITK returns what was
+    in memory for them.
+    """
     n_bytes = 0
     try:
         for file in _data_files(path, header) or [path]:
@@ -94,12 +124,15 @@ def _check_packed(path: Path, header: VoxelHeader) -> None:
         raise InputError(f"{DAMAGED_FILE} ({one_line(error)})") from error
     if n_bytes < header.value_bytes:
         raise InputError(
-            f"{DAMAGED_FILE} (its header declares {header.value_bytes} bytes of voxels, but {n_bytes} are packed)"
+            f"{DAMAGED_FILE} (its header declares {header.value_bytes} bytes of voxels, but "
+            f"{n_bytes} are packed)"
         )
 
 
 def data_files(path: Path) -> list[Path]:
-    """Return the data files of a header, empty if the voxels follow it; InputError for reasons of `checked_header`."""
+    """Return the data files of a header, empty if the voxels follow it; InputError for reasons
+    of `checked_header`.
+    """
     return _data_files(path, read_header(path))
 
 
@@ -110,7 +143,9 @@ def _data_files(path: Path, header: VoxelHeader) -> list[Path]:
 
 
 def header_sizes(path: Path) -> tuple[int, ...]:
-    """Return the lengths of the axes in the header; InputError for the reasons of `checked_header` in the header."""
+    """Return the lengths of the axes in the header; InputError for the reasons of
+    `checked_header` in the header.
+    """
     return tuple(read_header(path).sizes)
 
 
@@ -120,14 +155,19 @@ def read_header(path: Path) -> VoxelHeader:
         head = stream.read(HEADER_BYTES)
     header = _nrrd(head) if path.suffix.lower() in NRRD_SUFFIXES else _metaimage(head)
     if header.files and len(head) == HEADER_BYTES:  # the rest might name other files
-        raise InputError(f"{UNREADABLE_FILE} (a header of more than {HEADER_BYTES} bytes with separate data files)")
+        raise InputError(
+            f"{UNREADABLE_FILE} (a header of more than {HEADER_BYTES} bytes with separate data "
+            "files)"
+        )
     return header
 
 
 def _check_beside(path: Path, name: str) -> None:
     """Raise InputError unless the name is that of a regular file in the header's folder."""
     if name in ("", ".", "..") or re.search(r"[/\\:\0%*?]", name):
-        raise InputError(f'expected a data file next to the header, named without a folder, got "{name}"')
+        raise InputError(
+            f'expected a data file next to the header, named without a folder, got "{name}"'
+        )
     try:
         other = irregular(path.parent / name)
     except OSError as error:
@@ -177,7 +217,10 @@ def _metaimage(head: bytes) -> VoxelHeader:
     is_packed = fields.get("CompressedData", "").lower() in ("true", "1")
     is_text = fields.get("BinaryData", "True").lower() not in ("true", "1")
     ratio = DEFLATE_RATIO if is_packed else TEXT_RATIO if is_text else 1
-    value_bytes, end = math.prod(sizes) * int(channels) * _value_bytes(fields["ElementType"]), lines[: number + 1]
+    value_bytes, end = (
+        math.prod(sizes) * int(channels) * _value_bytes(fields["ElementType"]),
+        lines[: number + 1],
+    )
     skip, n_bytes = fields.get("HeaderSize", "0"), len(b"\n".join(end)) + 1
     return VoxelHeader(stated, {}, sizes, value_bytes, files, ratio, skip, n_bytes)
 
@@ -214,7 +257,11 @@ def _nrrd(head: bytes) -> VoxelHeader:
     sizes = _sizes(fields["sizes"], _n_axes(fields["dimension"]))
     encoding = fields["encoding"].lower()
     ratio = BZIP2_RATIO
-    for names, of_these in (("raw hex", 1), ("txt text ascii", TEXT_RATIO), ("gz gzip", DEFLATE_RATIO)):
+    for names, of_these in (
+        ("raw hex", 1),
+        ("txt text ascii", TEXT_RATIO),
+        ("gz gzip", DEFLATE_RATIO),
+    ):
         if encoding in names.split():
             ratio = of_these
     value_bytes, skip = math.prod(sizes) * _value_bytes(fields["type"]), fields.get("byteskip", "0")

@@ -1,10 +1,14 @@
-"""Label tables with names and colours: FreeSurfer, ITK-SNAP, 3D Slicer, BIDS, or any CSV, recognised by content.
+"""Label tables with names and colours: FreeSurfer, ITK-SNAP, 3D Slicer, BIDS, or any CSV,
+recognised by content.
 
-- FreeSurfer (FreeSurferColorLUT.txt) and 3D Slicer (.ctbl, .txt): label, name, red, green, blue, opacity, 0 to 255.
-- ITK-SNAP: label, red, green, blue, opacity (0 to 1), two switches, and the name in quotation marks.
+- FreeSurfer (FreeSurferColorLUT.txt) and 3D Slicer (.ctbl, .txt): label, name, red, green, blue,
+  opacity, 0 to 255.
+- ITK-SNAP: label, red, green, blue, opacity (0 to 1), two switches, and the name in quotation
+  marks.
 - 3D Slicer's segmentations (.seg.nrrd) and DICOM's (SEG): the names and colours of their segments.
-- BIDS (`*_dseg.tsv`), 3D Slicer's .csv, and other tables with column names in the first row, separated by tabs, commas
-  or semicolons: columns for the label, the name, and optionally the colour, as "#rrggbb" or as three numbers.
+- BIDS (`*_dseg.tsv`), 3D Slicer's .csv, and other tables with column names in the first row,
+  separated by tabs, commas or semicolons: columns for the label, the name, and optionally the
+  colour, as "#rrggbb" or as three numbers.
 
 Lines that are empty or begin with # are skipped. Opacities are ignored.
 """
@@ -29,11 +33,21 @@ from tetopt.system.incoming import irregular, text_of
 
 __all__ = ["NO_TABLE", "LabelTable", "load_label_table"]
 
-SNAP_LINE = re.compile(r'\s*(\d{1,10})\s+(\d+)\s+(\d+)\s+(\d+)\s+([\d.eE+-]+)\s+([01])\s+([01])\s+"(.*)"\s*')
+SNAP_LINE = re.compile(
+    r'\s*(\d{1,10})\s+(\d+)\s+(\d+)\s+(\d+)\s+([\d.eE+-]+)\s+([01])\s+([01])\s+"(.*)"\s*'
+)
 LUT_LINE = re.compile(r"\s*(\d{1,10})\s+(\S.*?)\s+(\d+)\s+(\d+)\s+(\d+)(?:\s+([\d.]+))?\s*")
 # Names of columns, in lower case without blanks; the first one present is used.
 LABEL_COLUMNS = ("labelvalue", "index", "id", "value", "labelid", "label", "labels")
-NAME_COLUMNS = ("name", "labelname", "structure", "structures", "region", "type_codemeaning", "label")
+NAME_COLUMNS = (
+    "name",
+    "labelname",
+    "structure",
+    "structures",
+    "region",
+    "type_codemeaning",
+    "label",
+)
 HEX_COLUMNS = ("color", "colour", "hex")
 RGB_COLUMNS = (("r", "g", "b"), ("red", "green", "blue"), ("color_r", "color_g", "color_b"))
 NO_NAMES = ("", "(none)", "n/a")  # missing names in 3D Slicer and BIDS
@@ -51,9 +65,10 @@ class LabelEntry(NamedTuple):
 def load_label_table(path: str | Path) -> LabelTable:
     """Load names and colours of labels from a file.
 
-    Colour tables of FreeSurfer and 3D Slicer, label descriptions of ITK-SNAP, BIDS's `*_dseg.tsv` and any CSV with
-    column names in the first row are recognised by their content; `tetopt.io.label_tables` lists the columns. So are
-    segmentations with names of their own: 3D Slicer's (.seg.nrrd) and DICOM's.
+    Colour tables of FreeSurfer and 3D Slicer, label descriptions of ITK-SNAP, BIDS's `*_dseg.tsv`
+    and any CSV with column names in the first row are recognised by their content;
+    `tetopt.io.label_tables` lists the columns. So are segmentations with names of their own: 3D
+    Slicer's (.seg.nrrd) and DICOM's.
 
     Parameters
     ----------
@@ -68,8 +83,8 @@ def load_label_table(path: str | Path) -> LabelTable:
     Raises
     ------
     InputError
-        The file does not exist or has another format; a line differs from the others; a label has two names or two
-        colours.
+        The file does not exist or has another format; a line differs from the others; a label has
+        two names or two colours.
 
     Examples
     --------
@@ -94,12 +109,14 @@ def load_label_table(path: str | Path) -> LabelTable:
     for entry in _entries(path, lines):
         if entry.label > LARGEST_LABEL:
             raise InputError(
-                f"{path}, line {entry.line}: expected a label up to {LARGEST_LABEL}, got {entry.label}; correct it"
+                f"{path}, line {entry.line}: expected a label up to {LARGEST_LABEL}, got "
+                f"{entry.label}; correct it"
             )
         first = of_label.setdefault(entry.label, entry)
         if first._replace(line=entry.line) != entry:
             raise InputError(
-                f'{path}, line {entry.line}: label {entry.label} is "{entry.name}", but "{first.name}" on line '
+                f'{path}, line {entry.line}: label {entry.label} is "{entry.name}", but '
+                f'"{first.name}" on line '
                 f"{first.line}; list each label only once"
             )
         if entry.name not in NO_NAMES:
@@ -112,7 +129,8 @@ def load_label_table(path: str | Path) -> LabelTable:
 
 
 def own_label_table(path: Path) -> LabelTable:
-    """Return the names and colours that a segmentation's own file has; empty for a file without any.
+    """Return the names and colours that a segmentation's own file has; empty for a file without
+    any.
 
     Raises
     ------
@@ -133,7 +151,9 @@ def _entries(path: Path, lines: list[tuple[int, str]]) -> Iterator[LabelEntry]:
     """Yield the labels of the lines, all in the format of the first line."""
     first = lines[0][1]
     if SNAP_LINE.fullmatch(first):
-        yield from _matched(path, lines, SNAP_LINE, 'label, red, green, blue, opacity, 1, 1, "name", as in ITK-SNAP')
+        yield from _matched(
+            path, lines, SNAP_LINE, 'label, red, green, blue, opacity, 1, 1, "name", as in ITK-SNAP'
+        )
     elif LUT_LINE.fullmatch(first):
         words = "label, name, red, green, blue, opacity, as in FreeSurfer and 3D Slicer"
         yield from _matched(path, lines, LUT_LINE, words)
@@ -141,13 +161,19 @@ def _entries(path: Path, lines: list[tuple[int, str]]) -> Iterator[LabelEntry]:
         yield from _of_columns(path, lines)
 
 
-def _matched(path: Path, lines: list[tuple[int, str]], pattern: re.Pattern[str], form: str) -> Iterator[LabelEntry]:
+def _matched(
+    path: Path, lines: list[tuple[int, str]], pattern: re.Pattern[str], form: str
+) -> Iterator[LabelEntry]:
     for number, line in lines:
         if (match := pattern.fullmatch(line)) is None:
             raise InputError(f'{path}, line {number}: expected {form}, got "{line}"')
         parts = match.groups()
-        tones, name = (parts[1:4], parts[7]) if pattern is SNAP_LINE else (parts[2:5], parts[1].strip('"'))
-        yield LabelEntry(number, int(parts[0]), _one_line(name), _colour(path, number, tones, 255.0))
+        tones, name = (
+            (parts[1:4], parts[7]) if pattern is SNAP_LINE else (parts[2:5], parts[1].strip('"'))
+        )
+        yield LabelEntry(
+            number, int(parts[0]), _one_line(name), _colour(path, number, tones, 255.0)
+        )
 
 
 def _of_columns(path: Path, lines: list[tuple[int, str]]) -> Iterator[LabelEntry]:
@@ -160,7 +186,8 @@ def _of_columns(path: Path, lines: list[tuple[int, str]]) -> Iterator[LabelEntry
     name = next((each for each in NAME_COLUMNS if each in columns and each != label), None)
     if label is None or name is None:
         raise InputError(
-            f"{path}, line {lines[0][0]}: expected a label table of FreeSurfer, ITK-SNAP or 3D Slicer, or a row of "
+            f"{path}, line {lines[0][0]}: expected a label table of FreeSurfer, ITK-SNAP or 3D "
+            "Slicer, or a row of "
             f'column names with "label" (or "index") and "name", got "{head[:60]}"'
         )
     tones = next((each for each in RGB_COLUMNS if all(part in columns for part in each)), ())
@@ -171,11 +198,13 @@ def _of_columns(path: Path, lines: list[tuple[int, str]]) -> Iterator[LabelEntry
         cells = {each: row[k].strip() for each, k in columns.items() if k < len(row)}
         if label not in cells or name not in cells:
             raise InputError(
-                f'{path}, line {number}: expected {len(rows[0])} columns, as in the first row, got "{line}"'
+                f"{path}, line {number}: expected {len(rows[0])} columns, as in the first row, "
+                f'got "{line}"'
             )
         if re.fullmatch(r"\d{1,10}(\.0*)?", cells[label]) is None:
             raise InputError(
-                f'{path}, line {number}: expected a whole number from 0 in column {label}, got "{cells[label]}"'
+                f"{path}, line {number}: expected a whole number from 0 in column {label}, got "
+                f'"{cells[label]}"'
             )
         colour = None
         if tones and any(cells.get(part, "") not in NO_NAMES for part in tones):
@@ -183,7 +212,9 @@ def _of_columns(path: Path, lines: list[tuple[int, str]]) -> Iterator[LabelEntry
         elif code is not None and (text := cells.get(code, "")) not in NO_NAMES:
             colour = hex_colour(text)
             if colour is None:
-                raise InputError(f'{path}, line {number}: expected a colour as #rrggbb, got "{text}"')
+                raise InputError(
+                    f'{path}, line {number}: expected a colour as #rrggbb, got "{text}"'
+                )
         yield LabelEntry(number, int(float(cells[label])), _one_line(cells[name]), colour)
 
 
@@ -198,7 +229,9 @@ def _one_line(name: str) -> str:
     return plain(" ".join(name.split()))
 
 
-def _colour(path: Path, line: int, texts: list[str] | tuple[str, ...], whole: float) -> tuple[float, float, float]:
+def _colour(
+    path: Path, line: int, texts: list[str] | tuple[str, ...], whole: float
+) -> tuple[float, float, float]:
     """Parse a colour of three numbers from 0 to `whole`."""
     try:
         red, green, blue = (float(text) / whole for text in texts)
@@ -206,6 +239,7 @@ def _colour(path: Path, line: int, texts: list[str] | tuple[str, ...], whole: fl
         red = green = blue = -1.0
     if not all(0.0 <= part <= 1.0 for part in (red, green, blue)):
         raise InputError(
-            f"{path}, line {line}: expected red, green and blue from 0 to {whole:g}, got {', '.join(texts)}"
+            f"{path}, line {line}: expected red, green and blue from 0 to {whole:g}, got "
+            f"{', '.join(texts)}"
         )
     return red, green, blue

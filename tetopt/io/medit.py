@@ -1,10 +1,11 @@
 """Meshes for medit (INRIA) and programs that read its files: FreeFEM, Mmg, SfePy, libMeshb.
 
-A tetrahedron (in 2-D a triangle) has one reference, a number of `tetopt.io.tags.numbered_parts`: its label, or without
-labels its material's number. If materials or cell sets divide a label, each part has its own reference. Similarly, the
-reference of a triangle (in 2-D an edge) represents a combination of facet sets, also inside the mesh; a facet that two
-sets hold from opposite sides is oriented as in the first of them. Comments in the header list the names of each
-reference, coordinates, units, each material's constants, and the loads. Vertices have the reference 0.
+A tetrahedron (in 2-D a triangle) has one reference, a number of `tetopt.io.tags.numbered_parts`:
+its label, or without labels its material's number. If materials or cell sets divide a label, each
+part has its own reference. Similarly, the reference of a triangle (in 2-D an edge) represents a
+combination of facet sets, also inside the mesh; a facet that two sets hold from opposite sides is
+oriented as in the first of them. Comments in the header list the names of each reference,
+coordinates, units, each material's constants, and the loads. Vertices have the reference 0.
 """
 
 from __future__ import annotations
@@ -12,7 +13,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.io.tags import all_sets, label_lines, numbered_parts, remarks, tag_lines, without_data, without_labels
+from tetopt.io.tags import (
+    all_sets,
+    label_lines,
+    numbered_parts,
+    remarks,
+    tag_lines,
+    without_data,
+    without_labels,
+)
 from tetopt.io.text import comment_lines, rows
 from tetopt.model.model import Model, element_facets, elements
 
@@ -32,9 +41,18 @@ def medit(model: Model) -> bytes:
     mesh = model.mesh
     points, nodes = elements(model)
     in_cells, on_facets = numbered_parts(model)
-    cells, sides = (f"{ELEMENT_KEYWORDS[dim]}{'P2' if model.order == 2 else ''}" for dim in (mesh.ndim, mesh.ndim - 1))
-    comments = [*remarks(model), *without_data(without_labels(model)), *label_lines(model, in_cells, "reference")]
-    comments += tag_lines(all_sets(in_cells), f"{cells} ref") + tag_lines(on_facets.sets, f"{sides} ref")
+    cells, sides = (
+        f"{ELEMENT_KEYWORDS[dim]}{'P2' if model.order == 2 else ''}"
+        for dim in (mesh.ndim, mesh.ndim - 1)
+    )
+    comments = [
+        *remarks(model),
+        *without_data(without_labels(model)),
+        *label_lines(model, in_cells, "reference"),
+    ]
+    comments += tag_lines(all_sets(in_cells), f"{cells} ref") + tag_lines(
+        on_facets.sets, f"{sides} ref"
+    )
     return "".join(
         [
             "MeshVersionFormatted 2\n\n",

@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import numbered_edges
-from tetopt.interop.conversions import CELL_DIMENSIONS, cells_of_rows, kind_of_cells, rows_by_kind, simplices_of
+from tetopt.interop.conversions import (
+    CELL_DIMENSIONS,
+    cells_of_rows,
+    kind_of_cells,
+    rows_by_kind,
+    simplices_of,
+)
 from tetopt.io.raw import Raw, by_corners
 from tetopt.io.read_gmsh import read_msh
 from tetopt.io.read_vtk import read_vtk
@@ -24,7 +30,8 @@ from tetopt.model.sets import SET_NAME, Sets, free_name, rows_of
 from tetopt.system.incoming import regular_file
 
 MESH_SUFFIXES = (*VTK_SUFFIXES, ".msh", ".msh2")
-STRAIGHT_FRACTION = 1e-6  # of an edge: a mid-edge node closer to its middle is rounded, as in files with few digits
+# of an edge: a mid-edge node closer to its middle is rounded, as in files with few digits
+STRAIGHT_FRACTION = 1e-6
 
 
 def load_mesh(path: str | Path) -> MeshFile:
@@ -43,8 +50,8 @@ def load_mesh(path: str | Path) -> MeshFile:
     Raises
     ------
     InputError
-        The file is missing or unreadable; it has no cells, or other cell types; triangles lie outside the plane; cells
-        are flat.
+        The file is missing or unreadable; it has no cells, or other cell types; triangles lie
+        outside the plane; cells are flat.
 
     See Also
     --------
@@ -63,7 +70,9 @@ def load_mesh(path: str | Path) -> MeshFile:
     if path.suffix.lower() == ".pvtu":
         raise InputError(f"{path}: cannot read .pvtu; save the mesh as .vtu in ParaView")
     if path.suffix.lower() not in MESH_SUFFIXES:
-        raise InputError(f"{path}: expected a {', '.join(MESH_SUFFIXES[:-1])} or {MESH_SUFFIXES[-1]} mesh")
+        raise InputError(
+            f"{path}: expected a {', '.join(MESH_SUFFIXES[:-1])} or {MESH_SUFFIXES[-1]} mesh"
+        )
     try:
         raw = read_msh(path) if path.suffix.lower() in (".msh", ".msh2") else _read_vtk(path)
     except InputError as error:
@@ -81,7 +90,9 @@ def load_mesh(path: str | Path) -> MeshFile:
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     used = picked.used
-    sets, of_sets = _sets_of_groups(raw, mesh, kind, used) if raw.groups else sets_in(raw.field_data, mesh)
+    sets, of_sets = (
+        _sets_of_groups(raw, mesh, kind, used) if raw.groups else sets_in(raw.field_data, mesh)
+    )
     shown = {f"{ON_PREFIX}{name}" for name in sets.facets}  # which repeat the sets
     at_nodes = {name: values for name, values in raw.point_data.items() if name not in shown}
     of_cells = {name: values[kind] for name, values in raw.cell_data.items() if kind in values}
@@ -102,15 +113,18 @@ def load_mesh(path: str | Path) -> MeshFile:
 
 
 def _middles(raw: Raw, kind: str) -> tuple[NDArray[np.int64], bool, tuple[str, ...]]:
-    """Return the mid-edge nodes (E,) in the order of `quadratic`, none for order 1; whether any edge is curved; and
-    notes on curved edges and on dropped mid-edge nodes."""
+    """Return the mid-edge nodes (E,) in the order of `quadratic`, none for order 1; whether any
+    edge is curved; and notes on curved edges and on dropped mid-edge nodes.
+    """
     if kind not in raw.middles:
         return np.empty(0, dtype=np.int64), False, ()
     edges, number = numbered_edges(raw.cells[kind])
     nodes, notes = np.empty(len(edges), dtype=np.int64), []
     nodes[number] = raw.middles[kind]
     if n_torn := len(np.unique(number[nodes[number] != raw.middles[kind]])):
-        notes.append(f"{n_torn} edges have different mid-edge nodes in their cells: using one of them")
+        notes.append(
+            f"{n_torn} edges have different mid-edge nodes in their cells: using one of them"
+        )
     start, end = np.moveaxis(raw.points[edges], 1, 0)
     off = np.linalg.norm(raw.points[nodes] - 0.5 * (start + end), axis=1)
     straight = STRAIGHT_FRACTION * np.linalg.norm(end - start, axis=1)
@@ -127,16 +141,23 @@ def _numbers(
     """Return numeric cell data and point data in RAS+ and kPa, and notes on dropped data."""
     fields, notes = [], []
     for what, values_of in (("cell", cell_data), ("point", point_data)):
-        numbers = {name: values for name, values in values_of.items() if values.dtype.kind in "biuf"}
+        numbers = {
+            name: values for name, values in values_of.items() if values.dtype.kind in "biuf"
+        }
         if others := ", ".join(name for name in values_of if name not in numbers):
             notes.append(f"dropped {what} data that are not numbers: {others}")
         fields.append(numbers)
     units = text_in(raw.field_data, "units") or "kPa"
     if units in STRESS_UNITS:
-        fields = [scaled_fields(each, STRESS_UNITS[units].kPa, STRESS_UNITS[units].mm, ndim) for each in fields]
+        fields = [
+            scaled_fields(each, STRESS_UNITS[units].kPa, STRESS_UNITS[units].mm, ndim)
+            for each in fields
+        ]
     elif lost := [name for each in fields for name in each if is_stress(name)]:
         lost += ["nu", "material", "density"] if "young" in lost else []
-        fields = [{name: values for name, values in each.items() if name not in lost} for each in fields]
+        fields = [
+            {name: values for name, values in each.items() if name not in lost} for each in fields
+        ]
         words = f'unit is none of {", ".join(STRESS_UNITS)}: "{units}"'
         notes.append(f"dropped moduli and stresses, as their {words}")
     if raw.space == "lps" and ndim == 3:
@@ -144,7 +165,9 @@ def _numbers(
     return fields, tuple(notes)
 
 
-def _sets_of_groups(raw: Raw, mesh: Mesh, kind: str, used: NDArray[np.int64]) -> tuple[Sets, tuple[str, ...]]:
+def _sets_of_groups(
+    raw: Raw, mesh: Mesh, kind: str, used: NDArray[np.int64]
+) -> tuple[Sets, tuple[str, ...]]:
     """Return gmsh's groups of cells and of facets as sets, and notes on renamed ones."""
     place = np.full(len(raw.points), -1)
     place[used] = np.arange(len(used))
@@ -176,11 +199,22 @@ def _read_vtk(path: Path) -> Raw:
     rows_of_kind = rows_by_kind(np.diff(grid.offsets), grid.cell_types)
     cells = cells_of_rows(grid.connectivity, grid.offsets, rows_of_kind)
     cell_data = {
-        name: {kind: values[chosen] for kind, chosen in rows_of_kind.items()} for name, values in grid.cell_data.items()
+        name: {kind: values[chosen] for kind, chosen in rows_of_kind.items()}
+        for name, values in grid.cell_data.items()
     }
     field_data = {name: _decoded(values) for name, values in grid.field_data.items()}
-    own = {name: values for name, values in grid.point_data.items() if not name.startswith("vtk")}  # e.g. vtkGhostType
-    raw = Raw(grid.points, cells, cell_data, own, field_data, [], _space(path, field_data), notes=grid.notes)
+    # e.g. vtkGhostType
+    own = {name: values for name, values in grid.point_data.items() if not name.startswith("vtk")}
+    raw = Raw(
+        grid.points,
+        cells,
+        cell_data,
+        own,
+        field_data,
+        [],
+        _space(path, field_data),
+        notes=grid.notes,
+    )
     return by_corners(raw)
 
 
@@ -195,7 +229,9 @@ def _space(path: Path, field_data: dict[str, NDArray]) -> str:
 
 
 def _decoded(values: NDArray) -> NDArray:
-    """Decode UTF-8 bytes, as tetopt writes texts, to an array of one string; return other values unchanged."""
+    """Decode UTF-8 bytes, as tetopt writes texts, to an array of one string; return other values
+    unchanged.
+    """
     if values.dtype != np.uint8:
         return values
     try:

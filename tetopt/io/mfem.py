@@ -1,17 +1,20 @@
-"""Meshes for MFEM and programs based on it: mesh format v1.3, with named sets of attributes (read by MFEM 4.10).
+"""Meshes for MFEM and programs based on it: mesh format v1.3, with named sets of attributes (read
+by MFEM 4.10).
 
-An element has one attribute, a number of `tetopt.io.tags.numbered_parts`: its label, or without labels its material's
-number. If materials or cell sets divide a label, each part has its own attribute. The named sets of the labels,
-"material_1", ... and those of the cell sets list their attributes. Similarly, the attribute of a boundary element
-represents a combination of facet sets. Facets inside the mesh that are in a set are boundary elements, too, as MFEM
-allows; one that two sets hold from opposite sides is oriented as in the first of them.
+An element has one attribute, a number of `tetopt.io.tags.numbered_parts`: its label, or without
+labels its material's number. If materials or cell sets divide a label, each part has its own
+attribute. The named sets of the labels, "material_1", ... and those of the cell sets list their
+attributes. Similarly, the attribute of a boundary element represents a combination of facet sets.
+Facets inside the mesh that are in a set are boundary elements, too, as MFEM allows; one that two
+sets hold from opposite sides is oriented as in the first of them.
 
-A mesh of order 2 has a nodal function of MFEM's quadratic H1 space, as created by `Mesh::SetCurvature(2)`: vertices,
-then the middles of edges in the order of their first occurrence in the elements. MFEM treats elements with such a
-function as curved, as those on interfaces may be.
+A mesh of order 2 has a nodal function of MFEM's quadratic H1 space, as created by
+`Mesh::SetCurvature(2)`: vertices, then the middles of edges in the order of their first occurrence
+in the elements. MFEM treats elements with such a function as curved, as those on interfaces may be.
 
-The comments in the header list coordinates, units, each material's constants and attributes, and the loads.
-`mesh.bdr_attribute_sets.GetAttributeSetMarker(name)` returns the marker of a boundary condition.
+The comments in the header list coordinates, units, each material's constants and attributes, and
+the loads. `mesh.bdr_attribute_sets.GetAttributeSetMarker(name)` returns the marker of a boundary
+condition.
 """
 
 from __future__ import annotations
@@ -19,13 +22,22 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.io.tags import all_sets, label_lines, numbered_parts, remarks, tag_lines, without_data, without_labels
+from tetopt.io.tags import (
+    all_sets,
+    label_lines,
+    numbered_parts,
+    remarks,
+    tag_lines,
+    without_data,
+    without_labels,
+)
 from tetopt.io.text import blocks, comment_lines, rows
 from tetopt.mesh import Mesh
 from tetopt.model.model import Model
 from tetopt.model.sets import facet_triples
 
-ELEMENT_GEOMETRIES = {1: 1, 2: 2, 3: 4}  # MFEM's numbers of simplices by dimension: segment, triangle, tetrahedron
+# MFEM's numbers of simplices by dimension: segment, triangle, tetrahedron
+ELEMENT_GEOMETRIES = {1: 1, 2: 2, 3: 4}
 # Local corners of an element's edges in MFEM's order (fem/geom.cpp), by dimension.
 ELEMENT_EDGES = {
     2: np.array([(0, 1), (1, 2), (2, 0)]),
@@ -46,7 +58,11 @@ def mfem(model: Model) -> bytes:
     mesh = model.mesh
     in_cells, on_facets = numbered_parts(model)
     cell_sets = all_sets(in_cells)
-    comments = [*remarks(model), *without_data(without_labels(model)), *label_lines(model, in_cells, "attribute")]
+    comments = [
+        *remarks(model),
+        *without_data(without_labels(model)),
+        *label_lines(model, in_cells, "attribute"),
+    ]
     comments += tag_lines(cell_sets, "attribute") + tag_lines(on_facets.sets, "boundary attribute")
     return "".join(
         [
@@ -75,14 +91,21 @@ def _elements(attributes: NDArray[np.int64], dim: int, nodes: NDArray[np.int64])
 def _nodes(mesh: Mesh) -> str:
     """Return the nodal function of order 2, node by node."""
     ends = np.sort(mesh.cells[:, ELEMENT_EDGES[mesh.ndim]], axis=2).reshape(-1, 2)
-    _, first, number = np.unique(ends[:, 0] * len(mesh.points) + ends[:, 1], return_index=True, return_inverse=True)
+    _, first, number = np.unique(
+        ends[:, 0] * len(mesh.points) + ends[:, 1], return_index=True, return_inverse=True
+    )
     straight = mesh.points[ends[np.sort(first)]].mean(axis=1)
     middles = straight if mesh.midpoints is None else mesh.midpoints[number.ravel()[np.sort(first)]]
-    head = f"FiniteElementSpace\nFiniteElementCollection: H1_{mesh.ndim}D_P2\nVDim: {mesh.ndim}\nOrdering: 1\n"
+    head = (
+        f"FiniteElementSpace\nFiniteElementCollection: H1_{mesh.ndim}D_P2\nVDim: "
+        f"{mesh.ndim}\nOrdering: 1\n"
+    )
     return f"\nnodes\n{head}\n{rows(np.concatenate([mesh.points, middles]))}"
 
 
 def _sets(tags_of: dict[str, list[int]]) -> str:
-    """Return the number of sets, then the name, the number of attributes and the attributes of each."""
+    """Return the number of sets, then the name, the number of attributes and the attributes of
+    each.
+    """
     lists = (f'"{name}"\n{len(tags)}\n{blocks(np.array(tags))}' for name, tags in tags_of.items())
     return f"{len(tags_of)}\n" + "".join(lists)

@@ -15,19 +15,27 @@ from tetopt.system.extras import install_hint
 
 
 def mni_path(contrast: Literal["t1", "gm", "wm"]) -> Path:
-    """Return the file of the T1, or of grey or white matter's probability times 255; InputError without nilearn."""
+    """Return the file of the T1, or of grey or white matter's probability times 255; InputError
+    without nilearn.
+    """
     package = importlib.util.find_spec("nilearn")
     name = f"datasets/data/mni_icbm152_{contrast}_tal_nlin_sym_09a_converted.nii.gz"
-    path = Path(package.origin).parent / name if package is not None and package.origin else Path(name)
+    path = (
+        Path(package.origin).parent / name if package is not None and package.origin else Path(name)
+    )
     if not path.is_file():
-        raise InputError(f"the MNI152 brain comes with nilearn: {install_hint('nilearn')}, or give an image")
+        raise InputError(
+            f"the MNI152 brain comes with nilearn: {install_hint('nilearn')}, or give an image"
+        )
     return path
 
 
 def mni_tissue() -> Image:
-    """Return tissue labels of the MNI152 brain: 0 background, 1 CSF and other, 2 grey matter, 3 white matter.
+    """Return tissue labels of the MNI152 brain: 0 background, 1 CSF and other, 2 grey matter, 3
+    white matter.
 
-    Each voxel where the T1 is not 0 gets the most probable of the three; CSF gets the remaining probability.
+    Each voxel where the T1 is not 0 gets the most probable of the three; CSF gets the remaining
+    probability.
 
     Raises
     ------

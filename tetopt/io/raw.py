@@ -47,7 +47,8 @@ class Raw(NamedTuple):
 
 
 def by_corners(raw: Raw) -> Raw:
-    """Rename quadratic cell types to the linear type of their corners; their mid-edge nodes become `middles`, by type.
+    """Rename quadratic cell types to the linear type of their corners; their mid-edge nodes become
+    `middles`, by type.
 
     If a type occurs in both orders, the quadratic one keeps its name.
     """

@@ -1,8 +1,10 @@
-"""Reading of DICOM by pydicom, in a separate process: series of slices, files of many frames, and segmentations.
+"""Reading of DICOM by pydicom, in a separate process: series of slices, files of many frames, and
+segmentations.
 
-A file has one frame or many; each frame states where it lies, itself or by what the file states of all. The frames of
-one volume, of one file or of a whole series, are sorted by position and checked in one place (`_placed`): parallel,
-evenly spaced, one of each position. A segmentation leaves out empty frames, so its slices may be missing.
+A file has one frame or many; each frame states where it lies, itself or by what the file states of
+all. The frames of one volume, of one file or of a whole series, are sorted by position and checked
+in one place (`_placed`): parallel, evenly spaced, one of each position. A segmentation leaves out
+empty frames, so its slices may be missing.
 """
 
 from __future__ import annotations
@@ -30,24 +32,37 @@ from tetopt.system.extras import install_hint
 from tetopt.system.incoming import irregular
 
 DICOM_SUFFIX = ".dcm"
-# Slices may deviate from an even spacing by this fraction of it, because positions are often rounded.
+# Slices may deviate from an even spacing by this fraction of it, because positions are often
+# rounded.
 _UNEVEN_FRACTION = 0.05
 _SAME_PLACE_MM = 1e-3  # slices closer to each other share one position
 _SAME_DIRECTION = 1e-4  # of direction cosines
-# In a folder without DICOM files: subfolders searched, files tried in each, and subfolders listed in the message.
+# In a folder without DICOM files: subfolders searched, files tried in each, and subfolders listed
+# in the message.
 WALKED_FOLDERS, TRIED_FILES, LISTED_FOLDERS = 1000, 3, 8
 # How files without DICOM's mark begin: a tag of group 8, or that group's length.
 FIRST_TAGS = re.compile(rb"\x08\0(\0\0(UL\x04\0|\x04\0\0\0)|[\x01\x05\x08\x12-\x18]\0)")
 LISTED_OVERLAPS = 3  # pairs of segments in a message
 SEGMENT_FRACTION = 0.5  # of a voxel: from this fraction on, it belongs to a segment
 VOXELS = ("PixelData", "FloatPixelData", "DoubleFloatPixelData")
-# Tags by which dimensions order frames in space, or segments; others distinguish volumes, such as echoes.
-SPATIAL_DIMENSIONS = (0x00200032, 0x00200037, 0x00209056, 0x00209057, 0x00209113, 0x00209128, 0x0062000B)
+# Tags by which dimensions order frames in space, or segments; others distinguish volumes, such as
+# echoes.
+SPATIAL_DIMENSIONS = (
+    0x00200032,
+    0x00200037,
+    0x00209056,
+    0x00209057,
+    0x00209113,
+    0x00209128,
+    0x0062000B,
+)
 AXIAL_DIRECTIONS = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)  # of rows and columns that are not stated
-MOST_EMPTY = 10  # empty slices between the frames of a segmentation, for each slice with one; more are reported
+# empty slices between the frames of a segmentation, for each slice with one; more are reported
+MOST_EMPTY = 10
 ALONE = "put the files of one into a separate folder"
 NO_PLACES = (
-    "does not state where its {} frames lie (cine, or an old kind of file); convert it with a program that knows, such "
+    "does not state where its {} frames lie (cine, or an old kind of file); convert it with a "
+    "program that knows, such "
     "as dcm2niix, or export a series of slices"
 )
 
@@ -81,7 +96,8 @@ class Frame(NamedTuple):
     file: DicomFile
     number: int  # among the frames of the file, from 0
     place: tuple[float, ...]  # of its first voxel; empty if unknown
-    axes: tuple[float, ...]  # directions of its rows (along which columns are counted), and of its columns
+    # directions of its rows (along which columns are counted), and of its columns
+    axes: tuple[float, ...]
     pixel: tuple[float, ...]  # between rows, and between columns; empty if unknown
     step: float  # to the next slice; 0 if unknown
     thickness: float  # 0 if unknown
@@ -99,8 +115,12 @@ class FrameGrid(NamedTuple):
     n_slices: int
 
 
-def read_dicom(path: Path, volume: int | None, notes: list[str]) -> tuple[NDArray, NDArray[np.float64]]:
-    """Return data and affine of a file, or of the one series in a folder; InputError without a leading path."""
+def read_dicom(
+    path: Path, volume: int | None, notes: list[str]
+) -> tuple[NDArray, NDArray[np.float64]]:
+    """Return data and affine of a file, or of the one series in a folder; InputError without a
+    leading path.
+    """
     data, affine, words = _read(image_of, path, volume)
     notes += words + notes_of_size(data.shape, affine, np.ones(3))  # DICOM's unit is the mm
     return data, affine
@@ -114,7 +134,9 @@ def read_segments_table(path: Path) -> LabelTable:
 
 
 def frame_of_reference(path: Path) -> str | None:
-    """Return the UID of the frame of reference of a file or a folder's first; None if not DICOM or without one."""
+    """Return the UID of the frame of reference of a file or a folder's first; None if not DICOM
+    or without one.
+    """
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     first = next((file for file in files if file.is_file() and is_dicom(file)), None)
     return None if first is None else _read(frame_of, first)
@@ -122,21 +144,32 @@ def frame_of_reference(path: Path) -> str | None:
 
 def dicom_file(path: Path) -> Path | None:
     """Return the path if it is a DICOM file, or the only one in this folder; otherwise None."""
-    files = [file for file in path.iterdir() if file.is_file()] if path.is_dir() else [path] if path.is_file() else []
+    files = (
+        [file for file in path.iterdir() if file.is_file()]
+        if path.is_dir()
+        else [path]
+        if path.is_file()
+        else []
+    )
     files = [file for file in files if is_dicom(file)]
     return files[0] if len(files) == 1 else None
 
 
 def _read(read: Callable[..., Any], path: Path, *rest: Any) -> Any:
     if importlib.util.find_spec("pydicom") is None:
-        raise InputError(f"DICOM needs pydicom; {install_hint('pydicom', 'python-gdcm')}, or dcm2niix converts it")
+        raise InputError(
+            f"DICOM needs pydicom; {install_hint('pydicom', 'python-gdcm')}, or dcm2niix "
+            "converts it"
+        )
     size = None
     if path.is_dir():
         files = sorted(path.iterdir())
         for file in files:
             other = None if file.is_symlink() and not file.exists() else irregular(file)
             if other not in (None, "a folder"):
-                raise InputError(f"{file.name} is {other}; move it out of the folder of DICOM files")
+                raise InputError(
+                    f"{file.name} is {other}; move it out of the folder of DICOM files"
+                )
         size = sum(file.stat().st_size for file in files if file.is_file())
     return read_apart(read, path, *rest, size=size, library="pydicom")
 
@@ -150,7 +183,9 @@ def image_of(path: str, volume: int | None) -> tuple[NDArray, NDArray[np.float64
     files = _series(Path(path), notes)
     is_segmentation = any(file.is_segmentation for file in files)
     if is_segmentation and len(files) > 1:
-        raise InputError(f"expected one segmentation, got {len(files)} DICOM files of a series with one; {ALONE}")
+        raise InputError(
+            f"expected one segmentation, got {len(files)} DICOM files of a series with one; {ALONE}"
+        )
     for file in files:
         _check_voxels(file, notes)
         _check_bits(file, notes)
@@ -165,14 +200,21 @@ def image_of(path: str, volume: int | None) -> tuple[NDArray, NDArray[np.float64
 
 
 def segments_of(path: str) -> list[tuple[int, str, list[float]]]:
-    """Return number, name and colour of each segment; a name that several segments have gets their numbers."""
+    """Return number, name and colour of each segment; a name that several segments have gets
+    their numbers.
+    """
     rows = []
     for file in _series(Path(path), []):
         for number, segment in _segments(file).items():
             lab = segment.get("RecommendedDisplayCIELabValue")
-            rows.append((number, _name(segment), [] if lab is None else _srgb([int(part) for part in lab])))
+            rows.append(
+                (number, _name(segment), [] if lab is None else _srgb([int(part) for part in lab]))
+            )
     count = Counter(name for _, name, _ in rows)
-    return [(number, name if count[name] == 1 or not name else f"{name} {number}", tone) for number, name, tone in rows]
+    return [
+        (number, name if count[name] == 1 or not name else f"{name} {number}", tone)
+        for number, name, tone in rows
+    ]
 
 
 def frame_of(path: str) -> str | None:
@@ -194,7 +236,8 @@ def _segments(file: DicomFile) -> dict[int, Any]:
         first = segments.setdefault(int(each.SegmentNumber), each)
         if first is not each:
             raise InputError(
-                f'{file.name} has two segments {each.SegmentNumber}, "{_name(first)}" and "{_name(each)}"; export it '
+                f'{file.name} has two segments {each.SegmentNumber}, "{_name(first)}" and '
+                f'"{_name(each)}"; export it '
                 "again"
             )
     return segments
@@ -205,12 +248,17 @@ def _name(segment: Any) -> str:
 
 
 def _srgb(lab: Sequence[int]) -> list[float]:
-    """Convert DICOM's CIELAB, 16 bits a part, to sRGB, 0 to 1; white is D65's, as in the programs that write it."""
+    """Convert DICOM's CIELAB, 16 bits a part, to sRGB, 0 to 1; white is D65's, as in the
+    programs that write it.
+    """
     lightness, a, b = np.array(lab) / 65535.0 * [100.0, 255.0, 255.0] - [0.0, 128.0, 128.0]
     y = (lightness + 16.0) / 116.0
     f = np.array([y + a / 500.0, y, y - b / 200.0])
     xyz = np.where(f > 6.0 / 29.0, f**3, (f - 4.0 / 29.0) * 108.0 / 841.0) * [0.95047, 1.0, 1.08883]
-    linear = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]]) @ xyz
+    linear = (
+        np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
+        @ xyz
+    )
     gamma = 1.055 * np.maximum(linear, 0.0) ** (1.0 / 2.4) - 0.055
     return np.clip(np.where(linear > 0.0031308, gamma, 12.92 * linear), 0.0, 1.0).tolist()
 
@@ -228,7 +276,9 @@ def _series(path: Path, notes: list[str]) -> list[DicomFile]:
             raise InputError(f"{file.name} {words}")
         return [file]
     series: dict[str, list[DicomFile]] = {}
-    for each in sorted(file for file in path.iterdir() if file.is_file() and file.name.upper() != "DICOMDIR"):
+    for each in sorted(
+        file for file in path.iterdir() if file.is_file() and file.name.upper() != "DICOMDIR"
+    ):
         file = _opened(each, f"the DICOM file {each.name}") if is_dicom(each) else None
         if file is None:
             continue
@@ -240,13 +290,21 @@ def _series(path: Path, notes: list[str]) -> list[DicomFile]:
         series.setdefault(str(file.tags.get("SeriesInstanceUID", "")), []).append(file)
     if not series:
         folders = islice(_dicom_folders(path), LISTED_FOLDERS)
-        if below := ", ".join(f"{folder.relative_to(path)} ({count} files)" for folder, count in folders):
-            raise InputError(f"no DICOM series in this folder itself; choose one of its subfolders: {below}")
+        if below := ", ".join(
+            f"{folder.relative_to(path)} ({count} files)" for folder, count in folders
+        ):
+            raise InputError(
+                f"no DICOM series in this folder itself; choose one of its subfolders: {below}"
+            )
         skipped = f" ({notes[0]})" if notes else ""
-        raise InputError(f"no DICOM series in this folder or its subfolders{skipped}; check the path")
+        raise InputError(
+            f"no DICOM series in this folder or its subfolders{skipped}; check the path"
+        )
     if len(series) > 1:
         listed = ", ".join(f"{uid} ({len(files)} files)" for uid, files in series.items())
-        raise InputError(f"expected one DICOM series, got {len(series)}; put one into its own folder: {listed}")
+        raise InputError(
+            f"expected one DICOM series, got {len(series)}; put one into its own folder: {listed}"
+        )
     return next(iter(series.values()))
 
 
@@ -260,7 +318,9 @@ def _dicom_folders(path: Path) -> Iterator[tuple[Path, int]]:
 
 
 def is_dicom(path: Path) -> bool:
-    """Return whether the file has DICOM's mark after 128 bytes, or begins with a first tag, as older files do."""
+    """Return whether the file has DICOM's mark after 128 bytes, or begins with a first tag, as
+    older files do.
+    """
     with path.open("rb") as stream:
         head = stream.read(132)
     return head[128:] == b"DICM" or FIRST_TAGS.match(head) is not None
@@ -272,13 +332,22 @@ def _opened(path: Path, name: str) -> DicomFile | None:
 
     with _errors_of(name):
         tags = pydicom.dcmread(path, force=True)
-        if "SOPClassUID" not in tags and "Rows" not in tags and "DirectoryRecordSequence" not in tags:
+        if (
+            "SOPClassUID" not in tags
+            and "Rows" not in tags
+            and "DirectoryRecordSequence" not in tags
+        ):
             if tags.preamble is None:
                 return None
             raise InputError(f"{name} is truncated or damaged; copy it again")
-        if "TransferSyntaxUID" not in tags.file_meta:  # an older file, or one without its first part
+        # an older file, or one without its first part
+        if "TransferSyntaxUID" not in tags.file_meta:
             is_implicit, _ = tags.original_encoding
-            plain = pydicom.uid.ImplicitVRLittleEndian if is_implicit else pydicom.uid.ExplicitVRLittleEndian
+            plain = (
+                pydicom.uid.ImplicitVRLittleEndian
+                if is_implicit
+                else pydicom.uid.ExplicitVRLittleEndian
+            )
             tags.file_meta.TransferSyntaxUID = plain
         return DicomFile(name, tags)
 
@@ -306,7 +375,10 @@ def _no_voxels(file: DicomFile) -> str:
         return "has no pixel data; copy or export it again"
     kind = getattr(tags.get("SOPClassUID"), "name", "DICOM object")
     if "ROIContourSequence" in tags:
-        return f"is of the kind {kind}: contours, no voxels; convert them to a label image, as 3D Slicer can"
+        return (
+            f"is of the kind {kind}: contours, no voxels; convert them to a label image, as "
+            "3D Slicer can"
+        )
     return f"is of the kind {kind}, without voxels; give the images themselves"
 
 
@@ -317,12 +389,16 @@ def _check_voxels(file: DicomFile, notes: list[str]) -> None:
     tags = file.tags
     with _errors_of(file.name):
         if (count := int(tags.get("SamplesPerPixel") or 1)) > 1:
-            raise InputError(f"{file.name} has {count} numbers per voxel (RGB or vectors); convert it to grey first")
+            raise InputError(
+                f"{file.name} has {count} numbers per voxel (RGB or vectors); convert it to grey "
+                "first"
+            )
         if tags.get("PhotometricInterpretation") == "PALETTE COLOR" and not file.is_segmentation:
             raise InputError(f"{file.name} has colours from a palette; convert it to grey first")
         if "MOSAIC" in (tags.get("ImageType") or ()):
             raise InputError(
-                f"{file.name} is a mosaic: its slices lie side by side in one picture; dcm2niix converts it"
+                f"{file.name} is a mosaic: its slices lie side by side in one picture; dcm2niix "
+                "converts it"
             )
         syntax = tags.file_meta.TransferSyntaxUID
         try:
@@ -331,7 +407,9 @@ def _check_voxels(file: DicomFile, notes: list[str]) -> None:
             is_known = False
         if not is_known:
             hint = f"{install_hint('python-gdcm')}, or decompress it with gdcmconv or dcmdjpeg"
-            raise InputError(f"{file.name} is compressed as {syntax.name}, which cannot be decoded here; {hint}")
+            raise InputError(
+                f"{file.name} is compressed as {syntax.name}, which cannot be decoded here; {hint}"
+            )
         n_bytes = max(len(tags[keyword].value) for keyword in VOXELS if keyword in tags)
         columns, rows = file.size
         least = (
@@ -341,27 +419,36 @@ def _check_voxels(file: DicomFile, notes: list[str]) -> None:
         )
         if not min(columns, rows, n_bytes) > 0 or least > n_bytes:
             raise InputError(
-                f"{file.name} is truncated or damaged: its header declares {file.n_frames} x {rows} x {columns} "
+                f"{file.name} is truncated or damaged: its header declares {file.n_frames} x "
+                f"{rows} x {columns} "
                 f"voxels, at least {least:.4g} bytes, but it has {n_bytes}; copy it again"
             )
         words = (
-            "more bytes of voxels than its header declares: the rest is ignored; check Rows, Columns, NumberOfFrames"
+            "more bytes of voxels than its header declares: the rest is ignored; check "
+            "Rows, Columns, NumberOfFrames"
         )
-        if not syntax.is_compressed and n_bytes > least + 2 and words not in notes:  # one or two may be padding
+        # one or two may be padding
+        if not syntax.is_compressed and n_bytes > least + 2 and words not in notes:
             notes.append(words)
 
 
 def _check_bits(file: DicomFile, notes: list[str]) -> None:
-    """Raise InputError unless the highest bit of values fits their number of bits; note lower bits that are left."""
+    """Raise InputError unless the highest bit of values fits their number of bits; note lower
+    bits that are left.
+    """
     with _errors_of(file.name):
         low, tags = _low_bits(file), file.tags
         is_compressed = tags.file_meta.TransferSyntaxUID.is_compressed
         if low < 0 or (low and (is_compressed or int(tags.HighBit) >= int(tags.BitsAllocated))):
             raise InputError(
-                f"{file.name} states BitsAllocated {tags.BitsAllocated}, BitsStored {tags.BitsStored} and HighBit "
+                f"{file.name} states BitsAllocated {tags.BitsAllocated}, BitsStored "
+                f"{tags.BitsStored} and HighBit "
                 f"{tags.HighBit}, which contradict each other; export it again"
             )
-        words = f"its HighBit is {tags.get('HighBit')}: the lowest {low} bits of its values are left out"
+        words = (
+            f"its HighBit is {tags.get('HighBit')}: the lowest {low} bits of its values are "
+            "left out"
+        )
         if low and words not in notes:
             notes.append(words)
 
@@ -374,7 +461,8 @@ def _check_sizes(files: list[DicomFile]) -> None:
         if file.size != most:
             here, there = ("{} x {}".format(*size) for size in (file.size, most))
             raise InputError(
-                f"{file.name} has {here} pixels, and {count} others of its series have {there} (is it a localizer?); "
+                f"{file.name} has {here} pixels, and {count} others of its series have {there} "
+                "(is it a localizer?); "
                 "move it out of the folder"
             )
 
@@ -388,7 +476,8 @@ def _check_world(files: list[DicomFile]) -> None:
     if len(stated) > 1:
         (one, first), (other, second) = list(stated.items())[:2]
         raise InputError(
-            f"{second.name} and {first.name} have different frames of reference ({other} and {one}): the patient was "
+            f"{second.name} and {first.name} have different frames of reference ({other} and "
+            f"{one}): the patient was "
             "moved between them; put the slices of one into a separate folder"
         )
 
@@ -403,11 +492,17 @@ def _frames(file: DicomFile, notes: list[str]) -> list[Frame]:
         shared = (tags.get("SharedFunctionalGroupsSequence") or [{}])[0]
         own = tags.get("PerFrameFunctionalGroupsSequence") or []
         if own and len(own) != n:
-            raise InputError(f"{file.name} has {n} frames, but states where {len(own)} lie; export it again")
+            raise InputError(
+                f"{file.name} has {n} frames, but states where {len(own)} lie; export it again"
+            )
         is_plain = not own and n > 1
         places = _stacked(file, notes) if is_plain and not file.is_segmentation else None
         frames = [_frame(file, k, (own[k] if own else {}, shared)) for k in range(n)]
-        return frames if places is None else [f._replace(place=p) for f, p in zip(frames, places, strict=True)]
+        return (
+            frames
+            if places is None
+            else [f._replace(place=p) for f, p in zip(frames, places, strict=True)]
+        )
 
 
 def _frame(file: DicomFile, index: int, groups: tuple[Any, ...]) -> Frame:
@@ -432,42 +527,61 @@ def _frame(file: DicomFile, index: int, groups: tuple[Any, ...]) -> Frame:
     content = "FrameContentSequence"
     indices = stated("DimensionIndexValues", content, ())
     indices = [int(value) for value in (indices if np.iterable(indices) else [indices])]
-    dimensions = [int(each.DimensionIndexPointer) for each in tags.get("DimensionIndexSequence") or ()]
+    dimensions = [
+        int(each.DimensionIndexPointer) for each in tags.get("DimensionIndexSequence") or ()
+    ]
     pairs = zip(dimensions, indices, strict=True) if len(dimensions) == len(indices) else ()
     slope = (numbers("RescaleSlope", "PixelValueTransformationSequence", 1) or (1.0,))[0]
     if "DoseGridScaling" in tags:
         slope = float(tags.DoseGridScaling)
     return Frame(
-        name, file, index,
+        name,
+        file,
+        index,
         place=numbers("ImagePositionPatient", "PlanePositionSequence", 3),
         axes=numbers("ImageOrientationPatient", "PlaneOrientationSequence", 6),
         pixel=pixel,
         step=(numbers("SpacingBetweenSlices", "PixelMeasuresSequence", 1) or (0.0,))[0],
         thickness=(numbers("SliceThickness", "PixelMeasuresSequence", 1) or (0.0,))[0],
-        scale=(slope, (numbers("RescaleIntercept", "PixelValueTransformationSequence", 1) or (0.0,))[0]),
-        volume=(str(stated("StackID", content, "")), int(stated("TemporalPositionIndex", content, 0))),
+        scale=(
+            slope,
+            (numbers("RescaleIntercept", "PixelValueTransformationSequence", 1) or (0.0,))[0],
+        ),
+        volume=(
+            str(stated("StackID", content, "")),
+            int(stated("TemporalPositionIndex", content, 0)),
+        ),
         others=tuple(value for tag, value in pairs if tag not in SPATIAL_DIMENSIONS),
         segment=int(stated("ReferencedSegmentNumber", "SegmentIdentificationSequence", 0)),
-    )  # fmt: skip
+    )
 
 
 def _numbers(name: str, keyword: str, source: Callable[[], Any], count: int) -> tuple[float, ...]:
-    """Return the numbers of a tag, none if it is missing; pydicom converts their texts only when asked."""
+    """Return the numbers of a tag, none if it is missing; pydicom converts their texts only when
+    asked.
+    """
     try:
         value = source()
         if value is None or value == "":
             return ()
-        numbers = [float(each) for each in (value if np.iterable(value) and not isinstance(value, str) else [value])]
+        numbers = [
+            float(each)
+            for each in (value if np.iterable(value) and not isinstance(value, str) else [value])
+        ]
     except (ValueError, TypeError, OverflowError):
         numbers = []
     if len(numbers) != count or not np.isfinite(numbers).all():
         plural = "s" * (count > 1)
-        raise InputError(f"{name}: expected {count} finite number{plural} for its {keyword}; export it again")
+        raise InputError(
+            f"{name}: expected {count} finite number{plural} for its {keyword}; export it again"
+        )
     return tuple(numbers)
 
 
 def _stacked(file: DicomFile, notes: list[str]) -> list[tuple[float, ...]]:
-    """Return the places of frames without functional groups, where the file states a distance between them."""
+    """Return the places of frames without functional groups, where the file states a distance
+    between them.
+    """
     tags, n = file.tags, file.n_frames
     detectors = tags.get("DetectorInformationSequence") or []
     for each in detectors if len(detectors) == 1 else ():  # nuclear medicine
@@ -475,29 +589,49 @@ def _stacked(file: DicomFile, notes: list[str]) -> list[tuple[float, ...]]:
             if keyword in each and keyword not in tags:
                 tags[keyword] = each[keyword]
     first = _frame(file, 0, ())
-    offsets = _numbers(file.name, "GridFrameOffsetVector", lambda: tags.get("GridFrameOffsetVector"), n)
+    offsets = _numbers(
+        file.name, "GridFrameOffsetVector", lambda: tags.get("GridFrameOffsetVector"), n
+    )
     pointer = tags.get("FrameIncrementPointer")
-    pointers = [int(each) for each in (pointer if np.iterable(pointer) else [pointer])] if pointer is not None else []
-    is_of_slices = not pointers or pointers == [0x00540080]  # slices, and not times, angles, phases or energies
+    pointers = (
+        [int(each) for each in (pointer if np.iterable(pointer) else [pointer])]
+        if pointer is not None
+        else []
+    )
+    # slices, and not times, angles, phases or energies
+    is_of_slices = not pointers or pointers == [0x00540080]
     if not first.place or not first.axes or not (offsets or (first.step and is_of_slices)):
         raise InputError(f"{file.name} {NO_PLACES.format(n)}")
     along = np.cross(first.axes[:3], first.axes[3:])
     if not offsets:
         notes.append(
-            f"its frames are put {first.step:.4g} mm apart along the slices' normal, as SpacingBetweenSlices states"
+            f"its frames are put {first.step:.4g} mm apart along the slices' normal, as "
+            "SpacingBetweenSlices states"
         )
-        order = _numbers(file.name, "SliceVector", lambda: tags.get("SliceVector"), n) or range(1, n + 1)
+        order = _numbers(file.name, "SliceVector", lambda: tags.get("SliceVector"), n) or range(
+            1, n + 1
+        )
         offsets = tuple(first.step * (float(k) - 1.0) for k in order)
     elif offsets[0] != 0.0:  # they are places along the patient's axis
-        if abs(along[2]) < 1.0 - _SAME_DIRECTION or abs(offsets[0] - first.place[2]) > _SAME_PLACE_MM:
-            raise InputError(f"{file.name} has a GridFrameOffsetVector that is not of its position; export it again")
+        if (
+            abs(along[2]) < 1.0 - _SAME_DIRECTION
+            or abs(offsets[0] - first.place[2]) > _SAME_PLACE_MM
+        ):
+            raise InputError(
+                f"{file.name} has a GridFrameOffsetVector that is not of its position; export it "
+                "again"
+            )
         along, offsets = np.array([0.0, 0.0, 1.0]), tuple(each - offsets[0] for each in offsets)
     return [tuple((np.array(first.place) + each * along).tolist()) for each in offsets]
 
 
 def _one_volume(frames: list[Frame], volume: int | None) -> list[Frame]:
-    """Return the frames of one volume: of one stack and time, and of one echo or the like where frames repeat."""
-    is_repeated = len({(frame.volume, frame.place, frame.segment) for frame in frames}) < len(frames)
+    """Return the frames of one volume: of one stack and time, and of one echo or the like where
+    frames repeat.
+    """
+    is_repeated = len({(frame.volume, frame.place, frame.segment) for frame in frames}) < len(
+        frames
+    )
     keys = [(*frame.volume, frame.others if is_repeated else ()) for frame in frames]
     volumes = sorted(set(keys))
     (chosen,) = volume_index((len(volumes),), volume)
@@ -508,34 +642,48 @@ def _one_volume(frames: list[Frame], volume: int | None) -> list[Frame]:
 
 
 def _placed(frames: list[Frame], notes: list[str], *, is_sparse: bool) -> FrameGrid:
-    """Return the grid of frames from their own positions; raise InputError unless they are those of a volume.
+    """Return the grid of frames from their own positions; raise InputError unless they are those of
+    a volume.
 
-    The slice axis is that of the positions, not orthogonal to the others in a tilted gantry. With `is_sparse`, frames
-    may share a slice, and slices may have none.
+    The slice axis is that of the positions, not orthogonal to the others in a tilted gantry. With
+    `is_sparse`, frames may share a slice, and slices may have none.
     """
     first = frames[0]
     axes = np.array(first.axes or AXIAL_DIRECTIONS).reshape(2, 3)
     if not np.allclose(axes @ axes.T, np.eye(2), rtol=0.0, atol=0.02):
-        raise InputError(f"{first.name}: expected the directions of its axes to be orthogonal, got {first.axes}")
+        raise InputError(
+            f"{first.name}: expected the directions of its axes to be orthogonal, got {first.axes}"
+        )
     for frame in frames[1:]:
         if len(frame.axes) != len(first.axes) or not np.allclose(
             frame.axes, first.axes, rtol=0.0, atol=_SAME_DIRECTION
         ):
             raise InputError(
-                f"the DICOM slices are not parallel (a localizer?): {frame.name} and {first.name} have different "
+                f"the DICOM slices are not parallel (a localizer?): {frame.name} and "
+                f"{first.name} have different "
                 "directions; choose another series"
             )
-        if len(frame.pixel) != len(first.pixel) or not np.allclose(frame.pixel, first.pixel, rtol=1e-3, atol=0.0):
-            raise InputError(f"{frame.name} and {first.name} have pixels of different sizes; choose another series")
+        if len(frame.pixel) != len(first.pixel) or not np.allclose(
+            frame.pixel, first.pixel, rtol=1e-3, atol=0.0
+        ):
+            raise InputError(
+                f"{frame.name} and {first.name} have pixels of different sizes; choose another "
+                "series"
+            )
     if not first.pixel:
         notes.append("states no size of pixels: 1 mm is assumed")
     between_rows, between_columns = first.pixel or (1.0, 1.0)
     if min(between_rows, between_columns) <= 0.0:
-        raise InputError(f"{first.name}: expected pixels larger than 0, got {between_rows:g} x {between_columns:g} mm")
+        raise InputError(
+            f"{first.name}: expected pixels larger than 0, got {between_rows:g} x "
+            f"{between_columns:g} mm"
+        )
     axes /= np.linalg.norm(axes, axis=1)[:, None]
     if unplaced := next((frame for frame in frames if not frame.place), None):
         if len(frames) > 1:
-            raise InputError(f"{unplaced.name} does not state where it lies; convert or export the series again")
+            raise InputError(
+                f"{unplaced.name} does not state where it lies; convert or export the series again"
+            )
         notes.append("states no position: its first voxel is put at the world's origin")
     points = np.array([frame.place or (0.0, 0.0, 0.0) for frame in frames])
     normal = np.cross(*axes)
@@ -559,7 +707,9 @@ def _ranks(points: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[
 def _even(
     points: NDArray[np.float64], normal: NDArray[np.float64], frames: list[Frame], notes: list[str]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the step between slices, and each one's rank; InputError unless each has a place, evenly spaced."""
+    """Return the step between slices, and each one's rank; InputError unless each has a place,
+    evenly spaced.
+    """
     n, ranks = len(points), _ranks(points, normal)
     if n == 1:
         return normal * _thickness(frames[0], notes), ranks
@@ -571,15 +721,18 @@ def _even(
         elif all(frame.file.n_frames == n_places for frame in frames):
             remedy = "give one of its files, or "
         raise InputError(
-            f"the {n} slices of this DICOM series have {n_places} position{'s' * (n_places > 1)}: it has "
-            f"several volumes (times, echoes or repeats); {remedy}convert it to a 4-D NIfTI file (dcm2niix)"
+            f"the {n} slices of this DICOM series have {n_places} "
+            f"position{'s' * (n_places > 1)}: it has "
+            f"several volumes (times, echoes or repeats); {remedy}convert it to a 4-D NIfTI file "
+            "(dcm2niix)"
         )
     points = points[np.argsort(ranks)]
     step = (points[-1] - points[0]) / (n - 1)
     off = np.linalg.norm(points - points[0] - np.arange(n)[:, None] * step, axis=1)
     if off.max() > _UNEVEN_FRACTION * np.linalg.norm(step):
         raise InputError(
-            f"the DICOM slices are not evenly spaced ({_unevenness(points, off)}); export the series again, or "
+            f"the DICOM slices are not evenly spaced ({_unevenness(points, off)}); export the "
+            "series again, or "
             "resample it to NIfTI"
         )
     _check_step(step, normal, frames, notes)
@@ -589,7 +742,8 @@ def _even(
 def _sparse(
     points: NDArray[np.float64], normal: NDArray[np.float64], frames: list[Frame], notes: list[str]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the step between slices, and each frame's slice; InputError unless all lie at multiples of the step.
+    """Return the step between slices, and each frame's slice; InputError unless all lie at
+    multiples of the step.
 
     The step is the one stated if the places fit it, and otherwise the smallest between two places.
     """
@@ -608,17 +762,20 @@ def _sparse(
             _check_step(step, normal, frames, notes)
             if np.diff(slices).min() > 1:
                 notes.append(
-                    f"its slices are {length:.4g} mm apart as it states, but its frames {np.diff(along).min():.4g} mm "
+                    f"its slices are {length:.4g} mm apart as it states, but its frames "
+                    f"{np.diff(along).min():.4g} mm "
                     "or more: those between are empty"
                 )
             elif (n_empty := int(slices[-1]) + 1 - len(slices)) > MOST_EMPTY * len(slices):
                 notes.append(
-                    f"its frames lie in {len(slices)} slices, far apart: {n_empty} slices between them are empty; "
+                    f"its frames lie in {len(slices)} slices, far apart: {n_empty} slices "
+                    "between them are empty; "
                     "check that they are of one scan"
                 )
             return step, slices.astype(np.int64)[ranks]
     raise InputError(
-        f"the frames of this segmentation are not at multiples of one distance ({_unevenness(places, off)}); export "
+        "the frames of this segmentation are not at multiples of one distance "
+        f"({_unevenness(places, off)}); export "
         "it again, or resample it to NIfTI"
     )
 
@@ -632,36 +789,52 @@ def _thickness(frame: Frame, notes: list[str]) -> float:
     return length
 
 
-def _check_step(step: NDArray[np.float64], normal: NDArray[np.float64], frames: list[Frame], notes: list[str]) -> None:
+def _check_step(
+    step: NDArray[np.float64], normal: NDArray[np.float64], frames: list[Frame], notes: list[str]
+) -> None:
     """Raise InputError for slices beside each other; note a step other than the one stated."""
     across = float(step @ normal)
     if across <= _SAME_PLACE_MM:
-        raise InputError("the DICOM slices lie beside each other, not above each other; choose another series")
+        raise InputError(
+            "the DICOM slices lie beside each other, not above each other; choose another series"
+        )
     lengths, stated = (across, float(np.linalg.norm(step))), abs(frames[0].step)
     if stated and all(abs(length / stated - 1.0) > _UNEVEN_FRACTION for length in lengths):
         notes.append(
-            f"its slices lie {lengths[1]:.4g} mm apart by their positions, which are used; SpacingBetweenSlices is "
+            f"its slices lie {lengths[1]:.4g} mm apart by their positions, which are used; "
+            "SpacingBetweenSlices is "
             f"{stated:.4g} mm"
         )
     thickness = frames[0].thickness
-    if frames[0].file.is_segmentation and not stated and 0.0 < thickness * (1.0 + _UNEVEN_FRACTION) < lengths[0]:
+    if (
+        frames[0].file.is_segmentation
+        and not stated
+        and 0.0 < thickness * (1.0 + _UNEVEN_FRACTION) < lengths[0]
+    ):
         notes.append(
-            f"its slices lie {lengths[1]:.4g} mm apart by their positions, which are used; SliceThickness is "
+            f"its slices lie {lengths[1]:.4g} mm apart by their positions, which are used; "
+            "SliceThickness is "
             f"{thickness:.4g} mm, so slices between them may be missing"
         )
 
 
 def _unevenness(points: NDArray[np.float64], off: NDArray[np.float64]) -> str:
-    """Describe where slices at `points`, (n, 3), mm, are uneven: an unusual step, or else the largest `off` (n,)."""
+    """Describe where slices at `points`, (n, 3), mm, are uneven: an unusual step, or else the
+    largest `off` (n,).
+    """
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     usual = float(np.median(steps))
     is_other = np.abs(steps - usual) > _UNEVEN_FRACTION * usual
     if not is_other.any():
-        return f"slice {off.argmax()}, counted from 0, is {off.max():.3g} mm off its even place between first and last"
+        return (
+            f"slice {off.argmax()}, counted from 0, is {off.max():.3g} mm off its even place "
+            "between first and last"
+        )
     k = int(np.abs(steps - usual).argmax())
     where = "elsewhere" if is_other.sum() == 1 else "at most places"
     return (
-        f"a step of {steps[k]:.3g} mm between slices {k} and {k + 1}, counted from 0, and {usual:.3g} mm {where}: "
+        f"a step of {steps[k]:.3g} mm between slices {k} and {k + 1}, counted from 0, and "
+        f"{usual:.3g} mm {where}: "
         "one is missing, or several volumes are mixed"
     )
 
@@ -674,7 +847,10 @@ def _planes(frames: list[Frame]) -> Iterator[NDArray]:
     from pydicom.pixels import iter_pixels
 
     file, indices = frames[0].file, [frame.number for frame in frames]
-    if int(file.tags.BitsAllocated) == 1 and not file.tags.file_meta.TransferSyntaxUID.is_compressed:
+    if (
+        int(file.tags.BitsAllocated) == 1
+        and not file.tags.file_meta.TransferSyntaxUID.is_compressed
+    ):
         yield from _unpacked(file, indices)
         return
     if low := _low_bits(file):  # pydicom takes the highest bit to be that of the number of bits
@@ -687,11 +863,16 @@ def _planes(frames: list[Frame]) -> Iterator[NDArray]:
             yield plane >> low if low else plane
             count += 1
     if count < len(frames):
-        raise InputError(f"{file.name} is truncated or damaged: {count} of its frames are complete; copy it again")
+        raise InputError(
+            f"{file.name} is truncated or damaged: {count} of its frames are complete; copy it "
+            "again"
+        )
 
 
 def _unpacked(file: DicomFile, indices: list[int]) -> Iterator[NDArray]:
-    """Yield frames of single bits, which follow each other without padding; pydicom reads bytes too few for some."""
+    """Yield frames of single bits, which follow each other without padding; pydicom reads bytes
+    too few for some.
+    """
     columns, rows = file.size
     packed, size = np.frombuffer(file.tags.PixelData, np.uint8), rows * columns
     for index in indices:
@@ -703,14 +884,25 @@ def _unpacked(file: DicomFile, indices: list[int]) -> Iterator[NDArray]:
 def _low_bits(file: DicomFile) -> int:
     """Return the number of bits below the values."""
     tags = file.tags
-    return int(tags.HighBit) + 1 - int(tags.BitsStored) if "HighBit" in tags and "BitsStored" in tags else 0
+    return (
+        int(tags.HighBit) + 1 - int(tags.BitsStored)
+        if "HighBit" in tags and "BitsStored" in tags
+        else 0
+    )
 
 
-def _rescaled(frames: list[Frame], grid: FrameGrid, shape: tuple[int, int, int], notes: list[str]) -> NDArray:
+def _rescaled(
+    frames: list[Frame], grid: FrameGrid, shape: tuple[int, int, int], notes: list[str]
+) -> NDArray:
     """Return the values of frames, each rescaled as it states."""
     if any("ModalityLUTSequence" in frame.file.tags for frame in frames):
-        notes.append("its values are as stored: its table of values (ModalityLUTSequence) is not applied")
-    scales, bits = {frame.scale for frame in frames}, max(int(frame.file.tags.BitsAllocated) for frame in frames)
+        notes.append(
+            "its values are as stored: its table of values (ModalityLUTSequence) is not applied"
+        )
+    scales, bits = (
+        {frame.scale for frame in frames},
+        max(int(frame.file.tags.BitsAllocated) for frame in frames),
+    )
     data = np.empty(shape, dtype=exact_type(bits, scales))
     slices = dict(zip(map(id, frames), grid.slices.tolist(), strict=True))
     of_file: dict[int, list[Frame]] = {}
@@ -722,15 +914,21 @@ def _rescaled(frames: list[Frame], grid: FrameGrid, shape: tuple[int, int, int],
     return data
 
 
-def _segmented(frames: list[Frame], grid: FrameGrid, shape: tuple[int, int, int], notes: list[str]) -> NDArray:
-    """Return the segments' numbers; where segments overlap, the larger number, or the larger fraction."""
+def _segmented(
+    frames: list[Frame], grid: FrameGrid, shape: tuple[int, int, int], notes: list[str]
+) -> NDArray:
+    """Return the segments' numbers; where segments overlap, the larger number, or the larger
+    fraction.
+    """
     tags = frames[0].file.tags
     order = np.lexsort([np.array([frame.segment for frame in frames]), grid.slices])
     frames, slices = [frames[k] for k in order], grid.slices[order]
     names = {number: _name(each) for number, each in _segments(frames[0].file).items()}
     for one, other, k, before in zip(frames[1:], frames, slices[1:], slices, strict=False):
         if (one.segment, k) == (other.segment, before):
-            raise InputError(f"{one.name} and {other.name} have one segment and position; export it again")
+            raise InputError(
+                f"{one.name} and {other.name} have one segment and position; export it again"
+            )
     data = np.zeros(shape, dtype=np.uint16)
     if tags.get("SegmentationType") == "LABELMAP":
         for k, plane in zip(slices, _planes(frames), strict=True):
@@ -742,23 +940,42 @@ def _segmented(frames: list[Frame], grid: FrameGrid, shape: tuple[int, int, int]
     whole = 1
     if tags.get("SegmentationType") == "FRACTIONAL":
         whole = int(tags.MaximumFractionalValue)
-        notes.append(f"its segments are fractions: voxels belong to the largest, if it is {SEGMENT_FRACTION:g} or more")
+        notes.append(
+            "its segments are fractions: voxels belong to the largest, if it is "
+            f"{SEGMENT_FRACTION:g} or more"
+        )
     return _labelled(frames, slices, data, whole, names, notes)
 
 
 def _clear(data: NDArray, outside: set[int], names: dict[int, str], notes: list[str]) -> None:
-    """Set voxels `outside` of all segments to 0, and those of other values without a segment, which are noted."""
+    """Set voxels `outside` of all segments to 0, and those of other values without a segment,
+    which are noted.
+    """
     values, counts = np.unique(data, return_counts=True)
-    unknown = {k: n for k, n in zip(values.tolist(), counts.tolist(), strict=True) if k not in outside | names.keys()}
+    unknown = {
+        k: n
+        for k, n in zip(values.tolist(), counts.tolist(), strict=True)
+        if k not in outside | names.keys()
+    }
     if unknown:
-        notes.append(f"{sum(unknown.values())} voxels have values of no segment ({list(unknown)[:8]}) and get label 0")
+        notes.append(
+            f"{sum(unknown.values())} voxels have values of no segment ({list(unknown)[:8]}) and "
+            "get label 0"
+        )
     data[np.isin(data, [*outside, *unknown])] = 0
 
 
 def _labelled(
-    frames: list[Frame], slices: NDArray[np.int64], data: NDArray, whole: int, names: dict[int, str], notes: list[str]
-) -> NDArray:  # fmt: skip
-    """Write numbers of segments to `data`, for frames in the order of slices and segments; note overlaps."""
+    frames: list[Frame],
+    slices: NDArray[np.int64],
+    data: NDArray,
+    whole: int,
+    names: dict[int, str],
+    notes: list[str],
+) -> NDArray:
+    """Write numbers of segments to `data`, for frames in the order of slices and segments; note
+    overlaps.
+    """
     overlaps: Counter[tuple[int, int]] = Counter()
     planes = _planes(frames)
     for k in np.unique(slices):
@@ -769,13 +986,19 @@ def _labelled(
         data[k] = np.where(is_in.any(axis=0), np.array(those)[largest], 0)
         is_several = is_in[:, is_in.sum(axis=0) > 1].astype(np.int64)
         shared = is_several @ is_several.T
-        overlaps.update({(those[i], those[j]): int(shared[i, j]) for i, j in np.argwhere(np.triu(shared, 1))})
+        overlaps.update(
+            {(those[i], those[j]): int(shared[i, j]) for i, j in np.argwhere(np.triu(shared, 1))}
+        )
     if overlaps:
         text = "; ".join(
             f"{a} ({names[a]}) and {b} ({names[b]}) in {count} voxels"
             for (a, b), count in overlaps.most_common(LISTED_OVERLAPS)
         )
-        more = f"; and {len(overlaps) - LISTED_OVERLAPS} more pairs" if len(overlaps) > LISTED_OVERLAPS else ""
+        more = (
+            f"; and {len(overlaps) - LISTED_OVERLAPS} more pairs"
+            if len(overlaps) > LISTED_OVERLAPS
+            else ""
+        )
         kept = "larger number" if whole == 1 else "larger fraction, or number"
         notes.append(f"segments overlap, and the {kept} is kept: {text}{more}")
     return data

@@ -29,7 +29,8 @@ DEFAULT_LABELS = {1: "edge", 2: "surface", 3: "volume"}
 
 
 def read_msh(path: Path) -> Raw:
-    """Read a gmsh file through meshio, in a child with limits, as it allocates the sizes in a header.
+    """Read a gmsh file through meshio, in a child with limits, as it allocates the sizes in a
+    header.
 
     All its errors become InputErrors, without a leading path.
     """
@@ -55,17 +56,24 @@ def _fields_of(path: str) -> dict[str, Any]:
 def _msh(file: meshio.Mesh, text: bytes) -> Raw:
     """Convert a file as read by meshio, and add groups that meshio loses."""
     kinds = list(dict.fromkeys(block.type for block in file.cells))
-    of_kind = {kind: [k for k, block in enumerate(file.cells) if block.type == kind] for kind in kinds}
+    of_kind = {
+        kind: [k for k, block in enumerate(file.cells) if block.type == kind] for kind in kinds
+    }
     cells = {
-        kind: np.concatenate([file.cells[k].data for k in blocks]).astype(np.int64) for kind, blocks in of_kind.items()
+        kind: np.concatenate([file.cells[k].data for k in blocks]).astype(np.int64)
+        for kind, blocks in of_kind.items()
     }
     cell_data = {
-        name: {kind: np.concatenate([values[k] for k in blocks]) for kind, blocks in of_kind.items()}
+        name: {
+            kind: np.concatenate([values[k] for k in blocks]) for kind, blocks in of_kind.items()
+        }
         for name, values in file.cell_data.items()
     }
     points = np.zeros((len(file.points), 3))
     points[:, : file.points.shape[1]] = file.points
-    point_data = {name: values for name, values in file.point_data.items() if not name.startswith("gmsh:")}
+    point_data = {
+        name: values for name, values in file.point_data.items() if not name.startswith("gmsh:")
+    }
     raw = by_corners(Raw(points, cells, cell_data, point_data, {}, [], "ras"))
     groups = _groups(raw.cells, raw.cell_data, _physical_names(text), _groups_of_entities(text))
     comments = own_comments(_section(text, "Comments").decode("utf-8", "replace").splitlines())
@@ -76,7 +84,8 @@ def _msh(file: meshio.Mesh, text: bytes) -> Raw:
 def _labelled(raw: Raw, comments: OwnComments | None) -> Raw:
     """Use the numbers and names of groups as labels of cells, if each cell is in one group.
 
-    Not done if there are other labels already, or if the groups of a file of tetopt's are not labels.
+    Not done if there are other labels already, or if the groups of a file of tetopt's are not
+    labels.
     """
     kind = _kind_of_cells(raw)
     groups = [group for group in raw.groups if group.kind == kind]
@@ -91,14 +100,20 @@ def _labelled(raw: Raw, comments: OwnComments | None) -> Raw:
     zero = None if comments is None else comments.zero
     of_group = {} if comments is None else comments.labels
     if of_group:
-        labels = np.array([of_group.get(number, number) for number in labels.tolist()], dtype=np.int64)
+        labels = np.array(
+            [of_group.get(number, number) for number in labels.tolist()], dtype=np.int64
+        )
     labels[labels == zero] = 0
     if "label" in raw.cell_data and not np.array_equal(raw.cell_data["label"][kind], labels):
         return raw
     names = {of_group.get(group.number, group.number): group.label for group in groups}
     names = {number: name for number, name in names.items() if name != f"label_{number}"}
-    names = {0 if number == zero else number: name for number, name in names.items() if name != "label_0"}
-    table = {TABLE_TEXT: np.array([json.dumps(table_words(LabelTable(names, {})))])} if names else {}
+    names = {
+        0 if number == zero else number: name for number, name in names.items() if name != "label_0"
+    }
+    table = (
+        {TABLE_TEXT: np.array([json.dumps(table_words(LabelTable(names, {})))])} if names else {}
+    )
     cell_data = raw.cell_data | {"label": {kind: labels}}
     return raw._replace(cell_data=cell_data, field_data=raw.field_data | table)
 
@@ -118,25 +133,45 @@ def _of_ours(raw: Raw, comments: OwnComments) -> Raw:
     is_painted = bool(comments.constants) and np.isfinite(constants).all()
     painted = {"young": {kind: constants[0]}, "nu": {kind: constants[1]}} if is_painted else {}
     sets = [Group(name, kind, of_set) for name, of_set in members.items()]
-    for side in {group.kind for group in raw.groups} - {kind}:  # in 2.2 a facet is in only one group
-        sets += [Group(name, side, of_set) for name, of_set in _members(raw, side, comments.facets).items()]
+    # in 2.2 a facet is in only one group
+    for side in {group.kind for group in raw.groups} - {kind}:
+        sets += [
+            Group(name, side, of_set)
+            for name, of_set in _members(raw, side, comments.facets).items()
+        ]
     labels_of_sets = {each.label for each in sets}
     dropped = ("gmsh:physical", "gmsh:geometrical")
     return raw._replace(
-        cell_data={name: values for name, values in (painted | raw.cell_data).items() if name not in dropped},
-        field_data=raw.field_data | {name: np.array([text]) for name, text in comments.texts.items()},
-        groups=[group for group in raw.groups if group.kind != kind and group.label not in labels_of_sets] + sets,
+        cell_data={
+            name: values
+            for name, values in (painted | raw.cell_data).items()
+            if name not in dropped
+        },
+        field_data=raw.field_data
+        | {name: np.array([text]) for name, text in comments.texts.items()},
+        groups=[
+            group
+            for group in raw.groups
+            if group.kind != kind and group.label not in labels_of_sets
+        ]
+        + sets,
         space=comments.space,
     )
 
 
-def _members(raw: Raw, kind: str, entities_of: dict[str, list[int]]) -> dict[str, NDArray[np.int64]]:
+def _members(
+    raw: Raw, kind: str, entities_of: dict[str, list[int]]
+) -> dict[str, NDArray[np.int64]]:
     """Return the elements of a type in each set, ascending, given the entities of the set.
 
-    When gmsh saves a file again, it keeps tetopt's comments and entities, but not all of their elements.
+    When gmsh saves a file again, it keeps tetopt's comments and entities, but not all of their
+    elements.
     """
     entity = _by_value(raw.cell_data["gmsh:geometrical"][kind])
-    blocks_of = {name: [entity[each] for each in numbers if each in entity] for name, numbers in entities_of.items()}
+    blocks_of = {
+        name: [entity[each] for each in numbers if each in entity]
+        for name, numbers in entities_of.items()
+    }
     return {name: np.sort(np.concatenate(parts)) for name, parts in blocks_of.items() if parts}
 
 
@@ -167,11 +202,14 @@ def _by_value(tags: NDArray) -> dict[int, NDArray[np.int64]]:
     """Return the positions of each value, ascending."""
     order = np.argsort(tags, kind="stable")
     values, starts = np.unique(tags[order], return_index=True)
-    return dict(zip(values.tolist(), np.split(order, starts[1:]), strict=False))  # split returns one part for no values
+    # split returns one part for no values
+    return dict(zip(values.tolist(), np.split(order, starts[1:]), strict=False))
 
 
 def _section(text: bytes, name: str) -> bytes:
-    """Return the text between the first lines $NAME and $EndNAME; names of groups may contain such words."""
+    """Return the text between the first lines $NAME and $EndNAME; names of groups may contain
+    such words.
+    """
     head = f"${name}".encode()
     start = 0 if text.startswith(head) else text.find(b"\n" + head) + 1
     if not text.startswith(head, start):
@@ -181,14 +219,18 @@ def _section(text: bytes, name: str) -> bytes:
 
 
 def _physical_names(text: bytes) -> dict[tuple[int, int], str]:
-    """Return the names of physical groups by dimension and number; several may have the same name."""
+    """Return the names of physical groups by dimension and number; several may have the same
+    name.
+    """
     lines = _section(text, "PhysicalNames").decode("utf-8", "replace").splitlines()
     matches = [re.fullmatch(r'\s*(\d+)\s+(-?\d+)\s+"?(.*?)"?\s*', line) for line in lines]
     return {(int(line[1]), abs(int(line[2]))): line[3] for line in matches if line is not None}
 
 
 def _groups_of_entities(text: bytes) -> dict[tuple[int, int], list[int]] | None:
-    """Return the physical groups of each entity, by dimension and number; None before version 4.1."""
+    """Return the physical groups of each entity, by dimension and number; None before version
+    4.1.
+    """
     version, is_binary, size = _section(text, "MeshFormat").split(maxsplit=3)[:3]
     if not version.startswith(b"4") or version == b"4.0":
         return None

@@ -1,4 +1,6 @@
-"""Reading of NRRD and MetaImage by SimpleITK, in a separate process after checks of headers and names."""
+"""Reading of NRRD and MetaImage by SimpleITK, in a separate process after checks of headers and
+names.
+"""
 
 from __future__ import annotations
 
@@ -27,22 +29,37 @@ ITK_READERS = {
     ".mha": "MetaImageIO",
     ".mhd": "MetaImageIO",
 }
-SPATIAL_KINDS = ("domain", "space", "???", "none")  # of NRRD's axes; others are times, colours, vectors
+# of NRRD's axes; others are times, colours, vectors
+SPATIAL_KINDS = ("domain", "space", "???", "none")
 
 
-def read_itk(path: Path, volume: int | None, notes: list[str]) -> tuple[NDArray, NDArray[np.float64]]:
+def read_itk(
+    path: Path, volume: int | None, notes: list[str]
+) -> tuple[NDArray, NDArray[np.float64]]:
     """Return data and affine of a file; InputError without a leading path."""
     _check_installed()
     header, size = checked_header(path)
     is_nrrd = path.suffix.lower() in NRRD_SUFFIXES
-    about = notes_of_nrrd(dict(header.stated), header.sizes) if is_nrrd else notes_of_metaimage(header.stated)
+    about = (
+        notes_of_nrrd(dict(header.stated), header.sizes)
+        if is_nrrd
+        else notes_of_metaimage(header.stated)
+    )
     if header.ratio == 1 and header.skip.isdecimal():  # neither packed nor text
         rest = size - header.n_bytes - int(header.skip) - header.value_bytes
-        about += notes_of_rest(rest, header.sizes, header.value_bytes // max(math.prod(header.sizes), 1))
+        about += notes_of_rest(
+            rest, header.sizes, header.value_bytes // max(math.prod(header.sizes), 1)
+        )
     lengths = (_nrrd_units if is_nrrd else _metaimage_units)(dict(header.stated), about)
     segments = segments_of(header.texts)
     data, affine = read_apart(
-        _volume_of, path, volume, bool(segments), size=size, value_bytes=header.value_bytes, library="SimpleITK"
+        _volume_of,
+        path,
+        volume,
+        bool(segments),
+        size=size,
+        value_bytes=header.value_bytes,
+        library="SimpleITK",
     )
     if segments:
         data = labels_of_layers(data, segments, about)
@@ -60,9 +77,15 @@ def _nrrd_units(fields: dict[str, str], notes: list[str]) -> NDArray[np.float64]
     kinds = fields.get("kinds", "").split()
     words = re.findall(r'"((?:[^"\\]|\\.)*)"', fields[key])
     if key == "units":  # of the array's axes, which are the world's without a space
-        words = [word for k, word in enumerate(words) if k >= len(kinds) or kinds[k].lower() in SPATIAL_KINDS]
+        words = [
+            word
+            for k, word in enumerate(words)
+            if k >= len(kinds) or kinds[k].lower() in SPATIAL_KINDS
+        ]
     if len(words) < 2:
-        raise InputError(f"{name}: expected a unit in quotation marks per axis, got {fields[key][:80]}")
+        raise InputError(
+            f"{name}: expected a unit in quotation marks per axis, got {fields[key][:80]}"
+        )
     return mm_of_axes(words[:3], name, notes)
 
 
@@ -79,7 +102,9 @@ def _check_installed() -> None:
 # In the child
 
 
-def _volume_of(path: str, volume: int | None, has_layers: bool = False) -> tuple[NDArray, NDArray[np.float64]]:
+def _volume_of(
+    path: str, volume: int | None, has_layers: bool = False
+) -> tuple[NDArray, NDArray[np.float64]]:
     """Return data, with layers on a last axis if it has them, and affine."""
     import SimpleITK as sitk
 
@@ -112,11 +137,15 @@ def _in_words(error: RuntimeError) -> InputError:
 
 def _check_components(count: int) -> None:
     if count > 1:
-        raise InputError(f"expected one number per voxel, got {count} (RGB or vectors); convert it to grey first")
+        raise InputError(
+            f"expected one number per voxel, got {count} (RGB or vectors); convert it to grey first"
+        )
 
 
 def _ras_affine(source: Any) -> NDArray[np.float64]:
-    """Return the RAS affine of a SimpleITK image or reader (LPS), for its first three axes or its two."""
+    """Return the RAS affine of a SimpleITK image or reader (LPS), for its first three axes or
+    its two.
+    """
     n = min(source.GetDimension(), 3)
     direction = np.reshape(source.GetDirection(), (source.GetDimension(),) * 2)
     affine = np.eye(n + 1)

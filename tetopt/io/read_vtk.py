@@ -1,4 +1,6 @@
-"""Reading of VTU and VTK files by VTK in a separate process, whose limits end what a false header asks for."""
+"""Reading of VTU and VTK files by VTK in a separate process, whose limits end what a false
+header asks for.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,8 @@ def read_vtk(path: Path) -> RawGrid:
     Raises
     ------
     InputError
-        Without a leading path: the file is damaged, or VTK crashes on it; it has another data set, or no cells.
+        Without a leading path: the file is damaged, or VTK crashes on it; it has another data set,
+        or no cells.
     """
     return checked_grid(*read_apart(arrays_of, path, library="VTK"))
 
@@ -57,7 +60,11 @@ def checked_grid(kind: str, errors: str, arrays: dict[str, Any]) -> RawGrid:
 def arrays_of(path: str) -> tuple[str, str, dict[str, Any]]:
     """Return the type of data set, VTK's first error, and the arrays of a `RawGrid`."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
-    from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow, vtkUnsignedCharArray
+    from vtkmodules.vtkCommonCore import (
+        vtkOutputWindow,
+        vtkStringOutputWindow,
+        vtkUnsignedCharArray,
+    )
     from vtkmodules.vtkIOLegacy import vtkDataSetReader
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridReader
 
@@ -65,7 +72,15 @@ def arrays_of(path: str) -> tuple[str, str, dict[str, Any]]:
     vtkOutputWindow.SetInstance(window)
     reader = vtkXMLUnstructuredGridReader() if path.lower().endswith(".vtu") else vtkDataSetReader()
     if isinstance(reader, vtkDataSetReader):
-        for kind in ("Scalars", "Vectors", "Normals", "Tensors", "ColorScalars", "TCoords", "Fields"):
+        for kind in (
+            "Scalars",
+            "Vectors",
+            "Normals",
+            "Tensors",
+            "ColorScalars",
+            "TCoords",
+            "Fields",
+        ):
             getattr(reader, f"ReadAll{kind}On")()
     reader.SetFileName(os.fsencode(path))  # type: ignore[arg-type]  # bytes, for names that are not UTF-8
     reader.Update()
@@ -98,18 +113,27 @@ def plain_arrays(grid: vtkUnstructuredGrid) -> dict[str, Any]:
 
 def _first_error(output: str | bytes | None) -> str:
     """Return VTK's first error on one line, without its place in VTK; empty if there is none."""
-    text = output.decode("utf-8", "replace") if isinstance(output, bytes) else output or ""  # bytes if not UTF-8
+    # bytes if not UTF-8
+    text = output.decode("utf-8", "replace") if isinstance(output, bytes) else output or ""
     _, mark, rest = text.partition("ERROR: ")
     if not mark:
         return ""
     words = re.split(r"\n(?=ERROR|Warning|Generic)", rest)[0].partition("\n")[2] or rest
-    return re.sub(r" ?\(0x[0-9a-f]+\)", "", " ".join(words.split()))[:300] or "an error without a message"
+    return (
+        re.sub(r" ?\(0x[0-9a-f]+\)", "", " ".join(words.split()))[:300]
+        or "an error without a message"
+    )
 
 
 def _data_of(data: Any) -> dict[str, NDArray]:
     """Return arrays by name."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
-    from vtkmodules.vtkCommonCore import vtkBitArray, vtkDataArray, vtkStringArray, vtkUnsignedCharArray
+    from vtkmodules.vtkCommonCore import (
+        vtkBitArray,
+        vtkDataArray,
+        vtkStringArray,
+        vtkUnsignedCharArray,
+    )
 
     arrays = {}
     for k in range(data.GetNumberOfArrays()):
@@ -117,7 +141,9 @@ def _data_of(data: Any) -> dict[str, NDArray]:
         name = array.GetName() or f"Unnamed_{k}"
         if isinstance(array, vtkStringArray):
             texts = [array.GetValue(i) for i in range(array.GetNumberOfValues())]
-            arrays[name] = np.array([text if isinstance(text, str) else repr(text) for text in texts], np.str_)
+            arrays[name] = np.array(
+                [text if isinstance(text, str) else repr(text) for text in texts], np.str_
+            )
         elif isinstance(array, vtkDataArray):
             if isinstance(array, vtkBitArray):
                 bits, array = array, vtkUnsignedCharArray()

@@ -1,7 +1,8 @@
 """Segmentations of 3D Slicer (.seg.nrrd): named segments in one or more layers of an NRRD file.
 
-A segment is the voxels of its layer with its label value. Within a layer segments do not overlap; those of different
-layers may, and may have the same value. Numbering and names depend on the header alone.
+A segment is the voxels of its layer with its label value. Within a layer segments do not overlap;
+those of different layers may, and may have the same value. Numbering and names depend on the header
+alone.
 """
 
 from __future__ import annotations
@@ -49,27 +50,40 @@ def segments_of(texts: Mapping[str, str]) -> list[Segment]:
     is_old = not any("Layer" in each or "LabelValue" in each for each in tables.values())
     described = []
     for order, (number, table) in enumerate(sorted(tables.items())):
-        name = plain(" ".join((table.get("Name") or table.get("ID") or f"segment {number}").split()))
+        name = plain(
+            " ".join((table.get("Name") or table.get("ID") or f"segment {number}").split())
+        )
         layer = _whole(name, "Layer", table.get("Layer", str(order) if is_old else "0"), 0)
         label = _whole(name, "LabelValue", table.get("LabelValue", "1"), 1)
         described.append(Segment(name, layer, label, label, _colour(table.get("Color", ""))))
     values = [segment.value for segment in described]
     is_shared = len(set(values)) < len(values) and len({segment.layer for segment in described}) > 1
-    return [each._replace(label=order) for order, each in enumerate(described, 1)] if is_shared else described
+    return (
+        [each._replace(label=order) for order, each in enumerate(described, 1)]
+        if is_shared
+        else described
+    )
 
 
 def segments_table(segments: list[Segment]) -> LabelTable:
-    """Return the names and colours of segments by label; a label of several segments has all their names."""
+    """Return the names and colours of segments by label; a label of several segments has all
+    their names.
+    """
     names: dict[int, str] = {}
     for each in segments:
-        names[each.label] = f"{names[each.label]} / {each.name}" if each.label in names else each.name
-    return LabelTable(names, {each.label: each.colour for each in segments if each.colour is not None})
+        names[each.label] = (
+            f"{names[each.label]} / {each.name}" if each.label in names else each.name
+        )
+    return LabelTable(
+        names, {each.label: each.colour for each in segments if each.colour is not None}
+    )
 
 
 def labels_of_layers(layers: NDArray, segments: list[Segment], notes: list[str]) -> NDArray:
     """Return the label of each voxel, from its values in the layers, which are on the last axis.
 
-    Where segments overlap, the later layer wins; overlaps, shared values and values of no segment are noted.
+    Where segments overlap, the later layer wins; overlaps, shared values and values of no segment
+    are noted.
 
     Raises
     ------
@@ -80,19 +94,29 @@ def labels_of_layers(layers: NDArray, segments: list[Segment], notes: list[str])
     for each in segments:
         if each.layer >= n_layers:
             raise InputError(
-                f'segment "{each.name}" is in layer {each.layer}, but the file has {n_layers}; export it again'
+                f'segment "{each.name}" is in layer {each.layer}, but the file has {n_layers}; '
+                "export it again"
             )
     names = segments_table(segments).names
     if len(names) < len(segments):
         doubled = ", ".join(f'"{name}"' for name in names.values() if " / " in name)
-        notes.append(f"segments of one layer share a label value and cannot be told apart: {doubled}")
+        notes.append(
+            f"segments of one layer share a label value and cannot be told apart: {doubled}"
+        )
     if [each.label for each in segments] != [each.value for each in segments]:
-        notes.append(f"its segments share label values; they are numbered in order: {_numbered(names)}")
+        notes.append(
+            f"its segments share label values; they are numbered in order: {_numbered(names)}"
+        )
     labels = np.zeros(layers.shape[:-1], np.int32)
     is_free = (layers != 0).any(axis=-1)
     for each in sorted(segments, key=lambda each: each.layer):
         is_here = layers[..., each.layer] == each.value
-        covered = dict(zip(*(part.tolist() for part in np.unique(labels[is_here], return_counts=True)), strict=True))
+        covered = dict(
+            zip(
+                *(part.tolist() for part in np.unique(labels[is_here], return_counts=True)),
+                strict=True,
+            )
+        )
         below = [
             f'{count} of the {np.count_nonzero(labels == label)} voxels of "{names[label]}"'
             for label, count in covered.items()
@@ -104,7 +128,9 @@ def labels_of_layers(layers: NDArray, segments: list[Segment], notes: list[str])
         is_free &= ~is_here
     if is_free.any():
         described = np.unique(layers[is_free]).tolist()
-        notes.append(f"{is_free.sum()} voxels have values of no segment ({described[:8]}) and get label 0")
+        notes.append(
+            f"{is_free.sum()} voxels have values of no segment ({described[:8]}) and get label 0"
+        )
     return labels
 
 
@@ -116,7 +142,8 @@ def _numbered(names: Mapping[int, str]) -> str:
 def _whole(name: str, field: str, text: str, least: int) -> int:
     if re.fullmatch(r"\d{1,10}", text) is None or not least <= int(text) <= LARGEST_LABEL:
         raise InputError(
-            f'segment "{name}": expected a whole number from {least} as its {field}, got "{plain(text[:40])}"'
+            f'segment "{name}": expected a whole number from {least} as its {field}, got '
+            f'"{plain(text[:40])}"'
         )
     return int(text)
 
@@ -124,7 +151,9 @@ def _whole(name: str, field: str, text: str, least: int) -> int:
 def _colour(text: str) -> tuple[float, float, float] | None:
     """Parse three numbers from 0 to 1; None for anything else, as colours do not matter."""
     words = text.split()
-    if len(words) != 3 or not all(re.fullmatch(r"[01]?\.?\d*(e-\d+)?", word) and word[0] != "e" for word in words):
+    if len(words) != 3 or not all(
+        re.fullmatch(r"[01]?\.?\d*(e-\d+)?", word) and word[0] != "e" for word in words
+    ):
         return None
     red, green, blue = (min(float(word), 1.0) for word in words)
     return red, green, blue

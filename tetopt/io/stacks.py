@@ -1,7 +1,9 @@
-"""Volumes of slices: TIFF stacks by tifffile, and folders with one picture per slice by Pillow, in a separate process.
+"""Volumes of slices: TIFF stacks by tifffile, and folders with one picture per slice by Pillow, in
+a separate process.
 
-Axes are placed as by ITK and 3D Slicer, without a mirror: index (column, row, slice), the first voxel at the origin,
-columns to the left, rows to the back and slices to the top. In RAS+ mm, x and y are negative.
+Axes are placed as by ITK and 3D Slicer, without a mirror: index (column, row, slice), the first
+voxel at the origin, columns to the left, rows to the back and slices to the top. In RAS+ mm, x and
+y are negative.
 """
 
 from __future__ import annotations
@@ -60,25 +62,32 @@ def parse_spacing(text: str) -> tuple[float, ...]:
     try:
         return tuple(float(word) for word in text.split(","))
     except ValueError:
-        raise InputError(f'spacing_mm: expected one number or three, such as "0.02,0.02,0.05", got "{text}"') from None
+        raise InputError(
+            f'spacing_mm: expected one number or three, such as "0.02,0.02,0.05", got "{text}"'
+        ) from None
 
 
 def spacing_of(spacing_mm: float | Sequence[float], n: int) -> NDArray[np.float64]:
     """Return n voxel sizes, mm, from one or n; InputError unless they are positive."""
     sizes = np.atleast_1d(np.asarray(spacing_mm, dtype=np.float64))
     if sizes.shape not in ((1,), (n,)) or not (np.isfinite(sizes) & (sizes > 0.0)).all():
-        raise InputError(f"`spacing_mm`: expected one positive number or {n}, mm, got {sizes.tolist()}")
+        raise InputError(
+            f"`spacing_mm`: expected one positive number or {n}, mm, got {sizes.tolist()}"
+        )
     return np.broadcast_to(sizes, n).copy()
 
 
 def check_spacing(spacing_mm: float | Sequence[float] | None, own: NDArray[np.float64]) -> None:
-    """Raise InputError if `spacing_mm` differs from the file's own voxel sizes, mm; NaN for unknown ones."""
+    """Raise InputError if `spacing_mm` differs from the file's own voxel sizes, mm; NaN for
+    unknown ones.
+    """
     if spacing_mm is None:
         return
     sizes = spacing_of(spacing_mm, len(own))
     if (np.abs(sizes - own) > SAME_SIZE * own).any():
         raise InputError(
-            f"the file has voxels of {_sizes(own)} mm, but `spacing_mm` is {_sizes(sizes)}; omit it or correct the file"
+            f"the file has voxels of {_sizes(own)} mm, but `spacing_mm` is {_sizes(sizes)}; omit "
+            "it or correct the file"
         )
 
 
@@ -94,12 +103,16 @@ class Tiff(NamedTuple):
 
 def read_pictures(
     path: Path, volume: int | None, notes: list[str], spacing_mm: float | Sequence[float] | None
-) -> tuple[NDArray, NDArray[np.float64]]:  # fmt: skip
-    """Return data and affine of a picture, or of a TIFF file's stack of pages; InputError without a leading path."""
+) -> tuple[NDArray, NDArray[np.float64]]:
+    """Return data and affine of a picture, or of a TIFF file's stack of pages; InputError
+    without a leading path.
+    """
     tiff = Tiff(None)
     if path.name.lower().endswith(TIFF_SUFFIXES) and _has_tifffile():
         is_page = volume is not None
-        tiff = Tiff(*read_apart(_stack_of, path, is_page, value_bytes=MOST_PIXELS, library="tifffile"))
+        tiff = Tiff(
+            *read_apart(_stack_of, path, is_page, value_bytes=MOST_PIXELS, library="tifffile")
+        )
     notes += tiff.notes
     n = 2 if tiff.voxels is None else 3
     steps = _steps(tiff, n, spacing_mm, notes)
@@ -114,13 +127,21 @@ def read_pictures(
 
 def read_slices(
     path: Path, names: list[str], notes: list[str], spacing_mm: float | Sequence[float] | None
-) -> tuple[NDArray, NDArray[np.float64]]:  # fmt: skip
-    """Return data and affine of a folder of slices, in their order; InputError without a leading path."""
+) -> tuple[NDArray, NDArray[np.float64]]:
+    """Return data and affine of a folder of slices, in their order; InputError without a leading
+    path.
+    """
     series, said = _series(names)
     size = sum((path / name).stat().st_size for name in series)
     tiff = Tiff(
         *read_apart(
-            _slices_of, path, series, spacing_mm is not None, size=size, value_bytes=MOST_PIXELS, library="Pillow"
+            _slices_of,
+            path,
+            series,
+            spacing_mm is not None,
+            size=size,
+            value_bytes=MOST_PIXELS,
+            library="Pillow",
         )
     )
     notes += [*said, *tiff.notes]
@@ -137,7 +158,9 @@ def _has_tifffile() -> bool:
 def _steps(
     tiff: Tiff, n: int, spacing_mm: float | Sequence[float] | None, notes: list[str]
 ) -> NDArray[np.float64] | None:
-    """Return n voxel sizes, mm, as the file or `spacing_mm` states; None without any. InputError if they differ."""
+    """Return n voxel sizes, mm, as the file or `spacing_mm` states; None without any. InputError
+    if they differ.
+    """
     stated = np.array([np.nan if mm is None else mm for mm in tiff.sizes[:n]])
     if spacing_mm is None:
         return None if not tiff.is_calibrated or np.isnan(stated).any() else stated
@@ -145,13 +168,18 @@ def _steps(
     if tiff.is_calibrated:
         check_spacing(spacing_mm, stated)
     elif (np.abs(sizes - stated) > SAME_SIZE * stated).any():
-        notes.append(f"its resolution tags say {_sizes(stated)} mm; `spacing_mm` is used, {_sizes(sizes)}")
+        notes.append(
+            f"its resolution tags say {_sizes(stated)} mm; `spacing_mm` is used, {_sizes(sizes)}"
+        )
     return sizes
 
 
 def _no_sizes(what: str, tiff: Tiff) -> str:
     stated = _sizes(np.array([np.nan if mm is None else mm for mm in tiff.sizes]))
-    return f"this {what} slices states no voxel size ({stated} mm); give it by `spacing_mm`, mm: one number, or three"
+    return (
+        f"this {what} slices states no voxel size ({stated} mm); give it by `spacing_mm`, "
+        "mm: one number, or three"
+    )
 
 
 def _scaled(values: NDArray, scale: Sequence[float]) -> NDArray:
@@ -165,7 +193,9 @@ def _scaled(values: NDArray, scale: Sequence[float]) -> NDArray:
 
 
 def slice_files(path: Path) -> list[str]:
-    """Return the names of the pictures in a folder; none if it also has DICOM files, which they may show."""
+    """Return the names of the pictures in a folder; none if it also has DICOM files, which they
+    may show.
+    """
     names = []
     for file in path.iterdir():
         if file.name.startswith(".") or irregular(file) is not None:
@@ -179,31 +209,48 @@ def slice_files(path: Path) -> list[str]:
 
 
 def _series(names: list[str]) -> tuple[list[str], list[str]]:
-    """Return the names of one series in the order of their numbers, and notes; InputError for a gap or two series."""
+    """Return the names of one series in the order of their numbers, and notes; InputError for a
+    gap or two series.
+    """
     parts = {name: re.split(r"(\d+)", name) for name in names}
     forms = {name: tuple(part.lower() for part in each[::2]) for name, each in parts.items()}
     form, count = Counter(forms.values()).most_common(1)[0]
     others = sorted(name for name in names if forms[name] != form)
     if count < 2 or len(others) > 1:
         raise InputError(
-            f"expected one series of numbered slices, got {', '.join(sorted(names)[:4])} and others; put one series "
+            f"expected one series of numbered slices, got {', '.join(sorted(names)[:4])} and "
+            "others; put one series "
             "into its own folder"
         )
-    numbers = {name: [int(digits) for digits in parts[name][1::2]] for name in names if forms[name] == form}
+    numbers = {
+        name: [int(digits) for digits in parts[name][1::2]] for name in names if forms[name] == form
+    }
     table = np.array(list(numbers.values()), dtype=object)
     varying = [k for k in range(table.shape[1]) if len(set(table[:, k])) > 1]
     if len(varying) != 1:
-        raise InputError(f"expected one number that counts the slices in names such as {names[0]}, got {len(varying)}")
+        raise InputError(
+            f"expected one number that counts the slices in names such as {names[0]}, got "
+            f"{len(varying)}"
+        )
     order = sorted(numbers, key=lambda name: numbers[name][varying[0]])
     counts = [numbers[name][varying[0]] for name in order]
     steps = np.diff(counts)
     if (gaps := np.flatnonzero(steps != steps.min())).size or steps.min() == 0:
         k = int(gaps[0]) if gaps.size else int(np.argmin(steps))
         raise InputError(
-            f"expected evenly numbered slices, got {order[k]} followed by {order[k + 1]}; a slice is missing or doubled"
+            f"expected evenly numbered slices, got {order[k]} followed by {order[k + 1]}; a "
+            "slice is missing or doubled"
         )
-    notes = [f"{others[0]} does not belong to the series of {order[0]} and is left out"] if others else []
-    notes += [f"its slices are numbered in steps of {steps[0]}; `spacing_mm` is their distance"] if steps[0] > 1 else []
+    notes = (
+        [f"{others[0]} does not belong to the series of {order[0]} and is left out"]
+        if others
+        else []
+    )
+    notes += (
+        [f"its slices are numbered in steps of {steps[0]}; `spacing_mm` is their distance"]
+        if steps[0] > 1
+        else []
+    )
     return order, notes
 
 
@@ -225,7 +272,11 @@ def _slices_of(path: str, names: list[str], has_spacing: bool) -> Tiff:
     for k, name in enumerate(names):
         file = str(Path(path) / name)
         try:
-            tiff = _stack_of(file, True) if name.lower().endswith(TIFF_SUFFIXES) and _has_tifffile() else Tiff(None)
+            tiff = (
+                _stack_of(file, True)
+                if name.lower().endswith(TIFF_SUFFIXES) and _has_tifffile()
+                else Tiff(None)
+            )
             first = tiff if k == 0 else first
             if not has_spacing and (not tiff.is_calibrated or None in tiff.sizes):
                 break
@@ -237,12 +288,16 @@ def _slices_of(path: str, names: list[str], has_spacing: bool) -> Tiff:
             data = np.empty((len(names), *pixels.shape), pixels.dtype)
         if pixels.shape != data.shape[1:] or pixels.dtype != data.dtype:
             raise InputError(
-                f"{plain(name)}: expected {data.shape[1]} x {data.shape[2]} pixels of {data.dtype}, as in "
+                f"{plain(name)}: expected {data.shape[1]} x {data.shape[2]} pixels of "
+                f"{data.dtype}, as in "
                 f"{plain(names[0])}, got {pixels.shape[0]} x {pixels.shape[1]} of {pixels.dtype}"
             )
         calibrations = [(each.scale, each.is_calibrated and each.sizes) for each in (tiff, first)]
         if calibrations[0] != calibrations[1]:
-            raise InputError(f"{plain(name)}: expected the pixel size and calibration of {plain(names[0])}, got others")
+            raise InputError(
+                f"{plain(name)}: expected the pixel size and calibration of {plain(names[0])}, "
+                "got others"
+            )
         data[k] = pixels
     else:
         assert data is not None
@@ -251,7 +306,9 @@ def _slices_of(path: str, names: list[str], has_spacing: bool) -> Tiff:
 
 
 def _stack_of(path: str, is_page: bool) -> Tiff:
-    """Return the voxels of a file's pages, and what the first one states; no voxels of one page, or with `is_page`."""
+    """Return the voxels of a file's pages, and what the first one states; no voxels of one page,
+    or with `is_page`.
+    """
     import tifffile
 
     words: list[str] = []
@@ -273,39 +330,72 @@ def _stack_of(path: str, is_page: bool) -> Tiff:
             return tiff
         series = file.series
         pixels = _ome_pixels(first.description)
-        axes = {name: int(size) for name, size in zip(series[0].axes, series[0].shape, strict=True) if size > 1}
-        axes |= {name: int(pixels.get(f"Size{name}", 1)) for name in "CT" if int(pixels.get(f"Size{name}", 1)) > 1}
-        if len(file.pages) == 1 and set(axes) <= set("YXS") and not words and int(pixels.get("SizeZ", 1)) == 1:
+        axes = {
+            name: int(size)
+            for name, size in zip(series[0].axes, series[0].shape, strict=True)
+            if size > 1
+        }
+        axes |= {
+            name: int(pixels.get(f"Size{name}", 1))
+            for name in "CT"
+            if int(pixels.get(f"Size{name}", 1)) > 1
+        }
+        if (
+            len(file.pages) == 1
+            and set(axes) <= set("YXS")
+            and not words
+            and int(pixels.get("SizeZ", 1)) == 1
+        ):
             return tiff
         if words:
             raise InputError(f"truncated or damaged; copy it again ({words[0]})")
         # A program may write a page at a time, each as a picture of its own.
-        is_apart = {each.kind for each in series} == {"shaped"} and {each.axes for each in series} == {"YX"}
-        if len({(each.shape, each.dtype) for each in series}) > 1 or (len(series) > 1 and not is_apart):
+        is_apart = {each.kind for each in series} == {"shaped"} and {
+            each.axes for each in series
+        } == {"YX"}
+        if len({(each.shape, each.dtype) for each in series}) > 1 or (
+            len(series) > 1 and not is_apart
+        ):
             shapes = ", ".join(" x ".join(map(str, each.shape)) for each in series[:4])
-            raise InputError(f"expected slices of one size and type, got {shapes}; export one stack")
+            raise InputError(
+                f"expected slices of one size and type, got {shapes}; export one stack"
+            )
         notes = [*tiff.notes]
         is_imagej = first.description.startswith("ImageJ=")
-        if is_imagej and set(axes) == set("CYX") and axes["C"] > MOST_CHANNELS and "\nspacing=" in first.description:
-            notes.append(f"its {axes.pop('C')} channels have a slice spacing: they are read as slices")
+        if (
+            is_imagej
+            and set(axes) == set("CYX")
+            and axes["C"] > MOST_CHANNELS
+            and "\nspacing=" in first.description
+        ):
+            notes.append(
+                f"its {axes.pop('C')} channels have a slice spacing: they are read as slices"
+            )
         if wrong := [f"{axes[name]} {word}" for name, word in AXIS_WORDS.items() if name in axes]:
-            raise InputError(f"expected a stack of grey slices, got {' and '.join(wrong)}; export one part")
+            raise InputError(
+                f"expected a stack of grey slices, got {' and '.join(wrong)}; export one part"
+            )
         shape = [int(size) for size in (len(series), *series[0].shape) if size > 1]
         if len(shape) != 3 or not {"Y", "X"} <= set(axes):
             said = f"axes {series[0].axes} of {series[0].shape}"
             raise InputError(f"expected a stack of slices of one size, got {said}; export it again")
         if pixels and series[0].kind != "ome":
             raise InputError(
-                f"expected the {pixels.get('SizeZ')} slices of its OME metadata, which are in other files, or not as "
+                f"expected the {pixels.get('SizeZ')} slices of its OME metadata, which are in "
+                "other files, or not as "
                 "it says; export it again as one file"
             )
         if first.photometric == 3 and not is_imagej:
-            raise InputError("expected grey slices, got a palette of colours; convert it to grey first")
+            raise InputError(
+                "expected grey slices, got a palette of colours; convert it to grey first"
+            )
         tag = first.tags.get(ORIENTATION_TAG)
         orientation = 1 if tag is None else int(tag.value)
         flips = FLIPPED_AXES.get(orientation)
         if flips is None:
-            raise InputError(f"its Orientation {orientation} swaps rows and columns; export it upright")
+            raise InputError(
+                f"its Orientation {orientation} swaps rows and columns; export it upright"
+            )
         check_room(shape, series[0].dtype.itemsize)
         parts = [_values(each) for each in series]
         data = (parts[0] if len(parts) == 1 else np.stack(parts)).reshape(shape)
@@ -324,12 +414,18 @@ def _stated(page: Any) -> Tiff:
         key, _, fields[key] = line.partition("=")
     pixels = _ome_pixels(page.description)
     own = _ome_sizes(pixels) if pixels else _imagej_sizes(page, fields)
-    scale = _imagej_scale(fields, notes) if page.dtype is not None and page.dtype.kind == "u" else (1.0, 0.0)
+    scale = (
+        _imagej_scale(fields, notes)
+        if page.dtype is not None and page.dtype.kind == "u"
+        else (1.0, 0.0)
+    )
     return Tiff(None, own or _resolution(page), own is not None, scale, notes)
 
 
 def _imagej_scale(fields: dict[str, str], notes: list[str]) -> tuple[float, float]:
-    """Return slope and intercept of ImageJ's calibration, if it is a straight line; others are noted."""
+    """Return slope and intercept of ImageJ's calibration, if it is a straight line; others are
+    noted.
+    """
     curve = fields.get("cf", IMAGEJ_LINE if {"c0", "c1"} <= fields.keys() else IMAGEJ_NONE)
     if curve == IMAGEJ_LINE:
         try:
@@ -339,7 +435,10 @@ def _imagej_scale(fields: dict[str, str], notes: list[str]) -> tuple[float, floa
         except (KeyError, ValueError):
             pass
     if curve != IMAGEJ_NONE:
-        notes.append("its values are as stored: ImageJ's calibration of them is no straight line and is not applied")
+        notes.append(
+            "its values are as stored: ImageJ's calibration of them is no straight line and is "
+            "not applied"
+        )
     return 1.0, 0.0
 
 
@@ -348,8 +447,12 @@ def _values(series: Any) -> NDArray:
         values: NDArray = series.asarray()
     except Exception as error:  # tifffile raises any error, also for a missing codec
         if "imagecodecs" in str(error):
-            raise InputError(f"its compression needs imagecodecs; {install_hint('imagecodecs')}") from error
-        raise InputError(f"truncated or damaged; copy it again (tifffile: {one_line(error)[:200]})") from error
+            raise InputError(
+                f"its compression needs imagecodecs; {install_hint('imagecodecs')}"
+            ) from error
+        raise InputError(
+            f"truncated or damaged; copy it again (tifffile: {one_line(error)[:200]})"
+        ) from error
     return values.astype(np.float32) if values.dtype == np.float16 else values
 
 
@@ -377,9 +480,14 @@ def _imagej_sizes(page: Any, fields: dict[str, str]) -> list[float | None] | Non
     """Return ImageJ's calibration, mm; None if it has no unit of length."""
     if "unit" not in fields or mm_of_unit(fields["unit"]) is None:
         return None
-    units = [mm_of_unit(fields.get(name) or fields["unit"], name) for name in ("unit", "yunit", "zunit")]
+    units = [
+        mm_of_unit(fields.get(name) or fields["unit"], name) for name in ("unit", "yunit", "zunit")
+    ]
     steps = [_pixels_per_unit(page, axis) for axis in "XY"]
-    in_plane = [None if mm is None or not step else mm / step for mm, step in zip(units[:2], steps, strict=True)]
+    in_plane = [
+        None if mm is None or not step else mm / step
+        for mm, step in zip(units[:2], steps, strict=True)
+    ]
     return [*in_plane, _product(fields.get("spacing"), units[2])]
 
 
@@ -387,7 +495,11 @@ def _resolution(page: Any) -> list[float | None]:
     unit = page.tags.get("ResolutionUnit")
     mm = MM_OF_RESOLUTION.get(2 if unit is None else int(unit.value))
     steps = [_pixels_per_unit(page, axis) for axis in "XY"]
-    if mm is None or not all(steps) or (mm == MM_OF_RESOLUTION[2] and set(steps) <= {1.0, *SCREEN_DPI}):
+    if (
+        mm is None
+        or not all(steps)
+        or (mm == MM_OF_RESOLUTION[2] and set(steps) <= {1.0, *SCREEN_DPI})
+    ):
         return [None] * 3
     return [*(mm / step for step in steps), None]
 

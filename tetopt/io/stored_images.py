@@ -1,4 +1,6 @@
-"""Images that may exceed memory: Zarr folders and uncompressed files, opened without reading their voxels."""
+"""Images that may exceed memory: Zarr folders and uncompressed files, opened without reading
+their voxels.
+"""
 
 from __future__ import annotations
 
@@ -25,43 +27,54 @@ from tetopt.io.images import (
     os_errors_named,
 )
 from tetopt.io.volumes import VoxelsInFile, check_room
-from tetopt.io.zarr_images import METADATA_FILES, ZARR_SUFFIX, check_chunks, is_zarr, open_zarr, zarr_levels
+from tetopt.io.zarr_images import (
+    METADATA_FILES,
+    ZARR_SUFFIX,
+    check_chunks,
+    is_zarr,
+    open_zarr,
+    zarr_levels,
+)
 
 STORED_SUFFIXES = (ZARR_SUFFIX, ".nii")
 
 
-def open_stored(path: str | Path, *, volume: int | None = None, crop: Bounds | None = None) -> Image:
+def open_stored(
+    path: str | Path, *, volume: int | None = None, crop: Bounds | None = None
+) -> Image:
     """Open an image whose voxels stay in their file.
 
     Parameters
     ----------
     path : str or Path
-        A Zarr folder: an OME-Zarr image (NGFF 0.4, 0.5; Zarr format 2 or 3), whose first multiscale level is
-        used, or an array with the attribute "affine". Or an uncompressed NIfTI file (.nii).
+        A Zarr folder: an OME-Zarr image (NGFF 0.4, 0.5; Zarr format 2 or 3), whose first multiscale
+        level is used, or an array with the attribute "affine". Or an uncompressed NIfTI file
+        (.nii).
     volume : int, optional
-        One of several volumes, from 0: for files as in `tetopt.load_image`, for Zarr along its axes of time, channels
-        and others; the last varies fastest.
+        One of several volumes, from 0: for files as in `tetopt.load_image`, for Zarr along its axes
+        of time, channels and others; the last varies fastest.
     crop : sequence of three (start, stop), optional
         Keep a box of voxels, as in `tetopt.load_image`.
 
     Returns
     -------
     Image
-        Its voxels and affine equal those of `tetopt.load_image` to the last bit. A box that cannot be read raises an
-        InputError that names the voxels.
+        Its voxels and affine equal those of `tetopt.load_image` to the last bit. A box that cannot
+        be read raises an InputError that names the voxels.
 
     Raises
     ------
     InputError
-        ``"<path>: ..."``: the reasons of `tetopt.load_image`; the file cannot be read in parts, or is on
-        the network; Zarr metadata are damaged, without a scale, do not have three spatial axes, or have units that are
-        not lengths; values are not real numbers; codecs are unknown; chunks without a fill value are missing, or all
-        chunks.
+        ``"<path>: ..."``: the reasons of `tetopt.load_image`; the file cannot be read in parts, or
+        is on the network; Zarr metadata are damaged, without a scale, do not have three spatial
+        axes, or have units that are not lengths; values are not real numbers; codecs are unknown;
+        chunks without a fill value are missing, or all chunks.
 
     Warns
     -----
     UserWarning
-        The image has no orientation or no unit; chunks with a fill value are missing; the size of its box is unusual.
+        The image has no orientation or no unit; chunks with a fill value are missing; the size of
+        its box is unusual.
 
     See Also
     --------
@@ -91,11 +104,13 @@ def open_stored(path: str | Path, *, volume: int | None = None, crop: Bounds | N
     return image
 
 
-def coarse_image(path: str | Path, most_voxels: float, *, volume: int | None = None) -> Image | None:
+def coarse_image(
+    path: str | Path, most_voxels: float, *, volume: int | None = None
+) -> Image | None:
     """Open the finest level of an OME-Zarr image with at most `most_voxels` voxels, for pictures.
 
-    Its voxels stay in the file until they are drawn, but are read once here to detect errors. Returns None for an image
-    without such a level, and for files without levels.
+    Its voxels stay in the file until they are drawn, but are read once here to detect errors.
+    Returns None for an image without such a level, and for files without levels.
 
     Raises
     ------
@@ -120,9 +135,10 @@ def coarse_image(path: str | Path, most_voxels: float, *, volume: int | None = N
 def stored_checksum(path: str | Path) -> str:
     """Return a SHA-256 that changes with an image, without reading its voxels.
 
-    For a Zarr folder it covers names, lengths and modification times of all files, and the contents of metadata files.
-    For a file, and the data files of a header, it covers name, length and modification time. Two copies of an image
-    have different checksums; `tetopt.io.images.sha256` is the same for both, but takes as long as reading them.
+    For a Zarr folder it covers names, lengths and modification times of all files, and the contents
+    of metadata files. For a file, and the data files of a header, it covers name, length and
+    modification time. Two copies of an image have different checksums; `tetopt.io.images.sha256` is
+    the same for both, but takes as long as reading them.
 
     Raises
     ------
@@ -151,15 +167,21 @@ def _opened(path: Path, volume: int | None, notes: list[str]) -> Image:
         if is_zarr(path):
             return open_zarr(zarr_levels(path, notes)[0], volume)
         if path.is_dir():
-            raise InputError("expected a Zarr folder, got another folder; convert it to .zarr or .nii first")
+            raise InputError(
+                "expected a Zarr folder, got another folder; convert it to .zarr or .nii first"
+            )
     name = check_beginning(path)
     if name.endswith(".nii"):
         return _mapped_nifti(path, volume, notes)
-    raise InputError("cannot be read in parts; unpack or convert it to .zarr or uncompressed .nii first")
+    raise InputError(
+        "cannot be read in parts; unpack or convert it to .zarr or uncompressed .nii first"
+    )
 
 
 class _Scaled:
-    """A mapped array with nibabel's scaling of values; nibabel's own thin slices take 30 times as long."""
+    """A mapped array with nibabel's scaling of values; nibabel's own thin slices take 30 times
+    as long.
+    """
 
     def __init__(self, mapped: np.memmap, slope: float, inter: float) -> None:
         self.mapped, self.shape, self.dtype = mapped, mapped.shape, mapped.dtype

@@ -1,4 +1,6 @@
-"""Triangle surfaces as STL, PLY, VTP and VTK files; all except STL can store integers for each triangle."""
+"""Triangle surfaces as STL, PLY, VTP and VTK files; all except STL can store integers for each
+triangle.
+"""
 
 from __future__ import annotations
 
@@ -26,10 +28,10 @@ if TYPE_CHECKING:
 SURFACE_SUFFIXES = (".stl", ".ply", ".vtp", ".vtk")
 LABELLED_SUFFIXES = SURFACE_SUFFIXES[1:]  # formats with labels of triangles
 
-# 3D Slicer looks for this in the header of an STL or VTK file, in the comments of a PLY file, or for a text of this
-# name in a VTP file; if it is missing, Slicer assumes LPS, with x and y negated: Slicer/Slicer,
-# Libs/MRML/Core/vtkMRMLModelStorageNode.cxx, GetCoordinateSystemFromFileHeader and ...FromFieldData;
-# https://discourse.slicer.org/t/10446.
+# 3D Slicer looks for this in the header of an STL or VTK file, in the comments of a PLY file, or
+# for a text of this name in a VTP file; if it is missing, Slicer assumes LPS, with x and y negated:
+# Slicer/Slicer, Libs/MRML/Core/vtkMRMLModelStorageNode.cxx, GetCoordinateSystemFromFileHeader and
+# ...FromFieldData; https://discourse.slicer.org/t/10446.
 SPACE_KEY = "SPACE="
 
 Labels = Mapping[str, NDArray[np.integer]]  # by name, one 32-bit number per triangle
@@ -49,13 +51,17 @@ class SurfaceCheck(NamedTuple):
 
 
 def save_surface(
-    path: str | Path, surface: Surface, about: str = "", space: str = "ras", labels: Labels | None = None
+    path: str | Path,
+    surface: Surface,
+    about: str = "",
+    space: str = "ras",
+    labels: Labels | None = None,
 ) -> None:
     """Write a binary STL, PLY, VTP or VTK file, by the name's suffix, whole or not at all.
 
-    The header states the coordinates' convention in 3D Slicer's form. All formats except STL, which rounds to float32,
-    keep every bit of the points and their order. Replaces an existing file; call `tetopt.system.files.checked_output`
-    first.
+    The header states the coordinates' convention in 3D Slicer's form. All formats except STL, which
+    rounds to float32, keep every bit of the points and their order. Replaces an existing file; call
+    `tetopt.system.files.checked_output` first.
 
     Parameters
     ----------
@@ -73,7 +79,8 @@ def save_surface(
     Raises
     ------
     InputError
-        The suffix is unknown; labels are given for an STL file, which cannot store them, or do not fit the triangles.
+        The suffix is unknown; labels are given for an STL file, which cannot store them, or do not
+        fit the triangles.
 
     Examples
     --------
@@ -88,10 +95,13 @@ def save_surface(
     if path.suffix.lower() not in writers:
         raise InputError(f"{path}: expected a name ending in {' or '.join(SURFACE_SUFFIXES)}")
     if labels and path.suffix.lower() not in LABELLED_SUFFIXES:
-        raise InputError(f"{path}: STL cannot store labels of triangles; use {' or '.join(LABELLED_SUFFIXES)}")
+        raise InputError(
+            f"{path}: STL cannot store labels of triangles; use {' or '.join(LABELLED_SUFFIXES)}"
+        )
     if odd := [name for name in labels or {} if not SET_NAME.fullmatch(name)]:
         raise InputError(
-            f"{path}: expected label names of up to {MOST_LETTERS} letters, digits, _ or -, the first a letter, "
+            f"{path}: expected label names of up to {MOST_LETTERS} letters, digits, _ or -, the "
+            "first a letter, "
             f'got "{plain(odd[0])}"; rename them'
         )
     surface, labels = _checked(path, surface, labels)
@@ -104,15 +114,23 @@ def save_surface(
 
 
 def _checked(path: Path, surface: Surface, labels: Labels | None) -> tuple[Surface, Labels]:
-    """Return the surface and labels as arrays; InputError for triangles or labels that do not fit."""
+    """Return the surface and labels as arrays; InputError for triangles or labels that do not
+    fit.
+    """
     points, triangles = checked_simplices(f"{path}: surface", surface.points, surface.triangles, 3)
     if points.shape[1] != 3:
         raise InputError(f"{path}: expected points in space, got shape {points.shape}")
     arrays, range_ = checked_fields(f"{path}: labels", labels, len(triangles)), np.iinfo(np.int32)
     for name, values in arrays.items():
-        if values.ndim != 1 or values.dtype.kind not in "iu" or values.min() < range_.min or values.max() > range_.max:
+        if (
+            values.ndim != 1
+            or values.dtype.kind not in "iu"
+            or values.min() < range_.min
+            or values.max() > range_.max
+        ):
             raise InputError(
-                f"{path}: labels: {name}: expected a 32-bit integer for each of {len(triangles)} triangles"
+                f"{path}: labels: {name}: expected a 32-bit integer for each of {len(triangles)} "
+                "triangles"
             )
     return surface._replace(points=points, triangles=triangles), arrays
 
@@ -128,15 +146,22 @@ def boundary_ply(model: Model) -> bytes:
 
 
 def _boundary(model: Model) -> tuple[Surface, str, str]:
-    """Return the surface, a text for its file that begins with the unit of length, and the space of its points."""
+    """Return the surface, a text for its file that begins with the unit of length, and the space
+    of its points.
+    """
     if model.mesh.ndim != 3:
         raise InputError("surface: expected a tetrahedral mesh, got triangles")
     surface = extract_surface(model.mesh.points, model.mesh.cells, np.arange(len(model.mesh.cells)))
-    return surface, f"{STRESS_UNITS[model.units].length} {model.about.get('image', '')}", model.space
+    return (
+        surface,
+        f"{STRESS_UNITS[model.units].length} {model.about.get('image', '')}",
+        model.space,
+    )
 
 
 def checked_surface(path: str | Path) -> SurfaceCheck:
-    """Read a surface file, merge nodes in the same place, and check whether it is closed, by trimesh.
+    """Read a surface file, merge nodes in the same place, and check whether it is closed, by
+    trimesh.
 
     trimesh reads STL and PLY, VTK reads the other formats.
 
@@ -149,10 +174,16 @@ def checked_surface(path: str | Path) -> SurfaceCheck:
     if not Path(path).is_file():
         raise InputError(f"{path}: no such surface file")
     try:
-        surface = _from_vtk(Path(path)) if Path(path).suffix.lower() in (".vtp", ".vtk") else _from_trimesh(Path(path))
+        surface = (
+            _from_vtk(Path(path))
+            if Path(path).suffix.lower() in (".vtp", ".vtk")
+            else _from_trimesh(Path(path))
+        )
         n_triangles = len(surface.faces)
     except Exception as error:  # trimesh raises any error on damaged files
-        raise InputError(f"{path}: cannot be read as a surface ({type(error).__name__}); damaged?") from error
+        raise InputError(
+            f"{path}: cannot be read as a surface ({type(error).__name__}); damaged?"
+        ) from error
     if n_triangles == 0:
         raise InputError(f"{path}: expected a surface of triangles, found none; is it damaged?")
     return SurfaceCheck(
@@ -165,7 +196,9 @@ def checked_surface(path: str | Path) -> SurfaceCheck:
 
 
 def _from_trimesh(path: Path) -> Any:
-    """Read the triangles of an STL or PLY file; it is opened here, as trimesh cannot open names that are not UTF-8."""
+    """Read the triangles of an STL or PLY file; it is opened here, as trimesh cannot open names
+    that are not UTF-8.
+    """
     import trimesh
 
     with path.open("rb") as stream:
@@ -215,7 +248,9 @@ def _ply(surface: Surface, about: str, space: str, labels: Labels) -> bytes:
         *(f"property int {name}" for name in labels),
         "end_header\n",
     ]
-    faces = np.empty(len(surface.triangles), dtype=[*PLY_FACE.descr, *((name, "<i4") for name in labels)])
+    faces = np.empty(
+        len(surface.triangles), dtype=[*PLY_FACE.descr, *((name, "<i4") for name in labels)]
+    )
     faces["count"], faces["nodes"] = 3, surface.triangles
     for name, values in labels.items():
         faces[name] = values
@@ -234,7 +269,8 @@ def _vtk(surface: Surface, about: str, space: str, labels: Labels) -> bytes:
     from vtkmodules.vtkIOLegacy import vtkPolyDataWriter
 
     writer = vtkPolyDataWriter()
-    writer.SetHeader(f"tetopt, {SPACE_KEY}{space.upper()} {_ascii_line(about)}"[:250])  # a line of 256 characters
+    # a line of 256 characters
+    writer.SetHeader(f"tetopt, {SPACE_KEY}{space.upper()} {_ascii_line(about)}"[:250])
     writer.SetFileVersion(LEGACY_VERSION)
     writer.SetFileTypeToBinary()
     return written_bytes(writer, _grid(surface, labels))

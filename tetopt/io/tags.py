@@ -1,13 +1,15 @@
-"""Shared code of mesh formats that have numbers for materials and sets, and comments for other data.
+"""Shared code of mesh formats that have numbers for materials and sets, and comments for other
+data.
 
-`numbered_parts` gives each cell and each facet of a set one number. If cells have labels, the number of a cell is its
-label; label 0, which formats treat as none, gets the number after the largest label. If a label exceeds
-`LARGEST_GROUP`, labels are numbered from 1, and comments list the label of each number. Otherwise it is the number of
-the cell's material, or without materials that of its cell set. If sets or materials divide such a group, each of its
-parts has its own number, after all others. The numbers of facets differ from those of cells. For a given R, those of
-the box's faces, "mask_surface" and "boundary", up to 2 R - 1, are the same for every mesh; interfaces and other sets
-are numbered from R + 1 in order, so that their numbers depend on the sets of the mesh. R is 1000, or a power of ten
-above all labels. Parts are numbered from 2 R + 1.
+`numbered_parts` gives each cell and each facet of a set one number. If cells have labels, the
+number of a cell is its label; label 0, which formats treat as none, gets the number after the
+largest label. If a label exceeds `LARGEST_GROUP`, labels are numbered from 1, and comments list the
+label of each number. Otherwise it is the number of the cell's material, or without materials that
+of its cell set. If sets or materials divide such a group, each of its parts has its own number,
+after all others. The numbers of facets differ from those of cells. For a given R, those of the
+box's faces, "mask_surface" and "boundary", up to 2 R - 1, are the same for every mesh; interfaces
+and other sets are numbered from R + 1 in order, so that their numbers depend on the sets of the
+mesh. R is 1000, or a power of ten above all labels. Parts are numbered from 2 R + 1.
 """
 
 from __future__ import annotations
@@ -27,15 +29,25 @@ from tetopt.mesh import Mesh
 from tetopt.model.labels import TABLE_TEXT, labels_of, table_of_words
 from tetopt.model.loads import load_words
 from tetopt.model.model import Model, described
-from tetopt.model.sets import BOUNDARY_SET, FACE_NAMES, MASK_SURFACE_SET, MOST_LETTERS, free_name, label_set_names
+from tetopt.model.sets import (
+    BOUNDARY_SET,
+    FACE_NAMES,
+    MASK_SURFACE_SET,
+    MOST_LETTERS,
+    free_name,
+    label_set_names,
+)
 
 UNNAMED_GROUP = "unnamed"  # the group of cells in no other group
 LEAST_ROOM = 1000  # numbers reserved for labels
-LARGEST_GROUP = 10**8 - 1  # largest label used as a number: twice the next power of ten still fits into 32 bits
+# largest label used as a number: twice the next power of ten still fits into 32 bits
+LARGEST_GROUP = 10**8 - 1
 
 
 class Tagged(NamedTuple):
-    """Overlapping sets as one tag per item, for formats that allow only one: the tag identifies all sets of an item."""
+    """Overlapping sets as one tag per item, for formats that allow only one: the tag identifies
+    all sets of an item.
+    """
 
     items: NDArray[np.int64]  # (T,) or (T, 2): all cells or facets in sets, ascending
     tags: NDArray[np.int64]  # (T,) from 1
@@ -43,19 +55,23 @@ class Tagged(NamedTuple):
 
 
 class Part(NamedTuple):
-    """The elements of one dimension. Entities and groups are gmsh's terms; other formats have only entities."""
+    """The elements of one dimension. Entities and groups are gmsh's terms; other formats have
+    only entities.
+    """
 
     dim: int
     numbers: NDArray[np.int64]  # (E,) from 1
     rows: NDArray[np.int64]  # (E,) cells, or (E, 2) facets
     entities: NDArray[np.int64]  # (E,) the number of each element's entity
-    groups_of: dict[int, list[int]]  # by entity, ascending: the numbers of its physical groups, the smallest set first
+    # by entity, ascending: the numbers of its physical groups, the smallest set first
+    groups_of: dict[int, list[int]]
     names: dict[int, str]  # names of the groups, by number
     sets: dict[str, list[int]]  # the entities of each set
 
 
 def tagged(sets: dict[str, NDArray[np.int64]]) -> Tagged:
-    """Return one tag for each combination of sets that occurs, from 1 in the order of first occurrence.
+    """Return one tag for each combination of sets that occurs, from 1 in the order of first
+    occurrence.
 
     Examples
     --------
@@ -77,9 +93,11 @@ def tagged(sets: dict[str, NDArray[np.int64]]) -> Tagged:
 
 
 def cell_tags(model: Model, labels: NDArray[np.int64] | None = None) -> Tagged:
-    """Return all cells, with one tag for each combination of label, material ("material_1", ...) and cell sets.
+    """Return all cells, with one tag for each combination of label, material ("material_1", ...)
+    and cell sets.
 
-    Without `labels` (M,), tags follow materials: they are the materials' numbers from 1 if no set divides one.
+    Without `labels` (M,), tags follow materials: they are the materials' numbers from 1 if no set
+    divides one.
 
     Raises
     ------
@@ -95,7 +113,8 @@ def cell_tags(model: Model, labels: NDArray[np.int64] | None = None) -> Tagged:
     kinds, which = np.unique(np.column_stack(columns), axis=0, return_inverse=True)
     ends = np.cumsum(np.bincount(kinds[:, 1], minlength=len(names)))[:-1]
     of_material = np.split(np.argsort(kinds[:, 1], kind="stable") + 1, ends)
-    tags_of = {name: tags.tolist() for name, tags in zip(names, of_material, strict=False)}  # one part without names
+    # one part without names
+    tags_of = {name: tags.tolist() for name, tags in zip(names, of_material, strict=False)}
     for name, tags in combined.tags_of.items():
         tags_of[name] = (np.flatnonzero(np.isin(kinds[:, 2], tags)) + 1).tolist()
     return Tagged(np.arange(len(material)), which.ravel() + 1, tags_of)
@@ -116,14 +135,22 @@ def facet_tags(mesh: Mesh, sets: dict[str, NDArray[np.int64]]) -> Tagged:
 
 
 def group_of_zero(labels: NDArray[np.int64]) -> int:
-    """Return the number of label 0, the first after all labels, because 0 means none in the formats."""
+    """Return the number of label 0, the first after all labels, because 0 means none in the
+    formats.
+    """
     return int(labels.max()) + 1
 
 
 def group_labels(model: Model) -> NDArray[np.int64] | None:
-    """Return the numbers of the cells' labels (M,), if any: the labels, unless there are `renumbered_labels`."""
+    """Return the numbers of the cells' labels (M,), if any: the labels, unless there are
+    `renumbered_labels`.
+    """
     labels, renumbered = labels_of(model.cell_data, len(model.mesh.cells)), renumbered_labels(model)
-    return labels if labels is None or not renumbered else np.searchsorted([0, *renumbered.values()], labels)
+    return (
+        labels
+        if labels is None or not renumbered
+        else np.searchsorted([0, *renumbered.values()], labels)
+    )
 
 
 def renumbered_labels(model: Model) -> dict[int, int]:
@@ -138,7 +165,9 @@ def without_labels(model: Model) -> Model:
     """Return the model without labels if numbers represent them."""
     of_cells = model.cell_data.items()
     return (
-        model if group_labels(model) is None else model._replace(cell_data={k: v for k, v in of_cells if k != "label"})
+        model
+        if group_labels(model) is None
+        else model._replace(cell_data={k: v for k, v in of_cells if k != "label"})
     )
 
 
@@ -157,25 +186,45 @@ def numbered_parts(model: Model) -> tuple[Part, Part]:
         room *= 10
     of_cells = cell_tags(model, labels)
     _, first = np.unique(of_cells.tags, return_index=True)
-    cells = _part(model.mesh.ndim, of_cells, [[each] for each in group[first].tolist()], names, 1, 2 * room)
+    cells = _part(
+        model.mesh.ndim, of_cells, [[each] for each in group[first].tolist()], names, 1, 2 * room
+    )
     return cells, _facets(model, room)
 
 
-def _part(dim: int, of_items: Tagged, groups_of: list[list[int]], names: dict[int, str], first: int, room: int) -> Part:
+def _part(
+    dim: int,
+    of_items: Tagged,
+    groups_of: list[list[int]],
+    names: dict[int, str],
+    first: int,
+    room: int,
+) -> Part:
     """Return the elements, numbered from `first`, with one entity for each tag.
 
-    An entity has the number of its first group; if the group has several entities, they are numbered after `room`.
+    An entity has the number of its first group; if the group has several entities, they are
+    numbered after `room`.
     """
     counts, free = Counter(groups[0] for groups in groups_of), count(room + 1)
-    number = np.array([groups[0] if counts[groups[0]] == 1 else next(free) for groups in groups_of], dtype=np.int64)
-    sets = {name: number[np.array(tags, dtype=np.int64) - 1].tolist() for name, tags in of_items.tags_of.items()}
+    number = np.array(
+        [groups[0] if counts[groups[0]] == 1 else next(free) for groups in groups_of],
+        dtype=np.int64,
+    )
+    sets = {
+        name: number[np.array(tags, dtype=np.int64) - 1].tolist()
+        for name, tags in of_items.tags_of.items()
+    }
     numbers = first + np.arange(len(of_items.items))
     by_number = dict(sorted(zip(number.tolist(), groups_of, strict=True)))
     return Part(dim, numbers, of_items.items, number[of_items.tags - 1], by_number, names, sets)
 
 
-def _cell_groups(model: Model, labels: NDArray[np.int64] | None) -> tuple[dict[int, str], NDArray[np.int64]]:
-    """Return the names of the cells' groups by number, ascending, and the number of each cell's group."""
+def _cell_groups(
+    model: Model, labels: NDArray[np.int64] | None
+) -> tuple[dict[int, str], NDArray[np.int64]]:
+    """Return the names of the cells' groups by number, ascending, and the number of each cell's
+    group.
+    """
     if labels is not None:
         kinds = np.unique(labels).tolist()
         own = [renumbered_labels(model).get(kind, kind) for kind in kinds]
@@ -186,11 +235,14 @@ def _cell_groups(model: Model, labels: NDArray[np.int64] | None) -> tuple[dict[i
             name: members
             for name, members in model.sets.cells.items()
             if not any(
-                name == called[kind] and np.array_equal(members, np.flatnonzero(labels == kind)) for kind in kinds
+                name == called[kind] and np.array_equal(members, np.flatnonzero(labels == kind))
+                for kind in kinds
             )
         }
         check_apart(list(called.values()), {**model.sets.facets, **others})
-        return dict(sorted((kind or zero, called[kind]) for kind in kinds)), np.where(labels == 0, zero, labels)
+        return dict(sorted((kind or zero, called[kind]) for kind in kinds)), np.where(
+            labels == 0, zero, labels
+        )
     if model.materials is None:
         listed, group = _disjoint_sets(model)
     else:
@@ -199,7 +251,9 @@ def _cell_groups(model: Model, labels: NDArray[np.int64] | None) -> tuple[dict[i
 
 
 def _disjoint_sets(model: Model) -> tuple[list[str], NDArray[np.int64]]:
-    """Return cell sets that do not overlap previous ones, and the number, from 1, of each cell's set or "unnamed"."""
+    """Return cell sets that do not overlap previous ones, and the number, from 1, of each cell's
+    set or "unnamed".
+    """
     names: list[str] = []
     number = np.zeros(len(model.mesh.cells), dtype=np.int64)
     for name, members in model.sets.cells.items():
@@ -216,7 +270,11 @@ def _disjoint_sets(model: Model) -> tuple[list[str], NDArray[np.int64]]:
 def _facets(model: Model, room: int) -> Part:
     """Return all facets in sets; facets in the same sets form an entity."""
     sets = model.sets.facets
-    last = [*(name for pair in FACE_NAMES[model.mesh.ndim] for name in pair), MASK_SURFACE_SET, BOUNDARY_SET]
+    last = [
+        *(name for pair in FACE_NAMES[model.mesh.ndim] for name in pair),
+        MASK_SURFACE_SET,
+        BOUNDARY_SET,
+    ]
     of_box = dict(zip(last, count(2 * room - len(last)), strict=False))
     free = count(room + 1)
     number = {name: of_box[name] if name in of_box else next(free) for name in sets}
@@ -226,29 +284,42 @@ def _facets(model: Model, room: int) -> Part:
         for tag in of_facets.tags_of[name]:
             groups_of[tag - 1].append(number[name])
     names = {number[name]: name for name in sorted(sets, key=number.__getitem__)}
-    return _part(model.mesh.ndim - 1, of_facets, groups_of, names, len(model.mesh.cells) + 1, 2 * room)
+    return _part(
+        model.mesh.ndim - 1, of_facets, groups_of, names, len(model.mesh.cells) + 1, 2 * room
+    )
 
 
 def material_names(model: Model, taken: dict[str, NDArray[np.int64]]) -> list[str]:
-    """Return names "material_1", ... of the model's materials; InputError if a set in `taken` has such a name."""
-    names = [] if model.materials is None else [f"material_{k + 1}" for k in range(len(model.materials.young))]
+    """Return names "material_1", ... of the model's materials; InputError if a set in `taken`
+    has such a name.
+    """
+    names = (
+        []
+        if model.materials is None
+        else [f"material_{k + 1}" for k in range(len(model.materials.young))]
+    )
     check_apart(names, taken)
     return names
 
 
 def named_materials(model: Model) -> list[str]:
-    """Return names of the model's materials by labels: "liver", or "label_5" for a label without a name.
+    """Return names of the model's materials by labels: "liver", or "label_5" for a label without a
+    name.
 
-    A material of several whole labels gets their joined names; materials that divide a label get its name and a number.
-    The others, which are parts of several labels, are "material_1", ...
+    A material of several whole labels gets their joined names; materials that divide a label get
+    its name and a number. The others, which are parts of several labels, are "material_1", ...
     """
     names = material_names(model, {})
     labels = labels_of(model.cell_data, len(model.mesh.cells))
     if model.materials is None or labels is None:
         return names
-    called = label_set_names(np.unique(labels).tolist(), table_of_words(model.about.get(TABLE_TEXT)).names)
+    called = label_set_names(
+        np.unique(labels).tolist(), table_of_words(model.about.get(TABLE_TEXT)).names
+    )
     labels_in: dict[int, list[int]] = {}
-    for material, label in np.unique(np.column_stack([model.materials.of_cell, labels]), axis=0).tolist():
+    for material, label in np.unique(
+        np.column_stack([model.materials.of_cell, labels]), axis=0
+    ).tolist():
         labels_in.setdefault(material, []).append(label)
     n_materials = Counter(label for those in labels_in.values() for label in those)
     own = {called[label]: np.flatnonzero(labels == label) for label in called}
@@ -271,16 +342,22 @@ def check_apart(names: list[str], taken: dict[str, NDArray[np.int64]]) -> None:
     """Raise InputError if a set has a name that the file uses for something else."""
     lower = {name.lower() for name in names}
     if both := [name for name in taken if name.lower() in lower]:
-        raise InputError(f'set {both[0]}: the file uses the name "{both[0]}" for something else; rename the set')
+        raise InputError(
+            f'set {both[0]}: the file uses the name "{both[0]}" for something else; rename the set'
+        )
 
 
 def remarks(model: Model) -> list[str]:
-    """Return lines for the header of a mesh file: `described`, each material's constants, the loads."""
+    """Return lines for the header of a mesh file: `described`, each material's constants, the
+    loads.
+    """
     lines = described(model)
     if model.materials is not None:
         pairs = zip(model.materials.young.tolist(), model.materials.nu.tolist(), strict=True)
         density = [] if model.materials.density is None else model.materials.density.tolist()
-        masses = [f", density {each!r} kg/m3" for each in density] or [""] * len(model.materials.young)
+        masses = [f", density {each!r} kg/m3" for each in density] or [""] * len(
+            model.materials.young
+        )
         lines += [
             f"material_{k}: young {young!r} {model.units}, nu {nu!r}{mass}"
             for k, ((young, nu), mass) in enumerate(zip(pairs, masses, strict=True), 1)
@@ -290,17 +367,28 @@ def remarks(model: Model) -> list[str]:
 
 
 def without_data(model: Model) -> list[str]:
-    """Return lines for the header of a file whose format does not support cell data and point data."""
+    """Return lines for the header of a file whose format does not support cell data and point
+    data.
+    """
     left_out = {"cell data": model.cell_data, "point data": model.point_data}
-    return [f"{what} (not supported by this format): {', '.join(data)}" for what, data in left_out.items() if data]
+    return [
+        f"{what} (not supported by this format): {', '.join(data)}"
+        for what, data in left_out.items()
+        if data
+    ]
 
 
-def as_columns(fields: dict[str, NDArray], shapes: Container[tuple[int, ...]] = ()) -> dict[str, NDArray]:
+def as_columns(
+    fields: dict[str, NDArray], shapes: Container[tuple[int, ...]] = ()
+) -> dict[str, NDArray]:
     """Split cell or point data into scalars by name: columns are numbered NAME_0, NAME_1, ...
 
-    Rows with one of the `shapes` are kept whole. A column with the name of another field is renamed.
+    Rows with one of the `shapes` are kept whole. A column with the name of another field is
+    renamed.
     """
-    whole = {name for name, values in fields.items() if values.ndim == 1 or values.shape[1:] in shapes}
+    whole = {
+        name for name, values in fields.items() if values.ndim == 1 or values.shape[1:] in shapes
+    }
     columns: dict[str, NDArray] = {}
     for name, values in fields.items():
         if name in whole:
@@ -313,14 +401,21 @@ def as_columns(fields: dict[str, NDArray], shapes: Container[tuple[int, ...]] = 
 
 def all_sets(part: Part) -> dict[str, list[int]]:
     """Return the entities of each set, and of each label that is not a set, by name."""
-    groups = {name: number for number, name in part.names.items() if name not in part.sets and name != UNNAMED_GROUP}
+    groups = {
+        name: number
+        for number, name in part.names.items()
+        if name not in part.sets and name != UNNAMED_GROUP
+    }
     return part.sets | {
-        name: [each for each, those in part.groups_of.items() if number in those] for name, number in groups.items()
+        name: [each for each, those in part.groups_of.items() if number in those]
+        for name, number in groups.items()
     }
 
 
 def label_lines(model: Model, cells: Part, what: str) -> list[str]:
-    """Describe how the numbers of cells, called `what` ("attribute"), represent labels, for the header and the run."""
+    """Describe how the numbers of cells, called `what` ("attribute"), represent labels, for the
+    header and the run.
+    """
     labels = group_labels(model)
     if labels is None:
         return []
@@ -328,13 +423,22 @@ def label_lines(model: Model, cells: Part, what: str) -> list[str]:
     renumbered = renumbered_labels(model)
     zero, lines = group_of_zero(labels), [f"the {what} of a cell is its label"]
     if renumbered:
-        lines[0] = f"the {what} of a cell numbers its label from 1, as labels above {LARGEST_GROUP} do not fit"
+        lines[0] = (
+            f"the {what} of a cell numbers its label from 1, as labels above {LARGEST_GROUP} do "
+            "not fit"
+        )
         lines += [f"{what} {number} is label {label}" for number, label in renumbered.items()]
     if zero in cells.names and zero not in divided:
         lines.append(f"label 0 is {what} {zero}, because 0 means none")
     if divided:
-        first, names = min(cells.groups_of.keys() - cells.names), ", ".join(cells.names[group] for group in divided)
-        lines[0] += f", unless a set or material divides it: then each part has a number from {first} on ({names})"
+        first, names = (
+            min(cells.groups_of.keys() - cells.names),
+            ", ".join(cells.names[group] for group in divided),
+        )
+        lines[0] += (
+            f", unless a set or material divides it: then each part has a number from {first} on "
+            f"({names})"
+        )
     return lines
 
 

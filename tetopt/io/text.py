@@ -5,21 +5,25 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Callable, Container, Iterable
-from html import escape  # not from xml.sax, which imports urllib.request and network modules, 0.02 s
+
+# not from xml.sax, which imports urllib.request and network modules, 0.02 s
+from html import escape
 from itertools import accumulate, chain, count
 from urllib.parse import quote
 
 from numpy.typing import NDArray
 
 NUMBERS_PER_LINE = 16  # the maximum in Abaqus
-# In a field's name, as some readers have lines of 256 characters: gmsh, and legacy VTK, percent-encoded there.
+# In a field's name, as some readers have lines of 256 characters: gmsh, and legacy VTK,
+# percent-encoded there.
 MOST_NAME_CHARACTERS = 240
 LINE_CHARACTERS = 300  # of another program's line in a message, at most
 UNNAMED_FIELD = "unnamed"  # VTK cannot read back a file with a field without a name
 
 
 def rows(*columns: NDArray, separator: str = " ") -> str:
-    """Format arrays side by side, each (K,) or (K, w), as one line per row; floats read back unchanged.
+    """Format arrays side by side, each (K,) or (K, w), as one line per row; floats read back
+    unchanged.
 
     Examples
     --------
@@ -34,10 +38,12 @@ def rows(*columns: NDArray, separator: str = " ") -> str:
 
 
 def plain(text: str) -> str:
-    r"""Convert untrusted text to one line of printable characters, for terminals, comments and names.
+    r"""Convert untrusted text to one line of printable characters, for terminals, comments and
+    names.
 
-    Unprintable characters are shown as Python escapes: line breaks, control characters, marks that reverse the
-    direction of writing, and lone surrogates from names of files that are not UTF-8. Spaces of any width are kept.
+    Unprintable characters are shown as Python escapes: line breaks, control characters, marks that
+    reverse the direction of writing, and lone surrogates from names of files that are not UTF-8.
+    Spaces of any width are kept.
 
     Examples
     --------
@@ -47,7 +53,8 @@ def plain(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(
-        letter if letter.isprintable() or unicodedata.category(letter) == "Zs" else _escaped(letter) for letter in text
+        letter if letter.isprintable() or unicodedata.category(letter) == "Zs" else _escaped(letter)
+        for letter in text
     )
 
 
@@ -73,7 +80,9 @@ def file_name(name: str) -> str:
 
 
 def short_name(name: str) -> str:
-    """Return as many letters of a `file_name` as fit into `MOST_NAME_CHARACTERS` when percent-encoded."""
+    """Return as many letters of a `file_name` as fit into `MOST_NAME_CHARACTERS` when
+    percent-encoded.
+    """
     name = file_name(name)
     if len(name) <= MOST_NAME_CHARACTERS and len(quote(name)) <= MOST_NAME_CHARACTERS:
         return name
@@ -82,7 +91,8 @@ def short_name(name: str) -> str:
 
 
 def legacy_name(name: str) -> str:
-    """Return a `short_name` without braces, which VTK's legacy writer misreads as its own marks and crashes on.
+    """Return a `short_name` without braces, which VTK's legacy writer misreads as its own marks and
+    crashes on.
 
     Examples
     --------
@@ -114,16 +124,24 @@ def names_apart(names: Iterable[str], shown: Callable[[str], str]) -> dict[str, 
 
 def free_text(text: str, taken: Container[str]) -> str:
     """Return the text, numbered from 2 if it is taken."""
-    return next(each for each in chain([text], (f"{text}_{number}" for number in count(2))) if each not in taken)
+    return next(
+        each
+        for each in chain([text], (f"{text}_{number}" for number in count(2)))
+        if each not in taken
+    )
 
 
 def comment_lines(lines: Iterable[str], mark: str = "") -> str:
-    """Format texts of any content as one comment line each, beginning with a format's comment mark."""
+    """Format texts of any content as one comment line each, beginning with a format's comment
+    mark.
+    """
     return "".join(f"{mark}{plain(line)}\n" for line in lines)
 
 
 def xml_comment(lines: Iterable[str]) -> str:
-    """Format lines as an XML comment, which cannot contain two adjacent hyphens or control characters."""
+    """Format lines as an XML comment, which cannot contain two adjacent hyphens or control
+    characters.
+    """
     return f"<!--\n{re.sub('-(?=-)', '- ', comment_lines(lines))}-->\n"
 
 
@@ -136,4 +154,6 @@ def blocks(numbers: NDArray, separator: str = " ") -> str:
     """Format a list of numbers, `NUMBERS_PER_LINE` per line."""
     texts = list(map(repr, numbers.tolist()))
     starts = range(0, len(texts), NUMBERS_PER_LINE)
-    return "".join(f"{separator.join(texts[start : start + NUMBERS_PER_LINE])}\n" for start in starts)
+    return "".join(
+        f"{separator.join(texts[start : start + NUMBERS_PER_LINE])}\n" for start in starts
+    )

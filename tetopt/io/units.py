@@ -1,4 +1,6 @@
-"""Units of length in the headers of images, converted to millimetres: the same words for all formats."""
+"""Units of length in the headers of images, converted to millimetres: the same words for all
+formats.
+"""
 
 from __future__ import annotations
 
@@ -13,22 +15,56 @@ from tetopt.io.text import plain
 
 # NGFF's units of length, with names of UDUNITS-2, in mm.
 MM_PER_LENGTH = {
-    "yoctometer": 1e-21, "zeptometer": 1e-18, "attometer": 1e-15, "femtometer": 1e-12, "picometer": 1e-9,
-    "angstrom": 1e-7, "nanometer": 1e-6, "micrometer": 1e-3, "millimeter": 1.0, "centimeter": 10.0, "decimeter": 100.0,
-    "meter": 1e3, "hectometer": 1e5, "kilometer": 1e6, "megameter": 1e9, "gigameter": 1e12, "terameter": 1e15,
-    "petameter": 1e18, "exameter": 1e21, "zettameter": 1e24, "yottameter": 1e27, "inch": 25.4, "foot": 304.8,
-    "yard": 914.4, "mile": 1609344.0, "parsec": 3.0856775814913674e19,
-}  # fmt: skip
-# Other words for them, in lower case, without a plural's s; "MM" and "Um" are written by programs for mm and um.
+    "yoctometer": 1e-21,
+    "zeptometer": 1e-18,
+    "attometer": 1e-15,
+    "femtometer": 1e-12,
+    "picometer": 1e-9,
+    "angstrom": 1e-7,
+    "nanometer": 1e-6,
+    "micrometer": 1e-3,
+    "millimeter": 1.0,
+    "centimeter": 10.0,
+    "decimeter": 100.0,
+    "meter": 1e3,
+    "hectometer": 1e5,
+    "kilometer": 1e6,
+    "megameter": 1e9,
+    "gigameter": 1e12,
+    "terameter": 1e15,
+    "petameter": 1e18,
+    "exameter": 1e21,
+    "zettameter": 1e24,
+    "yottameter": 1e27,
+    "inch": 25.4,
+    "foot": 304.8,
+    "yard": 914.4,
+    "mile": 1609344.0,
+    "parsec": 3.0856775814913674e19,
+}
+# Other words for them, in lower case, without a plural's s; "MM" and "Um" are written by programs
+# for mm and um.
 SHORT_WORDS = {
-    "m": "meter", "dm": "decimeter", "cm": "centimeter", "mm": "millimeter", "um": "micrometer", "nm": "nanometer",
-    "pm": "picometer", "km": "kilometer", "micron": "micrometer", "in": "inch", "inche": "inch", "ft": "foot",
+    "m": "meter",
+    "dm": "decimeter",
+    "cm": "centimeter",
+    "mm": "millimeter",
+    "um": "micrometer",
+    "nm": "nanometer",
+    "pm": "picometer",
+    "km": "kilometer",
+    "micron": "micrometer",
+    "in": "inch",
+    "inche": "inch",
+    "ft": "foot",
     "feet": "foot",
-}  # fmt: skip
-NO_UNITS = ("", "?", "none", "n/a", "unknown", "unit", "unitless", "pixel", "voxel")  # words for a missing unit
+}
+# words for a missing unit
+NO_UNITS = ("", "?", "none", "n/a", "unknown", "unit", "unitless", "pixel", "voxel")
 # The micro sign and the Greek letter, also as UTF-8 read as Latin-1, and as ImageJ's escape.
 MICRO = re.compile(r"\\u00b5|\\u03bc|\xc2\xb5|\xce\xbc|\xb5|\u03bc", re.IGNORECASE)
-# mm, longest side of an image's box: a body is shorter than the first; beyond these, the unit is probably not mm.
+# mm, longest side of an image's box: a body is shorter than the first; beyond these, the unit is
+# probably not mm.
 LONGEST_BOX, SHORTEST_BOX = 3000.0, 1.0
 
 
@@ -51,13 +87,18 @@ def mm_of_unit(word: str, name: str = "unit") -> float | None:
             return None
         if (mm := MM_PER_LENGTH.get(SHORT_WORDS.get(each, each))) is not None:
             return mm
-    raise InputError(f'{name}: expected a length such as "mm" or "um", got "{plain(word[:40])}"; correct the header')
+    raise InputError(
+        f'{name}: expected a length such as "mm" or "um", got "{plain(word[:40])}"; correct the '
+        "header"
+    )
 
 
 def mm_of_axes(words: Sequence[str], name: str, notes: list[str]) -> NDArray[np.float64] | None:
-    """Return the length of each axis's unit, mm, assuming mm where one is missing; None if all are missing.
+    """Return the length of each axis's unit, mm, assuming mm where one is missing; None if all are
+    missing.
 
-    Adds a note if only some are missing, or a word stands there that is not a unit, such as "pixel".
+    Adds a note if only some are missing, or a word stands there that is not a unit, such as
+    "pixel".
 
     Raises
     ------
@@ -65,7 +106,9 @@ def mm_of_axes(words: Sequence[str], name: str, notes: list[str]) -> NDArray[np.
         A word is not a length.
     """
     lengths = [mm_of_unit(word, name) for word in words]
-    missing = {axis: word for axis, (word, mm) in enumerate(zip(words, lengths, strict=True)) if mm is None}
+    missing = {
+        axis: word for axis, (word, mm) in enumerate(zip(words, lengths, strict=True)) if mm is None
+    }
     if any(missing.values()) or 0 < len(missing) < len(words):
         listed = ", ".join(f'axis {axis}: "{plain(word)}"' for axis, word in missing.items())
         notes.append(f"{name}: expected a unit of length, got none for {listed}; assuming mm")
@@ -76,16 +119,22 @@ def mm_of_axes(words: Sequence[str], name: str, notes: list[str]) -> NDArray[np.
 
 def notes_of_size(
     shape: Sequence[int], affine: NDArray[np.float64], lengths: NDArray[np.float64] | None
-) -> list[str]:  # fmt: skip
+) -> list[str]:
     """Return a warning if the longest side of the image's box is unusual.
 
-    `lengths` are those of the axes' units, mm; None if the file states no unit, which may then be another than mm.
+    `lengths` are those of the axes' units, mm; None if the file states no unit, which may then be
+    another than mm.
     """
     steps = np.linalg.norm(affine[:-1, :-1], axis=0)
     longest = max(float(step) * size for step, size in zip(steps, shape, strict=False))
     if SHORTEST_BOX <= longest <= LONGEST_BOX or (lengths is not None and (lengths != 1.0).any()):
         return []
     if lengths is not None:
-        return [f"the longest side of its box is {longest:.4g} mm, in the unit that its header states"]
+        return [
+            f"the longest side of its box is {longest:.4g} mm, in the unit that its header states"
+        ]
     voxel = " x ".join(f"{step:.4g}" for step in steps)
-    return [f"the longest side of its box is {longest:.4g} mm; are its voxels {voxel} mm, or in another unit?"]
+    return [
+        f"the longest side of its box is {longest:.4g} mm; are its voxels {voxel} mm, or in "
+        "another unit?"
+    ]

@@ -20,11 +20,14 @@ TRAILING_BYTES = 2**24  # 17 MB after the last voxel: MGH's tags
 # Stored numbers of so many bits, rescaled by whole numbers up to these, are exact in float32.
 EXACT_BITS, LARGEST_SLOPE, LARGEST_INTERCEPT = 16, 64, 2**22
 TOO_LONG = f"{DAMAGED_FILE} (it continues far after the last voxel, beyond byte {{}})"
-UNREADABLE_FILE = "truncated or damaged, or not an image of this kind; copy it again, or check its name"
+UNREADABLE_FILE = (
+    "truncated or damaged, or not an image of this kind; copy it again, or check its name"
+)
 
 
 class VoxelsInFile:
-    """Three axes of an array in a file, with fixed indices on its other axes; boxes are read by slicing.
+    """Three axes of an array in a file, with fixed indices on its other axes; boxes are read by
+    slicing.
 
     Parameters
     ----------
@@ -39,7 +42,11 @@ class VoxelsInFile:
     """
 
     def __init__(
-        self, path: Path, array: Any, picks: tuple[int | slice, ...], chunks: Sequence[int] | None = None
+        self,
+        path: Path,
+        array: Any,
+        picks: tuple[int | slice, ...],
+        chunks: Sequence[int] | None = None,
     ) -> None:
         self.path, self.array, self.picks = path, array, picks
         spans = [(axis, pick) for axis, pick in enumerate(picks) if isinstance(pick, slice)]
@@ -49,14 +56,22 @@ class VoxelsInFile:
 
     @property
     def strides(self) -> tuple[int, ...] | None:
-        """Bytes between voxels along each axis of a mapped file, in which the first varies fastest; None for chunks."""
+        """Bytes between voxels along each axis of a mapped file, in which the first varies
+        fastest; None for chunks.
+        """
         if self.chunks is not None:
             return None
         steps = np.cumprod([np.dtype(self.dtype).itemsize, *self.array.shape[:-1]])
-        return tuple(int(step) for step, pick in zip(steps, self.picks, strict=True) if isinstance(pick, slice))
+        return tuple(
+            int(step)
+            for step, pick in zip(steps, self.picks, strict=True)
+            if isinstance(pick, slice)
+        )
 
     def within(self, ranges: Sequence[tuple[int, int]]) -> VoxelsInFile:
-        """Return the voxels in a box of indices, start (inclusive) to stop (exclusive) along the three axes."""
+        """Return the voxels in a box of indices, start (inclusive) to stop (exclusive) along the
+        three axes.
+        """
         bounds = iter(ranges)
         picks = []
         for pick in self.picks:
@@ -80,19 +95,23 @@ class VoxelsInFile:
         except Exception as error:  # codecs raise any error on damaged chunks
             place = ", ".join(f"{start}:{stop}" for start, stop in ranges)
             raise InputError(
-                f"{self.path}: its voxels {place} cannot be read ({one_line(error)[:200]}); copy it again"
+                f"{self.path}: its voxels {place} cannot be read ({one_line(error)[:200]}); copy "
+                "it again"
             ) from error
 
 
 def volume_index(trailing: Sequence[int], volume: int | None, axes: str = "") -> tuple[int, ...]:
-    """Return the index into the axes beyond the third (or beyond a picture's two) for the requested volume.
+    """Return the index into the axes beyond the third (or beyond a picture's two) for the requested
+    volume.
 
     `axes` lists their names and lengths, if they have names.
     """
     axes = f" along {axes}" if axes else ""
     count = math.prod(int(size) for size in trailing)
     if count <= 0:
-        raise InputError(f"expected voxels along every axis, got trailing axes of lengths {trailing}")
+        raise InputError(
+            f"expected voxels along every axis, got trailing axes of lengths {trailing}"
+        )
     if volume is None and count > 1:
         raise InputError(
             f"the file has {count} volumes{axes}; choose one from 0 to {count - 1}: `volume=k`, "
@@ -101,19 +120,27 @@ def volume_index(trailing: Sequence[int], volume: int | None, axes: str = "") ->
     volume = 0 if volume is None else volume
     if not 0 <= volume < count:
         volumes = "one volume" if count == 1 else f"{count} volumes{axes}"
-        raise InputError(f"expected a volume from 0 to {count - 1}, got {volume}: the file has {volumes}")
+        raise InputError(
+            f"expected a volume from 0 to {count - 1}, got {volume}: the file has {volumes}"
+        )
     return tuple(int(i) for i in np.unravel_index(volume, trailing, order="F"))
 
 
-def check_room(sizes: Sequence[int], value_bytes: int, remedy: str = "crop or resample it first") -> None:
-    """Raise InputError if one volume, the first three axes, does not fit into memory, as read and as an `Image`."""
+def check_room(
+    sizes: Sequence[int], value_bytes: int, remedy: str = "crop or resample it first"
+) -> None:
+    """Raise InputError if one volume, the first three axes, does not fit into memory, as read
+    and as an `Image`.
+    """
     count = math.prod(sizes[:3])
     shape = " x ".join(str(size) for size in sizes[:3])
     check_memory(count * (value_bytes + IMAGE_BYTES), f"its {shape} voxels", remedy)
 
 
 def exact_type(bits: int, scales: Iterable[tuple[float, float]]) -> type[np.floating[Any]]:
-    """Return the type for stored whole numbers of so many bits, multiplied by slopes, plus intercepts."""
+    """Return the type for stored whole numbers of so many bits, multiplied by slopes, plus
+    intercepts.
+    """
     is_exact = bits <= EXACT_BITS and all(
         slope == round(slope)
         and shift == round(shift)

@@ -1,18 +1,21 @@
 """Meshes and models as VTK files: XML (.vtu) and legacy (.vtk), through VTK's own writers.
 
-Points are in world coordinates, mm; cells are positively oriented and of one type: linear, or quadratic with straight
-edges, with corners first among the points. Data of cells and points are cell data and point data. Materials are cell
-data `young`, `nu`, `material` (from 1), and `density`, kg/m3, if present; moduli that vary within a cell are also cell
-data `young_gauss`, with a column for each Gauss point of quadratic cells, or point data `young_nodes`. Strings are
-field data, as UTF-8 bytes: meshio rejects files with VTK's string arrays, and pyvista writes only ASCII to them.
+Points are in world coordinates, mm; cells are positively oriented and of one type: linear, or
+quadratic with straight edges, with corners first among the points. Data of cells and points are
+cell data and point data. Materials are cell data `young`, `nu`, `material` (from 1), and `density`,
+kg/m3, if present; moduli that vary within a cell are also cell data `young_gauss`, with a column
+for each Gauss point of quadratic cells, or point data `young_nodes`. Strings are field data, as
+UTF-8 bytes: meshio rejects files with VTK's string arrays, and pyvista writes only ASCII to them.
 `loads` contains loads in text form.
 
-A facet set is field data "facets:NAME", rows (cell, local node opposite), and its nodes are point data "on_NAME", 1 or
-0, for ParaView; a cell set is field data "cells:NAME", cell numbers from 0. Other programs keep field data when they
-change the cells: "cells_sha256" identifies the cells for which the sets were written.
+A facet set is field data "facets:NAME", rows (cell, local node opposite), and its nodes are point
+data "on_NAME", 1 or 0, for ParaView; a cell set is field data "cells:NAME", cell numbers from 0.
+Other programs keep field data when they change the cells: "cells_sha256" identifies the cells for
+which the sets were written.
 
-3D Slicer (`vtkMRMLModelStorageNode`) assumes LPS coordinates unless the header of a .vtk file has "SPACE=RAS", as
-tetopt's files do, or a .vtu file has a string array SPACE, which tetopt's cannot have: use .vtk there, or LPS.
+3D Slicer (`vtkMRMLModelStorageNode`) assumes LPS coordinates unless the header of a .vtk file has
+"SPACE=RAS", as tetopt's files do, or a .vtu file has a string array SPACE, which tetopt's cannot
+have: use .vtk there, or LPS.
 """
 
 from __future__ import annotations
@@ -41,7 +44,8 @@ if TYPE_CHECKING:
 VTK_SUFFIXES = (".vtu", ".vtk")  # formats that contain a whole model and can be read back
 # Names of field data in tetopt's files, see above.
 FACETS_PREFIX, CELLS_PREFIX, CHECKSUM_NAME = "facets:", "cells:", "cells_sha256"
-COMPRESSION_LEVEL = 2  # of zlib: files are 3 % larger than with VTK's default, 5, and written in 0.4 of the time
+# of zlib: files are 3 % larger than with VTK's default, 5, and written in 0.4 of the time
+COMPRESSION_LEVEL = 2
 LEGACY_VERSION = 42  # version 4.2: older programs, including 3D Slicer, cannot read 5.1
 
 
@@ -71,8 +75,8 @@ def vtk(model: Model) -> bytes:
 def _without_int64(values: NDArray) -> NDArray:
     """Convert 64-bit integers to 32 bits, or to floats if they do not fit.
 
-    VTK writes them as "long", whose size depends on the platform, or, if they are a "long long" (e.g. from a VTU file),
-    as "vtktypeint64", which meshio does not know.
+    VTK writes them as "long", whose size depends on the platform, or, if they are a "long long"
+    (e.g. from a VTU file), as "vtktypeint64", which meshio does not know.
     """
     if values.dtype.kind not in "iu" or values.dtype.itemsize < 8:
         return values
@@ -93,14 +97,17 @@ def xml_bytes(writer: Any, grid: vtkDataSet) -> bytes:
 
 
 def name_in_xml(name: str) -> str:
-    """Escape a name for VTK's XML files; apostrophes, too, as `tetopt.io.read_vtk` checks counts between them."""
+    """Escape a name for VTK's XML files; apostrophes, too, as `tetopt.io.read_vtk` checks counts
+    between them.
+    """
     return xml_attribute(name).replace("'", "&apos;")
 
 
 def written_bytes(writer: Any, grid: vtkDataSet) -> bytes:
     """Return the output of a VTK writer for a grid.
 
-    VTK writes to memory and Python to the disk: on a full disk, VTK reports nothing or ends the process.
+    VTK writes to memory and Python to the disk: on a full disk, VTK reports nothing or ends the
+    process.
     """
     writer.SetInputData(grid)
     writer.WriteToOutputStringOn()
@@ -120,7 +127,12 @@ def model_grid(model: Model) -> vtkUnstructuredGrid:
     if model.materials is not None and model.materials.binning is not None:
         texts["binning"] = model.materials.binning._asdict()
     has_stresses = any(map(is_stress, [*model.cell_data, *model.point_data]))
-    if model.materials is not None or model.loads or has_stresses or STRESS_UNITS[model.units].mm != 1.0:
+    if (
+        model.materials is not None
+        or model.loads
+        or has_stresses
+        or STRESS_UNITS[model.units].mm != 1.0
+    ):
         texts["units"] = model.units
     if model.loads:
         texts["loads"] = [load_words(load) for load in model.loads]
@@ -133,7 +145,11 @@ def add_texts(grid: vtkUnstructuredGrid, texts: dict[str, Any]) -> None:
     """Add each entry as field data, as JSON unless it is a string already."""
     for name, value in texts.items():
         text = value if isinstance(value, str) else json.dumps(value)
-        add_array(grid.GetFieldData(), name, np.frombuffer(text.encode("utf-8", "backslashreplace"), dtype=np.uint8))
+        add_array(
+            grid.GetFieldData(),
+            name,
+            np.frombuffer(text.encode("utf-8", "backslashreplace"), dtype=np.uint8),
+        )
 
 
 def add_sets(grid: vtkUnstructuredGrid, mesh: Mesh, sets: Sets) -> None:
@@ -147,7 +163,9 @@ def add_sets(grid: vtkUnstructuredGrid, mesh: Mesh, sets: Sets) -> None:
 
 
 def sets_in(field_data: dict[str, NDArray], mesh: Mesh) -> tuple[Sets, tuple[str, ...]]:
-    """Return the sets in a file's field data, if they were written for these cells, and notes on dropped ones."""
+    """Return the sets in a file's field data, if they were written for these cells, and notes on
+    dropped ones.
+    """
     names = [name for name in field_data if name.startswith((FACETS_PREFIX, CELLS_PREFIX))]
     sets = Sets({}, {})
     if not names:
@@ -179,8 +197,10 @@ def box_in(field_data: dict[str, NDArray], ndim: int) -> Box | None:
     try:
         box = json_of(text_in(field_data, "box") or "")
         shape = tuple(box["shape"])
-        affine = Image(np.zeros((1,) * ndim), np.array(box["affine"], dtype=np.float64)).affine  # checked by Image
-    except (TypeError, ValueError, KeyError, OverflowError, RecursionError):  # another program's "box"
+        # checked by Image
+        affine = Image(np.zeros((1,) * ndim), np.array(box["affine"], dtype=np.float64)).affine
+    # another program's "box"
+    except (TypeError, ValueError, KeyError, OverflowError, RecursionError):
         return None
     is_shape = len(shape) == ndim and all(type(size) is int and size > 0 for size in shape)
     return Box(shape, affine) if is_shape else None

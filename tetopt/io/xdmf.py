@@ -1,10 +1,12 @@
-"""XDMF for FEniCSx (dolfinx), ParaView and meshio: one text file with the mesh, its moduli and tags of its sets.
+"""XDMF for FEniCSx (dolfinx), ParaView and meshio: one text file with the mesh, its moduli and tags
+of its sets.
 
-The domain has one grid, "mesh", as meshio requires, with cell data: first `material` (from 1), then `young` and `nu`.
-An <Information> in it contains the other grids: "facets" and "cells", if there are such sets, with one integer for each
-facet or cell in any set. A tag represents one combination of sets, so that a set has several tags:
-<Information Name="superior" Value="2 5"> in the grid lists them. The tag of a cell is its label, or another number if
-sets divide the label (`tetopt.io.tags.numbered_parts`). This program reads all data, on any number of processes::
+The domain has one grid, "mesh", as meshio requires, with cell data: first `material` (from 1), then
+`young` and `nu`. An <Information> in it contains the other grids: "facets" and "cells", if there
+are such sets, with one integer for each facet or cell in any set. A tag represents one combination
+of sets, so that a set has several tags: <Information Name="superior" Value="2 5"> in the grid lists
+them. The tag of a cell is its label, or another number if sets divide the label
+(`tetopt.io.tags.numbered_parts`). This program reads all data, on any number of processes::
 
     from xml.etree import ElementTree
 
@@ -28,7 +30,8 @@ sets divide the label (`tetopt.io.tags.numbered_parts`). This program reads all 
         of_set = root.find(f".//Grid[@Name='{grid}']/Information[@Name='{name}']").get("Value")
         return tags.indices[np.isin(tags.values, np.array(of_set.split(), dtype=int))]
 
-    def on_cells(name):  # a field that is constant in each cell; dolfinx has changed the cells' order
+    def on_cells(name):  # a field that is constant in each cell; dolfinx has changed the cells'
+    order
         text = root.find(f".//Grid[@Name='mesh']/Attribute[@Name='{name}']/DataItem").text
         field = fem.Function(fem.functionspace(mesh, ("DG", 0)))
         field.x.array[:] = np.array(text.split(), dtype=float)[mesh.topology.original_cell_index]
@@ -37,16 +40,18 @@ sets divide the label (`tetopt.io.tags.numbered_parts`). This program reads all 
     young, nu = on_cells("young"), on_cells("nu")
     superior = members(facet_tags, "facets", "superior")
 
-Before 0.7, `fem.functionspace` was `fem.FunctionSpace`; with this change the program also runs with 0.5.2.
-`read_meshtags` uses the first attribute of a grid, which is why `material` comes first. The encoding must be given;
-otherwise dolfinx looks for an HDF5 file next to this one. dolfinx cannot read floating-point cell data from XDMF, hence
-the parsing. Quadratic elements are chosen in dolfinx, on cells of either order: a file of order 2 also has the nodes of
-order 2, and dolfinx integrates its cells as curved, as those on interfaces may be.
+Before 0.7, `fem.functionspace` was `fem.FunctionSpace`; with this change the program also runs with
+0.5.2. `read_meshtags` uses the first attribute of a grid, which is why `material` comes first. The
+encoding must be given; otherwise dolfinx looks for an HDF5 file next to this one. dolfinx cannot
+read floating-point cell data from XDMF, hence the parsing. Quadratic elements are chosen in
+dolfinx, on cells of either order: a file of order 2 also has the nodes of order 2, and dolfinx
+integrates its cells as curved, as those on interfaces may be.
 
-In the grid "mesh", <Information Name="young"> and <Information Name="nu"> list the constants of materials 1, 2, ...,
-<Information Name="load" Value="hold:superior"> is a load in the text form of `tetopt.model.loads`, and
-<Information Name="about"> describes the origin of the file, its coordinates and its units. With a test function `v` of
-a vector space `V`, the following continues the program above and applies the loads of step 1::
+In the grid "mesh", <Information Name="young"> and <Information Name="nu"> list the constants of
+materials 1, 2, ..., <Information Name="load" Value="hold:superior"> is a load in the text form of
+`tetopt.model.loads`, and <Information Name="about"> describes the origin of the file, its
+coordinates and its units. With a test function `v` of a vector space `V`, the following continues
+the program above and applies the loads of step 1::
 
     import ufl
 
@@ -61,12 +66,12 @@ a vector space `V`, the following continues the program above and applies the lo
         texts = "0 " * dim if kind == "hold" else rest[-1].replace("free", "nan").replace(",", " ")
         numbers = np.array(texts.split(), dtype=float)
         if kind == "gravity":
-            forces.append(ufl.inner(per_mm3 * on_cells("density") * fem.Constant(mesh, numbers), v) * ufl.dx)
-            continue
+            forces.append(ufl.inner(per_mm3 * on_cells("density") * fem.Constant(mesh, numbers), v)
+            * ufl.dx) continue
         if kind in ("hold", "move"):
             for d in np.flatnonzero(np.isfinite(numbers)):
-                dofs = fem.locate_dofs_topological(V.sub(d), dim - 1, members(facet_tags, "facets", rest[0]))
-                conditions.append(fem.dirichletbc(numbers[d], dofs, V.sub(d)))
+                dofs = fem.locate_dofs_topological(V.sub(d), dim - 1, members(facet_tags, "facets",
+                rest[0])) conditions.append(fem.dirichletbc(numbers[d], dofs, V.sub(d)))
             continue
         of_set = root.find(f".//Grid[@Name='facets']/Information[@Name='{rest[0]}']").get("Value")
         on_set = ds(tuple(map(int, of_set.split())))
@@ -79,9 +84,10 @@ a vector space `V`, the following continues the program above and applies the lo
 
 Moduli that are linear within cells are the attribute `young_nodes`, one for each node.
 
-VTK, and thus pyvista and ParaView, follows the grid's Reference to a tree of the same grids, which it reads as blocks,
-if no list exceeds 10 MB, as that of the cells does from about 400 000 tetrahedra on: use .vtu for larger meshes. meshio
-ignores the Reference and reads the mesh and its data, without sets.
+VTK, and thus pyvista and ParaView, follows the grid's Reference to a tree of the same grids, which
+it reads as blocks, if no list exceeds 10 MB, as that of the cells does from about 400 000
+tetrahedra on: use .vtu for larger meshes. meshio ignores the Reference and reads the mesh and its
+data, without sets.
 """
 
 from __future__ import annotations
@@ -100,9 +106,13 @@ from tetopt.model.sets import Sets
 
 # By dimension and order, with VTK's order of nodes; lines must state their number of nodes.
 TOPOLOGY_TYPES = {
-    (1, 1): '"PolyLine" NodesPerElement="2"', (2, 1): '"Triangle"', (3, 1): '"Tetrahedron"',
-    (1, 2): '"Edge_3"', (2, 2): '"Triangle_6"', (3, 2): '"Tetrahedron_10"',
-}  # fmt: skip
+    (1, 1): '"PolyLine" NodesPerElement="2"',
+    (2, 1): '"Triangle"',
+    (3, 1): '"Tetrahedron"',
+    (1, 2): '"Edge_3"',
+    (2, 2): '"Triangle_6"',
+    (3, 2): '"Tetrahedron_10"',
+}
 GEOMETRY_TYPES = {2: "XY", 3: "XYZ"}
 TREE_PATH = "/Xdmf/Domain/Grid/Information/Grid"
 TIME_ELEMENT = '<Time Value="0"/>\n'  # pyvista 0.49 requires it in XDMF, meshio 5.3.5 rejects it
@@ -110,12 +120,14 @@ INFORMATION_TEXT = "&lt;main/&gt;"  # meshio parses an Information's text as XML
 
 
 def xdmf(model: Model) -> bytes:
-    """Return an XDMF file (.xdmf): mesh, cell data, materials, tags of facets and cells, and the loads as text.
+    """Return an XDMF file (.xdmf): mesh, cell data, materials, tags of facets and cells, and the
+    loads as text.
 
-    A facet is listed once, oriented outwards from its cell in the first of its sets; if another set holds it from the
-    other side, its tag is also in <Information Name="NAME turned"/>. dolfinx itself does not orient facets. Cell data
-    with 3 columns are written as vectors, with other numbers of columns as separate fields NAME_0, NAME_1, ...;
-    materials replace cell data with the names material, young, nu and density.
+    A facet is listed once, oriented outwards from its cell in the first of its sets; if another set
+    holds it from the other side, its tag is also in <Information Name="NAME turned"/>. dolfinx
+    itself does not orient facets. Cell data with 3 columns are written as vectors, with other
+    numbers of columns as separate fields NAME_0, NAME_1, ...; materials replace cell data with the
+    names material, young, nu and density.
 
     Raises
     ------
@@ -130,8 +142,9 @@ def xdmf(model: Model) -> bytes:
         grids.append(_cell_grid(model))
     text = _mesh_grid(model, "".join(grids))
     return (
-        f'<?xml version="1.0" encoding="utf-8"?>\n<Xdmf Version="3.0">\n<Domain>\n{text}</Domain>\n</Xdmf>\n'.encode()
-    )
+        '<?xml version="1.0" encoding="utf-8"?>\n<Xdmf '
+        f'Version="3.0">\n<Domain>\n{text}</Domain>\n</Xdmf>\n'
+    ).encode()
 
 
 def _check(model: Model) -> None:
@@ -143,9 +156,13 @@ def _check(model: Model) -> None:
 
 
 def _mesh_grid(model: Model, others: str) -> str:
-    """Return the domain's grid, with the tree of grids that VTK reads instead: itself by references, and `others`."""
+    """Return the domain's grid, with the tree of grids that VTK reads instead: itself by
+    references, and `others`.
+    """
     fields = model.cell_data
-    named = [("about", line) for line in described(model)] + [("load", load_words(load)) for load in model.loads]
+    named = [("about", line) for line in described(model)] + [
+        ("load", load_words(load)) for load in model.loads
+    ]
     if model.materials is not None:
         young, nu, of_cell = model.materials.young, model.materials.nu, model.materials.of_cell
         own = {"material": of_cell + 1, "young": young[of_cell], "nu": nu[of_cell]}
@@ -160,16 +177,24 @@ def _mesh_grid(model: Model, others: str) -> str:
     columns = [(*item, "Cell") for item in _columns(fields).items()]
     columns += [(*item, "Node") for item in _columns(at_nodes).items()]
     whole = _body(model, model.mesh.ndim, cells, _item(cells), _item(points))
-    whole += "".join(_attribute(name, values, center, _item(values)) for name, values, center in columns)
+    whole += "".join(
+        _attribute(name, values, center, _item(values)) for name, values, center in columns
+    )
     shown = _body(model, model.mesh.ndim, cells, _reference("Topology"), _reference("Geometry"))
     shown += "".join(
         _attribute(name, values, center, _reference(f"Attribute[{k}]"))
         for k, (name, values, center) in enumerate(columns, 1)
     )
-    tree = f'<Grid Name="all" GridType="Tree">\n<Grid Name="mesh">\n{TIME_ELEMENT}{shown}</Grid>\n{others}</Grid>\n'
+    tree = (
+        '<Grid Name="all" GridType="Tree">\n<Grid '
+        f'Name="mesh">\n{TIME_ELEMENT}{shown}</Grid>\n{others}</Grid>\n'
+    )
     tree = f'<Information Name="grids">{INFORMATION_TEXT}\n{tree}</Information>\n'
     texts = "".join(_information(*each) for each in named)
-    return f'<Grid Name="mesh" GridType="Uniform" Reference="{TREE_PATH}">\n{texts}{whole}{tree}</Grid>\n'
+    return (
+        '<Grid Name="mesh" GridType="Uniform" '
+        f'Reference="{TREE_PATH}">\n{texts}{whole}{tree}</Grid>\n'
+    )
 
 
 def _columns(fields: dict[str, NDArray]) -> dict[str, NDArray]:
@@ -192,7 +217,9 @@ def _facet_grid(model: Model) -> str:
     numbers, first = np.unique(np.concatenate(list(number.values())), return_index=True)
     listed = np.concatenate(list(sets.values()))[first]  # the row of each facet
     turned = {
-        f"{name} turned": number[name][listed[np.searchsorted(numbers, number[name]), 0] != members[:, 0]]
+        f"{name} turned": number[name][
+            listed[np.searchsorted(numbers, number[name]), 0] != members[:, 0]
+        ]
         for name, members in sets.items()
     }
     combined = tagged(number | {name: those for name, those in turned.items() if len(those)})
@@ -201,7 +228,9 @@ def _facet_grid(model: Model) -> str:
 
 
 def _tag_grid(name: str, model: Model, dim: int, nodes: NDArray[np.int64], combined: Tagged) -> str:
-    named = "".join(_information(each, " ".join(map(str, those))) for each, those in combined.tags_of.items())
+    named = "".join(
+        _information(each, " ".join(map(str, those))) for each, those in combined.tags_of.items()
+    )
     body = _body(model, dim, nodes, _item(nodes), _reference("Geometry"))
     tags = _attribute(name, combined.tags, "Cell", _item(combined.tags))
     return f'<Grid Name="{name}" GridType="Uniform">\n{named}{TIME_ELEMENT}{body}{tags}</Grid>\n'
@@ -209,7 +238,8 @@ def _tag_grid(name: str, model: Model, dim: int, nodes: NDArray[np.int64], combi
 
 def _body(model: Model, dim: int, nodes: NDArray[np.int64], node_item: str, point_item: str) -> str:
     return (
-        f'<Topology TopologyType={TOPOLOGY_TYPES[dim, model.order]} NumberOfElements="{len(nodes)}">\n'
+        f"<Topology TopologyType={TOPOLOGY_TYPES[dim, model.order]} "
+        f'NumberOfElements="{len(nodes)}">\n'
         f"{node_item}</Topology>\n"
         f'<Geometry GeometryType="{GEOMETRY_TYPES[model.mesh.ndim]}">\n{point_item}</Geometry>\n'
     )
@@ -217,7 +247,8 @@ def _body(model: Model, dim: int, nodes: NDArray[np.int64], node_item: str, poin
 
 def _attribute(name: str, values: NDArray, center: str, item: str) -> str:
     return (
-        f'<Attribute Name="{xml_attribute(name)}" AttributeType="{"Scalar" if values.ndim == 1 else "Vector"}" '
+        f'<Attribute Name="{xml_attribute(name)}" '
+        f'AttributeType="{"Scalar" if values.ndim == 1 else "Vector"}" '
         f'Center="{center}" Dimensions="{_sizes(values)}">\n{item}</Attribute>\n'
     )
 
@@ -245,7 +276,8 @@ def _item(values: NDArray) -> str:
 
 def _information(name: str, value: str) -> str:
     return (
-        f'<Information Name="{xml_attribute(name)}" Value="{xml_attribute(value)}">{INFORMATION_TEXT}</Information>\n'
+        f'<Information Name="{xml_attribute(name)}" '
+        f'Value="{xml_attribute(value)}">{INFORMATION_TEXT}</Information>\n'
     )
 
 

@@ -1,7 +1,8 @@
 """Zarr arrays and OME-Zarr images in local folders: axes, scales and translations of voxels.
 
-NGFF 0.4 and 0.5 (https://ngff.openmicroscopy.org) define axes, units, scales and translations; indices keep the order
-of the array's spatial axes. The zarr library reads metadata and voxels, and refuses what it does not understand.
+NGFF 0.4 and 0.5 (https://ngff.openmicroscopy.org) define axes, units, scales and translations;
+indices keep the order of the array's spatial axes. The zarr library reads metadata and voxels, and
+refuses what it does not understand.
 """
 
 from __future__ import annotations
@@ -30,21 +31,32 @@ from tetopt.system.files import folder_written_whole
 from tetopt.system.incoming import TEXT_BYTES, irregular
 
 ZARR_SUFFIX = ".zarr"
-NODE_FILES = ("zarr.json", ".zarray", ".zgroup")  # every Zarr array and group, of version 3 or 2, has one of these
+# every Zarr array and group, of version 3 or 2, has one of these
+NODE_FILES = ("zarr.json", ".zarray", ".zgroup")
 METADATA_FILES = (*NODE_FILES, ".zattrs", ".zmetadata")
-MOST_CHUNKS = 2**24  # in an image: their names are looked up in a minute or two; 2048^3 voxels have 4,096 of 128^3
-# In a chunk's file: headers of codecs, and per voxel a number of 8 bytes and the overhead of shards and codecs.
+# in an image: their names are looked up in a minute or two; 2048^3 voxels have 4,096 of 128^3
+MOST_CHUNKS = 2**24
+# In a chunk's file: headers of codecs, and per voxel a number of 8 bytes and the overhead of shards
+# and codecs.
 PACKED_BYTES, PACKED_VOXEL_BYTES = 2**16, 32
-CHUNK_EDGE = 128  # voxels, in written files: 4 MB of 16 bits, and a part of a mesh reads a few chunks
+# voxels, in written files: 4 MB of 16 bits, and a part of a mesh reads a few chunks
+CHUNK_EDGE = 128
 # Row of the affine and sign of an axis in RAS+, by its orientation (NGFF's RFC-4) or name.
 WAYS = {
-    "left-to-right": (0, 1.0), "right-to-left": (0, -1.0), "posterior-to-anterior": (1, 1.0),
-    "anterior-to-posterior": (1, -1.0), "inferior-to-superior": (2, 1.0), "superior-to-inferior": (2, -1.0),
-    "x": (0, 1.0), "y": (1, 1.0), "z": (2, 1.0),
-}  # fmt: skip
+    "left-to-right": (0, 1.0),
+    "right-to-left": (0, -1.0),
+    "posterior-to-anterior": (1, 1.0),
+    "anterior-to-posterior": (1, -1.0),
+    "inferior-to-superior": (2, 1.0),
+    "superior-to-inferior": (2, -1.0),
+    "x": (0, 1.0),
+    "y": (1, 1.0),
+    "z": (2, 1.0),
+}
 ARRAY_AXES = 32  # at most in an array, the limit of the oldest supported numpy
 MOST_LEVELS = 64  # in a multiscale: more than halving any volume can give
-# Errors on metadata of another structure: a list in place of a table, a missing entry, a text in place of a number.
+# Errors on metadata of another structure: a list in place of a table, a missing entry, a text in
+# place of a number.
 STRUCTURE_ERRORS = (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError)
 
 
@@ -99,11 +111,15 @@ def open_zarr(level: ZarrLevel, volume: int | None) -> Image:
     """
     words = ", ".join(f"{level.names[axis]} ({level.array.shape[axis]})" for axis in level.others)
     # The last axis varies fastest, as in the file.
-    index = volume_index([level.array.shape[axis] for axis in level.others[::-1]], volume, words)[::-1]
+    index = volume_index([level.array.shape[axis] for axis in level.others[::-1]], volume, words)[
+        ::-1
+    ]
     picks: list[int | slice] = [slice(0, int(size)) for size in level.array.shape]
     for axis, at in zip(level.others, index, strict=True):
         picks[axis] = at
-    return Image.stored(VoxelsInFile(level.folder, level.array, tuple(picks), level.array.chunks), level.affine)
+    return Image.stored(
+        VoxelsInFile(level.folder, level.array, tuple(picks), level.array.chunks), level.affine
+    )
 
 
 def read_chunks(voxels: VoxelsInFile) -> NDArray:
@@ -116,7 +132,9 @@ def read_chunks(voxels: VoxelsInFile) -> NDArray:
     """
     picks = [[pick.start, pick.stop] if isinstance(pick, slice) else pick for pick in voxels.picks]
     n_bytes = math.prod(voxels.shape) * voxels.dtype.itemsize
-    values: NDArray = read_apart(_values, voxels.path, picks, size=n_bytes, value_bytes=n_bytes, library="zarr")
+    values: NDArray = read_apart(
+        _values, voxels.path, picks, size=n_bytes, value_bytes=n_bytes, library="zarr"
+    )
     return values
 
 
@@ -128,28 +146,38 @@ def _values(folder: str, picks: list[list[int] | int]) -> NDArray:
 
 
 def zarr_levels(path: Path, notes: list[str]) -> list[ZarrLevel]:
-    """Return the arrays of an image, the finest first: those of OME-Zarr's first multiscale, or a single array.
+    """Return the arrays of an image, the finest first: those of OME-Zarr's first multiscale, or a
+    single array.
 
     Raises
     ------
     InputError
-        Without a leading path: zarr is not installed; the folder or its metadata do not describe a 3-D image with a
-        scale.
+        Without a leading path: zarr is not installed; the folder or its metadata do not describe a
+        3-D image with a scale.
     """
     node = _node(path)
     if hasattr(node, "shape"):
         _check_array(node)
         if (affine := _own_affine(node)) is None:
             raise InputError(
-                "this Zarr array has no scale; give the folder of its OME-Zarr image, or give it the "
+                "this Zarr array has no scale; give the folder of its OME-Zarr image, or give it "
+                "the "
                 'attribute "affine", 4 x 4 numbers from index to world in mm'
             )
-        return [ZarrLevel(path, node, tuple(f"axis {axis}" for axis in range(node.ndim)), (0, 1, 2), affine)]
+        return [
+            ZarrLevel(
+                path, node, tuple(f"axis {axis}" for axis in range(node.ndim)), (0, 1, 2), affine
+            )
+        ]
     attributes = node.attrs.asdict()
     ome = attributes.get("ome", attributes)
     if not isinstance(ome, dict) or not ome.get("multiscales"):
         inside = sorted(child.name for child in path.iterdir() if is_node(child))
-        listed = f"; choose one of its members: {', '.join(inside[:8])}" if inside else ", and it is empty"
+        listed = (
+            f"; choose one of its members: {', '.join(inside[:8])}"
+            if inside
+            else ", and it is empty"
+        )
         raise InputError(f"this Zarr group has no OME-Zarr image (multiscales){listed}")
     try:
         return _levels(path, ome["multiscales"][0], notes)
@@ -157,14 +185,17 @@ def zarr_levels(path: Path, notes: list[str]) -> list[ZarrLevel]:
         raise
     except STRUCTURE_ERRORS as error:
         words = f"{type(error).__name__}: {plain(one_line(error)[:80])}"
-        raise InputError(f"its OME-Zarr metadata does not follow NGFF 0.4 or 0.5 ({words}); write it again") from error
+        raise InputError(
+            f"its OME-Zarr metadata does not follow NGFF 0.4 or 0.5 ({words}); write it again"
+        ) from error
 
 
 def save_zarr(path: Path, image: Image, voxels: Any, dtype: DTypeLike) -> tuple[float, float]:
     """Write an OME-Zarr image (NGFF 0.5, Zarr's format 3) chunk by chunk, whole or not at all.
 
-    Its axes are named x, y, z in the order of the indices. Scale and translation are the lengths of a voxel's edges and
-    the position of the first voxel, which is all that NGFF supports; the attribute "affine" has the whole affine.
+    Its axes are named x, y, z in the order of the indices. Scale and translation are the lengths of
+    a voxel's edges and the position of the first voxel, which is all that NGFF supports; the
+    attribute "affine" has the whole affine.
 
     Parameters
     ----------
@@ -191,7 +222,9 @@ def save_zarr(path: Path, image: Image, voxels: Any, dtype: DTypeLike) -> tuple[
     """
     zarr = _library()
     if image.ndim != 3:
-        raise InputError(f"{path}: expected a 3-D image for Zarr, got a {image.ndim}-D one; use .nii.gz")
+        raise InputError(
+            f"{path}: expected a 3-D image for Zarr, got a {image.ndim}-D one; use .nii.gz"
+        )
     axes = [{"name": name, "type": "space", "unit": "millimeter"} for name in "xyz"]
     place = [
         {"type": "scale", "scale": image.spacing.tolist()},
@@ -203,13 +236,21 @@ def save_zarr(path: Path, image: Image, voxels: Any, dtype: DTypeLike) -> tuple[
     with folder_written_whole(path) as folder:
         group = zarr.open_group(folder, mode="w", zarr_format=3)
         array = group.create_array(
-            "0", shape=image.shape, chunks=[min(size, CHUNK_EDGE) for size in image.shape], dtype=dtype, fill_value=0,
-            dimension_names=["x", "y", "z"], attributes={"affine": image.affine.tolist()},
+            "0",
+            shape=image.shape,
+            chunks=[min(size, CHUNK_EDGE) for size in image.shape],
+            dtype=dtype,
+            fill_value=0,
+            dimension_names=["x", "y", "z"],
+            attributes={"affine": image.affine.tolist()},
             config={"write_empty_chunks": True},
-        )  # fmt: skip
+        )
         group.attrs.update({"ome": {"version": "0.5", "multiscales": [scales]}})
         for corner in itertools.product(*ends):
-            box = tuple(slice(at, min(at + CHUNK_EDGE, size)) for at, size in zip(corner, image.shape, strict=True))
+            box = tuple(
+                slice(at, min(at + CHUNK_EDGE, size))
+                for at, size in zip(corner, image.shape, strict=True)
+            )
             block = _of_type(path, np.asarray(voxels[box]), array.dtype)
             low, high = min(low, float(block.min())), max(high, float(block.max()))
             array[box] = block
@@ -222,7 +263,8 @@ def _of_type(path: Path, block: NDArray, dtype: np.dtype) -> NDArray:
         block, limits = np.rint(block), np.iinfo(dtype)
         if block.min() < limits.min or block.max() > limits.max:
             raise InputError(
-                f"{path}: expected values from {limits.min} to {limits.max} for {dtype}, got {block.min():g} to "
+                f"{path}: expected values from {limits.min} to {limits.max} for {dtype}, got "
+                f"{block.min():g} to "
                 f"{block.max():g}; scale them"
             )
     return block.astype(dtype)
@@ -241,7 +283,9 @@ def _node(path: Path, name: str = "") -> Any:
     """Open the array or group in a folder, or its member of this name."""
     zarr = _library()
     for file in (path / name / each for each in METADATA_FILES):
-        if file.exists() and ((other := irregular(file)) is not None or file.stat().st_size > TEXT_BYTES):
+        if file.exists() and (
+            (other := irregular(file)) is not None or file.stat().st_size > TEXT_BYTES
+        ):
             raise InputError(f"its {file.name} is {other or 'too long'}; expected JSON text")
     if not is_node(path):
         raise InputError(f"no Zarr array in this folder: expected one of {', '.join(NODE_FILES)}")
@@ -252,12 +296,17 @@ def _node(path: Path, name: str = "") -> Any:
             warnings.filterwarnings("error", message="(?s).*stored chunk shape .* is invalid")
             store = zarr.storage.LocalStore(path, read_only=True)
             return zarr.open(store, path=name, mode="r", use_consolidated=False)
-    except Exception as error:  # zarr raises any error on damaged metadata; a missing codec or array is named
-        raise InputError(f"its Zarr metadata cannot be read ({plain(one_line(error)[:200])}); copy it again") from error
+    # zarr raises any error on damaged metadata; a missing codec or array is named
+    except Exception as error:
+        raise InputError(
+            f"its Zarr metadata cannot be read ({plain(one_line(error)[:200])}); copy it again"
+        ) from error
 
 
 def _levels(path: Path, scales: dict[str, Any], notes: list[str]) -> list[ZarrLevel]:
-    """Return the arrays of a multiscale; errors of `STRUCTURE_ERRORS` if it has another structure than NGFF's."""
+    """Return the arrays of a multiscale; errors of `STRUCTURE_ERRORS` if it has another
+    structure than NGFF's.
+    """
     axes, after = _axes_of(scales["axes"]), scales.get("coordinateTransformations", [])
     levels = [_level(path, each, after, axes) for each in scales["datasets"][:MOST_LEVELS]]
     own = _own_affine(levels[0].array)
@@ -267,7 +316,10 @@ def _levels(path: Path, scales: dict[str, Any], notes: list[str]) -> list[ZarrLe
     notes += notes_of_size(levels[0].shape, own, np.ones(3))
     # NGFF 0.5 has no rotations: the attribute of the first level places all levels.
     turn = own @ np.linalg.inv(levels[0].affine)
-    return [levels[0]._replace(affine=own), *(each._replace(affine=turn @ each.affine) for each in levels[1:])]
+    return [
+        levels[0]._replace(affine=own),
+        *(each._replace(affine=turn @ each.affine) for each in levels[1:]),
+    ]
 
 
 def _level(path: Path, dataset: dict[str, Any], after: Sequence[dict], axes: _Axes) -> ZarrLevel:
@@ -279,17 +331,24 @@ def _level(path: Path, dataset: dict[str, Any], after: Sequence[dict], axes: _Ax
     affine[axes.rows, range(3)] = axes.steps * scale[axes.space]
     affine[axes.rows, 3] = axes.steps * shift[axes.space]
     affine[3, 3] = 1.0
-    return ZarrLevel(path / array.path, array, axes.names, tuple(axes.space), checked_affine(affine, 3))
+    return ZarrLevel(
+        path / array.path, array, axes.names, tuple(axes.space), checked_affine(affine, 3)
+    )
 
 
 def _axes_of(axes: list[dict[str, Any]]) -> _Axes:
     """Return the axes of a multiscale."""
     names, notes = tuple(plain(str(axis.get("name"))) for axis in axes), list[str]()
-    kinds = [axis.get("type", "space" if axis.get("name") in ("x", "y", "z") else None) for axis in axes]
+    kinds = [
+        axis.get("type", "space" if axis.get("name") in ("x", "y", "z") else None) for axis in axes
+    ]
     space = [number for number, kind in enumerate(kinds) if kind == "space"]
     words = ", ".join(names)
     if len(space) != 3:
-        raise InputError(f"expected three spatial axes, got {len(space)} among {words}; only 3-D images are supported")
+        raise InputError(
+            f"expected three spatial axes, got {len(space)} among {words}; only 3-D images are "
+            "supported"
+        )
     units = [axes[number].get("unit") or "" for number in space]
     if not any(units):
         notes.append("has no unit on its axes: assuming mm")
@@ -298,7 +357,8 @@ def _axes_of(axes: list[dict[str, Any]]) -> _Axes:
     if None in ways:
         ways = [WAYS.get(names[number].lower()) for number in space]
         notes.append(
-            "has no orientation: assuming x, y and z are right, anterior and superior; if left/right "
+            "has no orientation: assuming x, y and z are right, anterior and superior; if "
+            "left/right "
             "matters, give its axes an orientation (NGFF's RFC-4)"
         )
     rows, signs = zip(*(way or (None, 0.0) for way in ways), strict=True)
@@ -307,7 +367,9 @@ def _axes_of(axes: list[dict[str, Any]]) -> _Axes:
     return _Axes(names, space, list(rows), np.array(signs) * (1.0 if mm is None else mm), notes, mm)
 
 
-def _scale_and_shift(transforms: list[dict[str, Any]], n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _scale_and_shift(
+    transforms: list[dict[str, Any]], n: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Combine successive scales and translations of n axes."""
     scale, shift, has_scale = np.ones(n), np.zeros(n), False
     for each in transforms:
@@ -321,12 +383,16 @@ def _scale_and_shift(transforms: list[dict[str, Any]], n: int) -> tuple[NDArray[
         elif kind != "identity":
             raise _unusable("coordinateTransformations", kind, "scales and translations")
     if not has_scale:
-        raise InputError("its metadata has no scale, so its voxel size is unknown; correct the metadata")
+        raise InputError(
+            "its metadata has no scale, so its voxel size is unknown; correct the metadata"
+        )
     return scale, shift
 
 
 def _unusable(what: str, value: object, expected: str) -> InputError:
-    return InputError(f"its OME-Zarr metadata: {what}: expected {expected}, got {plain(str(value)[:80])}")
+    return InputError(
+        f"its OME-Zarr metadata: {what}: expected {expected}, got {plain(str(value)[:80])}"
+    )
 
 
 def _own_affine(array: Any) -> NDArray[np.float64] | None:
@@ -336,22 +402,32 @@ def _own_affine(array: Any) -> NDArray[np.float64] | None:
 
 
 def _check_array(array: Any) -> None:
-    """Raise InputError for values that are not numbers, no voxels, and chunks larger than memory."""
+    """Raise InputError for values that are not numbers, no voxels, and chunks larger than
+    memory.
+    """
     check_kind(array.dtype)
-    if not 3 <= array.ndim <= ARRAY_AXES or 0 in (*array.shape, *array.chunks, *(array.shards or ())):
+    if not 3 <= array.ndim <= ARRAY_AXES or 0 in (
+        *array.shape,
+        *array.chunks,
+        *(array.shards or ()),
+    ):
         raise InputError(
-            f"expected 3 to {ARRAY_AXES} axes with voxels, got shape {array.shape} in chunks of {array.chunks}"
+            f"expected 3 to {ARRAY_AXES} axes with voxels, got shape {array.shape} in chunks of "
+            f"{array.chunks}"
         )
     shape = " x ".join(str(size) for size in array.chunks)
     n_bytes = math.prod(array.chunks) * array.dtype.itemsize
-    check_memory(n_bytes, f"one of its chunks of {shape} voxels", "write it again with smaller chunks")
+    check_memory(
+        n_bytes, f"one of its chunks of {shape} voxels", "write it again with smaller chunks"
+    )
 
 
 def check_chunks(voxels: VoxelsInFile, notes: list[str]) -> None:
-    """Check that the files of these voxels' chunks are regular, and not longer or shorter than they can be.
+    """Check that the files of these voxels' chunks are regular, and not longer or shorter than they
+    can be.
 
-    Writers omit chunks that contain only the fill value; therefore some missing chunks only add to `notes`, but if all
-    are missing it is an error.
+    Writers omit chunks that contain only the fill value; therefore some missing chunks only add to
+    `notes`, but if all are missing it is an error.
 
     Raises
     ------
@@ -361,14 +437,21 @@ def check_chunks(voxels: VoxelsInFile, notes: list[str]) -> None:
     array = voxels.array
     edges = array.shards or array.chunks
     ranges = [
-        range(pick.start // size, -(-pick.stop // size)) if isinstance(pick, slice) else [pick // size]
+        range(pick.start // size, -(-pick.stop // size))
+        if isinstance(pick, slice)
+        else [pick // size]
         for pick, size in zip(voxels.picks, edges, strict=True)
     ]
     most_bytes = PACKED_BYTES + PACKED_VOXEL_BYTES * math.prod(edges)
     n_chunks, n_missing = math.prod(map(len, ranges)), 0
     if n_chunks > MOST_CHUNKS:
-        raise InputError(f"expected at most {MOST_CHUNKS} chunks, got {n_chunks}; write it again with larger chunks")
-    is_blosc = not array.shards and "Blosc" in "".join(type(each).__name__ for each in array.compressors[-1:])
+        raise InputError(
+            f"expected at most {MOST_CHUNKS} chunks, got {n_chunks}; write it again with larger "
+            "chunks"
+        )
+    is_blosc = not array.shards and "Blosc" in "".join(
+        type(each).__name__ for each in array.compressors[-1:]
+    )
     for place in itertools.product(*ranges):
         name = array.metadata.encode_chunk_key(place)
         file = f"{voxels.path}/{name}"
@@ -378,11 +461,19 @@ def check_chunks(voxels: VoxelsInFile, notes: list[str]) -> None:
             n_missing += 1
             continue
         if not stat.S_ISREG(status.st_mode) or status.st_size > most_bytes:
-            raise InputError(f"its chunk {name} is not a regular file of at most {most_bytes} bytes; copy it again")
+            raise InputError(
+                f"its chunk {name} is not a regular file of at most {most_bytes} bytes; copy it "
+                "again"
+            )
         if is_blosc and status.st_size < _blosc_length(file):
-            raise InputError(f"its chunk {name} has {status.st_size} bytes, fewer than it begins with; copy it again")
+            raise InputError(
+                f"its chunk {name} has {status.st_size} bytes, fewer than it begins with; copy "
+                "it again"
+            )
     if n_missing == n_chunks:
-        raise InputError(f"all of its {n_chunks} chunks are missing; copy it again, with its whole folder")
+        raise InputError(
+            f"all of its {n_chunks} chunks are missing; copy it again, with its whole folder"
+        )
     if n_missing > 0:
         notes.append(
             f"{n_missing} of its {n_chunks} chunks are missing; their voxels get its fill value, "
@@ -391,6 +482,8 @@ def check_chunks(voxels: VoxelsInFile, notes: list[str]) -> None:
 
 
 def _blosc_length(file: str) -> int:
-    """Return the length of a chunk by Blosc's header; the codec reads beyond the end of a shorter one."""
+    """Return the length of a chunk by Blosc's header; the codec reads beyond the end of a
+    shorter one.
+    """
     with open(file, "rb") as stream:
         return int.from_bytes(stream.read(16)[12:], "little")

@@ -60,10 +60,17 @@ class Converted(NamedTuple):
 
 
 def convert_file(
-    mesh: Path, output: Path, *, solver: SolverOptions, part: LabelledPart, choice: LabelChoice = ALL_LABELS,
-    image: Path | None = None, results: Path | None = None,
-) -> Converted:  # fmt: skip
-    """Write a mesh's file for a solver: materials, named sets, loads, in the format of the output's suffix.
+    mesh: Path,
+    output: Path,
+    *,
+    solver: SolverOptions,
+    part: LabelledPart,
+    choice: LabelChoice = ALL_LABELS,
+    image: Path | None = None,
+    results: Path | None = None,
+) -> Converted:
+    """Write a mesh's file for a solver: materials, named sets, loads, in the format of the output's
+    suffix.
 
     Parameters
     ----------
@@ -84,21 +91,34 @@ def convert_file(
         Options are invalid; files cannot be read, or do not belong together.
     """
     if results is not None and output.suffix.lower() not in VTK_SUFFIXES:
-        raise InputError(f"`results`: expected an output file {' or '.join(VTK_SUFFIXES)}, got {output}")
+        raise InputError(
+            f"`results`: expected an output file {' or '.join(VTK_SUFFIXES)}, got {output}"
+        )
     check_part(image, part, part.labels)
     loaded = read_mesh(mesh)
     check_unfolded(loaded.mesh, source=str(mesh))
-    loaded = without_stale_results(loaded, solver) if results is None else with_results(loaded, results)
-    solver, is_surface = replace(solver, order=_order_of(loaded, solver, output)), format_of(output).is_surface
+    loaded = (
+        without_stale_results(loaded, solver) if results is None else with_results(loaded, results)
+    )
+    solver, is_surface = (
+        replace(solver, order=_order_of(loaded, solver, output)),
+        format_of(output).is_surface,
+    )
     loaded = _with_straight_edges(loaded) if solver.order == 1 else loaded
     check_solver_options(output, solver, has_materials="young" in loaded.cell_data)
     if image is None and solver.average is not None:
-        raise InputError(f"`average`: {solver.average} averages over voxels and needs an image; pass `image`")
+        raise InputError(
+            f"`average`: {solver.average} averages over voxels and needs an image; pass `image`"
+        )
     if not solver.loads and not is_surface:
         solver = replace(solver, loads=_loads_of_file(loaded, choice))
     loaded, what, is_other = voxels_of(loaded, mesh, image, part, part.labels)
     loaded = _of_labels(loaded, choice)
-    about, box, voxels = _texts_of(loaded, solver, has_new_results=results is not None), loaded.box, None
+    about, box, voxels = (
+        _texts_of(loaded, solver, has_new_results=results is not None),
+        loaded.box,
+        None,
+    )
     if image is not None and what is not None:
         about = texts_of(loaded, is_other=True) if is_other else about
         about |= {"image": image.name, "image_sha256": sha256(image)}
@@ -106,22 +126,31 @@ def convert_file(
     if box is not None:
         about["box"] = box_text(box)
     if is_surface:  # a surface has no materials
-        kept = {name: rows for name, rows in loaded.cell_data.items() if name not in MATERIAL_FIELDS}
+        kept = {
+            name: rows for name, rows in loaded.cell_data.items() if name not in MATERIAL_FIELDS
+        }
         loaded = loaded._replace(cell_data=kept)
     model = with_chosen_sets(model_of_file(loaded, voxels, solver, about, box), output, solver)
     save_for_solver(output, model, solver)
     files = {"mesh": mesh.name, "output": output.name, "units": solver.units, "space": solver.space}
     files |= {} if results is None else {"results": results.name}
-    files |= {name: path.name for name in ("labels", "mask") if (path := getattr(part, name)) is not None}
+    files |= {
+        name: path.name for name in ("labels", "mask") if (path := getattr(part, name)) is not None
+    }
     return Converted(model, solver, files | {"versions": versions()} | model_summary(model))
 
 
 def _loads_of_file(loaded: MeshFile, choice: LabelChoice) -> list[str] | None:
-    """Return the loads of a mesh's file; without some of its labels, their sets would be others: warn instead."""
+    """Return the loads of a mesh's file; without some of its labels, their sets would be others:
+    warn instead.
+    """
     loads = loads_of(loaded)
     if choice == ALL_LABELS or not loads:
         return loads
-    warning(f"the file's loads were for all labels and are left out: {listed(loads)}; give those of the rest (`load`)")
+    warning(
+        f"the file's loads were for all labels and are left out: {listed(loads)}; give those of "
+        "the rest (`load`)"
+    )
     return None
 
 
@@ -144,13 +173,19 @@ def _of_labels(loaded: MeshFile, choice: LabelChoice) -> MeshFile:
         for name, rows in before.items():
             count = len(after.get(name, ()))
             if count < len(rows) and name not in rebuilt and not name.startswith(INTERFACE_PREFIX):
-                warning(f'set "{name}" keeps {count} of its {len(rows)} {what}; the others are of labels left out')
+                warning(
+                    f'set "{name}" keeps {count} of its {len(rows)} {what}; the others are of '
+                    "labels left out"
+                )
     inputs = loaded.table("inputs") | {"kept_labels": kept}
     return part._replace(field_data=part.field_data | {"inputs": np.array([json.dumps(inputs)])})
 
 
-def _without_crumbs(mesh: Mesh, labels: NDArray[np.int64], is_kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the cells that stay, (M,), without components that have little of any label; report these.
+def _without_crumbs(
+    mesh: Mesh, labels: NDArray[np.int64], is_kept: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Return the cells that stay, (M,), without components that have little of any label; report
+    these.
 
     No load or support would hold them: they hung on cells that are left out.
     """
@@ -165,21 +200,32 @@ def _without_crumbs(mesh: Mesh, labels: NDArray[np.int64], is_kept: NDArray[np.b
     if len(crumbs):
         count, volume = int((share < SMALL_COMPONENT_FRACTION).sum()), float(volumes[crumbs].sum())
         words = f"less than {SMALL_COMPONENT_FRACTION:.0%} of any label, are left out with them"
-        note(f"{counted(count, 'component')} ({counted(len(crumbs), 'cell')}, {volume:.4g} mm{mesh.ndim}), {words}")
+        note(
+            f"{counted(count, 'component')} ({counted(len(crumbs), 'cell')}, {volume:.4g} "
+            f"mm{mesh.ndim}), {words}"
+        )
     is_kept = is_kept.copy()
     is_kept[crumbs] = False
     return is_kept
 
 
 def _texts_of(loaded: MeshFile, solver: SolverOptions, *, has_new_results: bool) -> dict[str, Any]:
-    """Return the texts of the mesh's file to keep; reactions, in RAS+ and mN, only if space and units are unchanged."""
+    """Return the texts of the mesh's file to keep; reactions, in RAS+ and mN, only if space and
+    units are unchanged.
+    """
     is_as_solved = (solver.space, solver.units) == ("ras", "kPa") and not has_new_results
-    names = [name for name in loaded.field_data if is_as_solved and re.fullmatch(REACTIONS_TEXT, name)]
-    return texts_of(loaded) | {name: text for name in names if (text := loaded.text(name)) is not None}
+    names = [
+        name for name in loaded.field_data if is_as_solved and re.fullmatch(REACTIONS_TEXT, name)
+    ]
+    return texts_of(loaded) | {
+        name: text for name in names if (text := loaded.text(name)) is not None
+    }
 
 
 def _with_straight_edges(loaded: MeshFile) -> MeshFile:
-    """Return the mesh without curved edges, and the volumes of its cells; its other fields are of straight cells."""
+    """Return the mesh without curved edges, and the volumes of its cells; its other fields are
+    of straight cells.
+    """
     if loaded.mesh.midpoints is None:
         return loaded
     mesh = Mesh(loaded.mesh.points, loaded.mesh.cells)
@@ -188,25 +234,35 @@ def _with_straight_edges(loaded: MeshFile) -> MeshFile:
 
 
 def with_results(loaded: MeshFile, path: Path) -> MeshFile:
-    """Return the mesh with a solver's results instead of earlier ones, of the solved order; report the results."""
+    """Return the mesh with a solver's results instead of earlier ones, of the solved order;
+    report the results.
+    """
     results = read_frd(path, loaded.mesh)
     for line in results.notes:
         note(f"{path}: {line}")
     for name, values in results.point_data.items():
         if values.shape[1:] != (9,):  # tensors come with their von Mises stress
-            largest = float(np.abs(values).max() if values.ndim == 1 else np.sqrt((values**2).sum(axis=1)).max())
-            progress(f"{path.name}: {name} up to {largest:.4g} {'kPa' if is_stress(name) else 'mm'}")
+            largest = float(
+                np.abs(values).max() if values.ndim == 1 else np.sqrt((values**2).sum(axis=1)).max()
+            )
+            progress(
+                f"{path.name}: {name} up to {largest:.4g} {'kPa' if is_stress(name) else 'mm'}"
+            )
             remedy = "check loads, units and fixed sets, unless the solver's was nonlinear"
             how = f"too large for a linear solution; {remedy}"
             if values.shape[1:] == (3,) and (words := large_words(loaded.mesh, largest, how)):
                 warning(f"{path}: {name}: {words}")
     loaded = without_results(loaded)
     sets = _sets_with_input(loaded, path.with_suffix(".inp"))
-    return loaded._replace(point_data=loaded.point_data | results.point_data, order=results.order, sets=sets)
+    return loaded._replace(
+        point_data=loaded.point_data | results.point_data, order=results.order, sets=sets
+    )
 
 
 def _sets_with_input(loaded: MeshFile, path: Path) -> Sets:
-    """Return the mesh's sets and those of the solver's input file, if it exists and belongs to this mesh; note it."""
+    """Return the mesh's sets and those of the solver's input file, if it exists and belongs to
+    this mesh; note it.
+    """
     from_input = input_sets(path, loaded.mesh) if path.is_file() else None
     if from_input is None:
         note(f"{path}: missing, or not the input file of this mesh; its sets are not added")
@@ -218,7 +274,9 @@ def _sets_with_input(loaded: MeshFile, path: Path) -> Sets:
 
 
 def _order_of(loaded: MeshFile, solver: SolverOptions, output: Path) -> int:
-    """Return the order of the cells to write: as requested, else as in the mesh's file, if the format supports it."""
+    """Return the order of the cells to write: as requested, else as in the mesh's file, if the
+    format supports it.
+    """
     form = format_of(output)
     if solver.order is not None or loaded.order == 1 or form.has_quadratic:
         return solver.order or loaded.order

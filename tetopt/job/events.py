@@ -9,12 +9,17 @@ from typing import Any, Literal, NamedTuple
 
 from tetopt.errors import warn
 
-KERNEL_WORDS = "preparing the kernels (the first run compiles them, half a minute)"  # a stage of every run
+# a stage of every run
+KERNEL_WORDS = "preparing the kernels (the first run compiles them, half a minute)"
 Kind = Literal["started", "progress", "note", "warning", "violated"]
 """A stage begins; its progress; a note; an oddity; a requirement that the mesh does not meet."""
 
 
-ENDED_WORDS = {"max_seconds": "out of time", "max_gb": "memory limit reached", "stopped": "interrupted"}
+ENDED_WORDS = {
+    "max_seconds": "out of time",
+    "max_gb": "memory limit reached",
+    "stopped": "interrupted",
+}
 
 
 class Stage(NamedTuple):
@@ -35,8 +40,8 @@ class Event(NamedTuple):
     text : str
         On one line. Arguments of the job are between backticks: "`nodes`".
     data : object
-        For "started" the `Stage`; for "progress" the state, such as an `IterationRecord`; for "violated" the
-        requirement's name.
+        For "started" the `Stage`; for "progress" the state, such as an `IterationRecord`; for
+        "violated" the requirement's name.
 
     Examples
     --------
@@ -72,7 +77,9 @@ def listened(listener: Listener | None) -> Iterator[None]:
 
 
 def ended_words(ended: str, kept: str, followed: str = "") -> str:
-    """Return why a run ended before its last iteration, and what is kept; `followed` names surfaces."""
+    """Return why a run ended before its last iteration, and what is kept; `followed` names
+    surfaces.
+    """
     if ended == "converged":
         return "converged: the mesh hardly changes any more"
     if ended == "risen":
@@ -87,8 +94,12 @@ def time_words(seconds: float) -> str:
     return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"
 
 
-def started(stage: str, text: str = "", number: int | None = None, most_seconds: float | None = None) -> None:
-    """Report that a stage begins, which ends the previous one; `number` and `most_seconds` as in `Stage`."""
+def started(
+    stage: str, text: str = "", number: int | None = None, most_seconds: float | None = None
+) -> None:
+    """Report that a stage begins, which ends the previous one; `number` and `most_seconds` as in
+    `Stage`.
+    """
     _LISTENER.get()(Event("started", text, Stage(stage, number, most_seconds)))
 
 

@@ -33,7 +33,15 @@ from tetopt.contents.labels import checked_labels
 from tetopt.contents.probabilities import resample_tissue
 from tetopt.errors import InputError, Remark
 from tetopt.image import Image
-from tetopt.io.images import file_shape, has_own_spacing, load_image, parse_crop, parse_slice, part_of, sha256
+from tetopt.io.images import (
+    file_shape,
+    has_own_spacing,
+    load_image,
+    parse_crop,
+    parse_slice,
+    part_of,
+    sha256,
+)
 from tetopt.io.label_tables import LabelTable, load_label_table, own_label_table
 from tetopt.io.meshes import load_mesh
 from tetopt.io.read_dicom import frame_of_reference
@@ -42,16 +50,32 @@ from tetopt.job.events import note, warning
 from tetopt.job.options import WHOLE_BOX, BoxPart, ImagePart, MaskedPart, SourceOptions, stated_part
 from tetopt.measure.fidelity import cell_labels
 from tetopt.measure.requirements import warn_of_other_mask
-from tetopt.model.file import MASK_TEXT, TEXTS_KEPT, MeshFile, count_of_other_voxels, own_mask, words_of_other_box
-from tetopt.model.labels import NO_TABLE, TABLE_TEXT, label_words, labels_named, labels_of, table_words
+from tetopt.model.file import (
+    MASK_TEXT,
+    TEXTS_KEPT,
+    MeshFile,
+    count_of_other_voxels,
+    own_mask,
+    words_of_other_box,
+)
+from tetopt.model.labels import (
+    NO_TABLE,
+    TABLE_TEXT,
+    label_words,
+    labels_named,
+    labels_of,
+    table_words,
+)
 from tetopt.model.mappings import named_file
 from tetopt.start.label_sizes import EVERY_LABEL, LabelSize, parse_label_sizes
 from tetopt.system.budget import available_bytes, memory_words
 from tetopt.system.files import checked_output
 from tetopt.system.incoming import rows_of
 
-OUTSIDE_FRACTION = 0.02  # of a mask's or labels' voxels: grids' differences do not explain more outside the image
-SIZE_HEADS = ("size", "size_mm", "mm", "edge", "length")  # headings of the column of sizes in a table
+# of a mask's or labels' voxels: grids' differences do not explain more outside the image
+OUTSIDE_FRACTION = 0.02
+# headings of the column of sizes in a table
+SIZE_HEADS = ("size", "size_mm", "mm", "edge", "length")
 DIVIDED_BYTES = 300.0  # per voxel of a run with labels, measured
 MASK_LABELS_LISTED = 20  # in a message
 NAMES_LISTED = 8  # as many as fit on a line
@@ -79,17 +103,22 @@ def read_volume(path: Path, part: BoxPart = WHOLE_BOX) -> Image:
 
 
 def read_labels(path: Path, image: Image, part: BoxPart = WHOLE_BOX) -> Image:
-    """Read the same part of a label image; raise InputError unless it lies on the image's voxels."""
+    """Read the same part of a label image; raise InputError unless it lies on the image's
+    voxels.
+    """
     labels = read_image(path, replace(part, volume=None))
     if labels.shape != image.shape or not np.allclose(labels.affine, image.affine, atol=AFFINE_MM):
         raise InputError(
-            f"{path}: expected labels on the image's grid, {image.shape} with its affine, got {labels.shape}; "
+            f"{path}: expected labels on the image's grid, {image.shape} with its affine, got "
+            f"{labels.shape}; "
             "resample them to the image first"
         )
     return checked_labels(str(path), labels, is_map=True)
 
 
-def image_and_labels(path: Path, labels_path: Path | None, part: BoxPart) -> tuple[Image, Image | None]:
+def image_and_labels(
+    path: Path, labels_path: Path | None, part: BoxPart
+) -> tuple[Image, Image | None]:
     """Read a volume, and labels on its voxels if there are any."""
     image = read_volume(path, part)
     return image, None if labels_path is None else read_labels(labels_path, image, part)
@@ -109,10 +138,15 @@ class Aligned(NamedTuple):
 
 
 def image_and_others(image: Image, path: Path, part: ImagePart, originals: Originals) -> Aligned:
-    """Divide the voxels of an image, the selected part of its file, to the size of the finest of labels and mask."""
-    # A slice has no position across its plane: other files are aligned to the whole image, then sliced.
+    """Divide the voxels of an image, the selected part of its file, to the size of the finest of
+    labels and mask.
+    """
+    # A slice has no position across its plane: other files are aligned to the whole image, then
+    # sliced.
     slice_ = None if part.slice_ is None else parse_slice(part.slice_)
-    whole = coarse = image if slice_ is None else read_image(path, replace(part, slice_=None, crop=None))
+    whole = coarse = (
+        image if slice_ is None else read_image(path, replace(part, slice_=None, crop=None))
+    )
     crop = None if part.crop is None else parse_crop(part.crop)
     finer = {other: each for (other, _), each in originals.items()}
     factors = _divisions(whole, finer, None if slice_ is None else slice_[0])
@@ -135,7 +169,9 @@ def image_and_others(image: Image, path: Path, part: ImagePart, originals: Origi
         is_cropped = slice_ is None and crop is not None
         if not is_same_grid(original, grid, is_cropped=is_cropped):
             is_linear = aligned in (resample_contrast, resample_tissue)
-            _say_resampled(other, original, moved, coarse.shape, is_contrast=is_linear, is_cropped=is_cropped)
+            _say_resampled(
+                other, original, moved, coarse.shape, is_contrast=is_linear, is_cropped=is_cropped
+            )
         return moved if slice_ is None else part_of(moved, slice_, crop)
 
     if slice_ is not None:
@@ -149,13 +185,15 @@ def warn_of_other_world(path: Path, other: Path) -> None:
     two = None if one is None else frame_of_reference(path)
     if two is not None and one != two:
         warning(
-            f"{other}: its positions are in another frame of reference than those of {path} ({one}, not {two}): the "
+            f"{other}: its positions are in another frame of reference than those of {path} "
+            f"({one}, not {two}): the "
             "patient may have been moved between them; register it to the image first"
         )
 
 
 def _divisions(image: Image, others: Mapping[Path, Image], across: int | None) -> tuple[int, ...]:
-    """Return the parts of the image's voxels along each axis, with a message; fewer if memory is short.
+    """Return the parts of the image's voxels along each axis, with a message; fewer if memory is
+    short.
 
     Voxels are not divided along the axis `across` a slice.
     """
@@ -165,10 +203,15 @@ def _divisions(image: Image, others: Mapping[Path, Image], across: int | None) -
     while max(factors) > 1 and DIVIDED_BYTES * prod((*image.shape, *factors)) > n_free:
         factors[int(np.argmax(factors))] -= 1
     if max(needed) > 1:
-        names = listed([path for path, other in finer.items() if max(divisions(image, [other])) > 1])
+        names = listed(
+            [path for path, other in finer.items() if max(divisions(image, [other])) > 1]
+        )
         note(
             f"{names}: finer than the image, whose voxels are divided by {_times(factors)}"
-            + (f" instead of {_times(needed)}, as only {memory_words(n_free)} of memory are free" * (factors != needed))
+            + (
+                f" instead of {_times(needed)}, as only {memory_words(n_free)} of memory are free"
+                * (factors != needed)
+            )
         )
     return tuple(factors)
 
@@ -178,29 +221,43 @@ def _times(factors: Sequence[int]) -> str:
 
 
 def _say_resampled(
-    path: Path, original: Image, moved: Image, shape: tuple[int, ...], *, is_contrast: bool, is_cropped: bool
+    path: Path,
+    original: Image,
+    moved: Image,
+    shape: tuple[int, ...],
+    *,
+    is_contrast: bool,
+    is_cropped: bool,
 ) -> None:
     """Report that a file was resampled; warn of a mask or labels that seem to be of another scan.
 
-    These are cut by the image's box, though the image is no crop of them, or have its own `shape`, before it was
-    divided, and its directions in another place. Labels of FreeSurfer have their own directions.
+    These are cut by the image's box, though the image is no crop of them, or have its own `shape`,
+    before it was divided, and its directions in another place. Labels of FreeSurfer have their own
+    directions.
     """
-    note(f"{path}: resampled to the image's grid ({'linear' if is_contrast else 'nearest neighbour'})")
+    note(
+        f"{path}: resampled to the image's grid "
+        f"({'linear' if is_contrast else 'nearest neighbour'})"
+    )
     if is_contrast or is_cropped or is_same_grid(original, moved, is_cropped=True):
         return
-    outside = 1.0 - float(in_box(moved, original)[original.data >= min(INSIDE_FRACTION, original.data.max())].mean())
+    outside = 1.0 - float(
+        in_box(moved, original)[original.data >= min(INSIDE_FRACTION, original.data.max())].mean()
+    )
     cosines = [(each.affine[:-1, :-1] / each.spacing) for each in (original, moved)]
     is_alike = original.shape == shape and bool((np.prod(cosines, axis=0).sum(axis=0) > 0.5).all())
     is_moved = is_alike and bool(other_box(original, moved))
     if is_moved or outside > OUTSIDE_FRACTION:
         warning(
-            f"{path}: {outside:.1%} of it lies outside the image; its box covers {in_box(original, moved).mean():.1%} "
+            f"{path}: {outside:.1%} of it lies outside the image; its box covers "
+            f"{in_box(original, moved).mean():.1%} "
             f"of the image ({'same shape, ' * is_moved}different affine); is it from the same scan?"
         )
 
 
 def read_companion(path: Path, spacing_mm: str | None = None) -> Image:
-    """Read another file with the image, without the warning for a constant image, which sizes or a mask may be.
+    """Read another file with the image, without the warning for a constant image, which sizes or a
+    mask may be.
 
     Voxel sizes are for a stack or folder of slices; files of other formats have their own.
     """
@@ -225,20 +282,31 @@ def tissue_files(path: Path | None) -> list[Path]:
 
 
 def tissue_volumes(path: Path) -> dict[str, Path]:
-    """Return the files of tissues, or `FILE:K` for each volume of one, by the tissues' names; raise InputError."""
+    """Return the files of tissues, or `FILE:K` for each volume of one, by the tissues' names;
+    raise InputError.
+    """
     files = tissue_files(path)
     if Path() in files or len(set(files)) < len(files):
         raise InputError(f"`tissues`: expected different files, separated by commas, got {path}")
     shape = file_shape(files[0]) if len(files) == 1 else None
-    if shape is not None and len(shape) > 3 and shape[3] > 1 and file_and_volume(files[0])[1] is None:
+    if (
+        shape is not None
+        and len(shape) > 3
+        and shape[3] > 1
+        and file_and_volume(files[0])[1] is None
+    ):
         return {f"tissue {k + 1}": Path(f"{path}:{k}") for k in range(shape[3])}
     names = [file_and_volume(file)[0].name.split(".")[0] for file in files]
-    numbered = [name if names.count(name) == 1 else f"{name} {k}" for k, name in enumerate(names, 1)]
+    numbered = [
+        name if names.count(name) == 1 else f"{name} {k}" for k, name in enumerate(names, 1)
+    ]
     return dict(zip(numbered, files, strict=True))
 
 
 def number_of(name: str, text: str) -> float:
-    """Convert an option's text to a number; raise InputError with the option's name if it is not one."""
+    """Convert an option's text to a number; raise InputError with the option's name if it is not
+    one.
+    """
     try:
         return float(text)
     except ValueError:
@@ -259,7 +327,9 @@ def balance_of(options: SourceOptions) -> Balance:
     if options.weights is not None:
         weights = [number_of("`weights`", part) for part in options.weights.split(",")]
     names = ("label_weight", "smooth_interfaces")
-    return Balance(weights, **{name: each for name in names if (each := getattr(options, name)) is not None})
+    return Balance(
+        weights, **{name: each for name in names if (each := getattr(options, name)) is not None}
+    )
 
 
 def read_mesh(path: Path) -> MeshFile:
@@ -272,14 +342,17 @@ def read_mesh(path: Path) -> MeshFile:
     for line in loaded.notes:
         note(f"{path}: {line}")
     if violated := loaded.table("violated"):
-        warning(f"{path}: the run that built this mesh violated requirements: {listed(list(violated))}")
+        warning(
+            f"{path}: the run that built this mesh violated requirements: {listed(list(violated))}"
+        )
     return loaded
 
 
 def mask_for(
     options: MaskedPart | SourceOptions, image: Image, beside: Beside, loaded: MeshFile | None
 ) -> Image | None:
-    """Read the mask of an image's voxels that count: the options', else the one that a mesh's file was built within.
+    """Read the mask of an image's voxels that count: the options', else the one that a mesh's file
+    was built within.
 
     Warn if the two differ.
 
@@ -293,12 +366,18 @@ def mask_for(
         return None if loaded is None else own_mask(loaded, image)
     mask = beside(options.mask, resample_mask)
     if loaded is not None and (n_other := count_of_other_voxels(loaded, mask)):
-        warning(f"{options.mask}: differs in {n_other} voxels from the mask that the mesh was built within")
+        warning(
+            f"{options.mask}: differs in {n_other} voxels from the mask that the mesh was built "
+            "within"
+        )
     return mask
 
 
-def read_mask(options: MaskedPart | SourceOptions, names_of: Path | None = None) -> dict[tuple[Path, Align], Image]:
-    """Read the options' mask, of the voxels with `mask_label` if given, for `image_and_others`; none without one.
+def read_mask(
+    options: MaskedPart | SourceOptions, names_of: Path | None = None
+) -> dict[tuple[Path, Align], Image]:
+    """Read the options' mask, of the voxels with `mask_label` if given, for `image_and_others`;
+    none without one.
 
     Names of labels are those of the table `names_of`, or else of the mask's own file.
 
@@ -318,7 +397,10 @@ def read_mask(options: MaskedPart | SourceOptions, names_of: Path | None = None)
     mask, table = checked_labels(str(path), mask, is_map=True), names_of
     if table is None and str(path).lower().endswith((".seg.nrrd", ".dcm")):
         table = path
-    names, present = {} if table is None else load_label_table(table).names, np.unique(mask.data).astype(np.int64)
+    names, present = (
+        {} if table is None else load_label_table(table).names,
+        np.unique(mask.data).astype(np.int64),
+    )
     chosen: list[int] = []
     for word in words.split(","):
         try:
@@ -326,17 +408,26 @@ def read_mask(options: MaskedPart | SourceOptions, names_of: Path | None = None)
         except InputError as error:
             raise InputError(f"`mask_label`: {error}") from error
         if not np.isin(labels, present).any():
-            listed_words = listed([label_words(label, names) for label in present.tolist()], MASK_LABELS_LISTED)
-            raise InputError(f'`mask_label`: {path} has no voxel with label "{word.strip()}"; it has {listed_words}')
+            listed_words = listed(
+                [label_words(label, names) for label in present.tolist()], MASK_LABELS_LISTED
+            )
+            raise InputError(
+                f'`mask_label`: {path} has no voxel with label "{word.strip()}"; it has '
+                f"{listed_words}"
+            )
         chosen += labels
     return {(path, resample_mask): Image(np.isin(mask.data, chosen), mask.affine)}
 
 
 def check_part(image: Path | None, part: MaskedPart, labels: Path | None = None) -> None:
-    """Raise InputError for options that select the voxels of an image if there is none; labels may have a mask."""
+    """Raise InputError for options that select the voxels of an image if there is none; labels
+    may have a mask.
+    """
     needs_image: dict[str, Any] = {**stated_part(part), "registered": part.registered or None}
     needs_image |= {"mask": part.mask, "mask_label": part.mask_label} if labels is None else {}
-    if image is None and (lost := [name for name, value in needs_image.items() if value is not None]):
+    if image is None and (
+        lost := [name for name, value in needs_image.items() if value is not None]
+    ):
         raise InputError(f"`{lost[0]}`: needs `image`")
 
 
@@ -348,7 +439,8 @@ class MeshVoxels(NamedTuple):
     is_other: bool  # True if the mesh's file names another image
 
 
-Masks = Callable[[], dict[tuple[Path, Align], Image]]  # reads the mask of the options, as `read_mask` does, once
+# reads the mask of the options, as `read_mask` does, once
+Masks = Callable[[], dict[tuple[Path, Align], Image]]
 
 
 def voxels_of(
@@ -378,20 +470,27 @@ def voxels_of(
 def image_voxels(
     loaded: MeshFile, mesh: Path, image: Path, part: MaskedPart, masks: Masks | None = None
 ) -> tuple[Content, bool]:
-    """Read the image beside a mesh's file, without the voxels outside its mask; True if the file names another one.
+    """Read the image beside a mesh's file, without the voxels outside its mask; True if the file
+    names another one.
 
     The image's box is checked before the mask is read.
 
     Raises
     ------
     InputError
-        As for `mask_for` and `warn_of_other_image`; the dimension of the image differs from the mesh's.
+        As for `mask_for` and `warn_of_other_image`; the dimension of the image differs from the
+        mesh's.
     """
     whole = read_image(image, part)
     if whole.ndim != loaded.mesh.ndim:
-        raise InputError(f"{image}: expected a {loaded.mesh.ndim}-D image like the mesh, got a {whole.ndim}-D one")
+        raise InputError(
+            f"{image}: expected a {loaded.mesh.ndim}-D image like the mesh, got a {whole.ndim}-D "
+            "one"
+        )
     is_other = warn_of_other_image(loaded, mesh, image, whole, is_registered=part.registered)
-    whole, beside, _ = image_and_others(whole, image, part, read_mask(part) if masks is None else masks())
+    whole, beside, _ = image_and_others(
+        whole, image, part, read_mask(part) if masks is None else masks()
+    )
     content = _within(whole, part, beside, loaded)
     _warn_of_mask(loaded, content, part)
     return content, is_other
@@ -403,17 +502,26 @@ def _warn_of_mask(loaded: MeshFile, counted: Content, part: MaskedPart) -> None:
 
 
 def _within(image: Image, part: MaskedPart, beside: Beside, loaded: MeshFile) -> Content:
-    """Return an image as given, and continued beyond the mask of the voxels that count for a mesh's file."""
+    """Return an image as given, and continued beyond the mask of the voxels that count for a
+    mesh's file.
+    """
     mask = mask_for(part, image, beside, loaded)
     beyond = None if mask is None else continuation(mask, image.spacing)
     return Content(continued(image, beyond), continuation=beyond, whole=image)
 
 
-def _with_labels(loaded: MeshFile, path: Path, part: MaskedPart, masks: Masks) -> tuple[MeshFile, Content]:
-    """Return the mesh with the majority labels of an image's voxels, instead of the file's, and these voxels."""
+def _with_labels(
+    loaded: MeshFile, path: Path, part: MaskedPart, masks: Masks
+) -> tuple[MeshFile, Content]:
+    """Return the mesh with the majority labels of an image's voxels, instead of the file's, and
+    these voxels.
+    """
     labels = checked_labels(str(path), read_companion(path, part.spacing_mm), is_map=True)
     if labels.ndim != loaded.mesh.ndim:
-        raise InputError(f"{path}: expected {loaded.mesh.ndim}-D labels like the mesh, got a {labels.ndim}-D image")
+        raise InputError(
+            f"{path}: expected {loaded.mesh.ndim}-D labels like the mesh, got a {labels.ndim}-D "
+            "image"
+        )
 
     def beside(other: Path, aligned: Align) -> Image:
         return aligned(masks()[other, aligned], labels, str(other))
@@ -426,9 +534,12 @@ def _with_labels(loaded: MeshFile, path: Path, part: MaskedPart, masks: Masks) -
     own = table_of_segmentation(path)
     texts = {TABLE_TEXT: np.array([table_words(own)])} if own.names else {}
     inputs = {
-        name: each for name, each in loaded.table("inputs").items() if name not in ("kept_labels", "filled_holes")
+        name: each
+        for name, each in loaded.table("inputs").items()
+        if name not in ("kept_labels", "filled_holes")
     }
-    texts |= {"inputs": np.array([json.dumps(inputs)])} if inputs else {}  # of the labels that these replace
+    # of the labels that these replace
+    texts |= {"inputs": np.array([json.dumps(inputs)])} if inputs else {}
     return loaded._replace(cell_data=fields, field_data={**loaded.field_data, **texts}), counted
 
 
@@ -437,23 +548,34 @@ def table_of_segmentation(path: Path | None) -> LabelTable:
     return NO_TABLE if path is None else own_label_table(file_and_volume(path)[0])
 
 
-def label_table(path: Path | None, loaded: MeshFile | None = None, labels_path: Path | None = None) -> LabelTable:
-    """Return names and colours of labels: those of the file, else in the mesh's file, else in that of the labels."""
+def label_table(
+    path: Path | None, loaded: MeshFile | None = None, labels_path: Path | None = None
+) -> LabelTable:
+    """Return names and colours of labels: those of the file, else in the mesh's file, else in
+    that of the labels.
+    """
     if path is not None:
         table = load_label_table(path)
         labels = None if loaded is None else labels_of(loaded.cell_data, len(loaded.mesh.cells))
         if labels is not None and not np.isin(labels, [*table.names, *table.colours]).any():
-            warning(f"{path}: contains none of the mesh's labels, {listed(np.unique(labels).tolist())}")
+            warning(
+                f"{path}: contains none of the mesh's labels, {listed(np.unique(labels).tolist())}"
+            )
         return table
     table = NO_TABLE if loaded is None else loaded.label_table
     return table if table.names else table_of_segmentation(labels_path)
 
 
 def label_sizes_of(text: str, table: LabelTable | None = None) -> dict[int | str, LabelSize]:
-    """Parse sizes by label, from an option or a file; a table of labels, if any, converts names to numbers."""
+    """Parse sizes by label, from an option or a file; a table of labels, if any, converts names
+    to numbers.
+    """
     file = named_file(text)
     if file is not None:
-        text = ",".join(f"{name}={''.join(cells[:1])}" for name, cells in rows_of(file, "table of sizes", SIZE_HEADS))
+        text = ",".join(
+            f"{name}={''.join(cells[:1])}"
+            for name, cells in rows_of(file, "table of sizes", SIZE_HEADS)
+        )
     try:
         sizes = parse_label_sizes(text)
         return sizes if table is None else _by_number(sizes, table)
@@ -464,10 +586,15 @@ def label_sizes_of(text: str, table: LabelTable | None = None) -> dict[int | str
 def _by_number(sizes: dict[int | str, LabelSize], table: LabelTable) -> dict[int | str, LabelSize]:
     """Return the sizes by the labels' numbers instead of names."""
     numbers = {name: label for label, name in table.names.items()}
-    known = {name: size for name, size in sizes.items() if isinstance(name, int) or name in (*numbers, EVERY_LABEL)}
+    known = {
+        name: size
+        for name, size in sizes.items()
+        if isinstance(name, int) or name in (*numbers, EVERY_LABEL)
+    }
     if unknown := [name for name in sizes if name not in known]:
         raise InputError(
-            f'label_size: no label has the name "{unknown[0]}"; {listed([*numbers]) or "the labels have no names"}'
+            f'label_size: no label has the name "{unknown[0]}"; '
+            f"{listed([*numbers]) or 'the labels have no names'}"
         )
     by_label: dict[int | str, LabelSize] = {}
     for name, size in known.items():
@@ -485,13 +612,18 @@ def listed(names: Sequence[object], most: int = NAMES_LISTED) -> str:
 
 
 def warn_of_other_image(
-    loaded: MeshFile, mesh_path: Path, image_path: Path, image: Image, *,
-    is_registered: bool = False, is_exact: bool = False,
-) -> bool:  # fmt: skip
+    loaded: MeshFile,
+    mesh_path: Path,
+    image_path: Path,
+    image: Image,
+    *,
+    is_registered: bool = False,
+    is_exact: bool = False,
+) -> bool:
     """Warn if the mesh's file names another source image than this one; return whether it does.
 
-    Reject such an image unless it is registered or has the source's box to a voxel; with `is_exact`, reject any image
-    with another box.
+    Reject such an image unless it is registered or has the source's box to a voxel; with
+    `is_exact`, reject any image with another box.
     """
     made_from, words = loaded.text("image_sha256"), ""
     is_other = made_from is not None and made_from != sha256(image_path)
@@ -509,7 +641,9 @@ def warn_of_other_image(
 
 
 def texts_of(loaded: MeshFile, *, is_other: bool = False) -> dict[str, Any]:
-    """Return the texts of a mesh's file to keep in another file; with another image, only that on the mesh's mask."""
+    """Return the texts of a mesh's file to keep in another file; with another image, only that
+    on the mesh's mask.
+    """
     kept = (MASK_TEXT,) if is_other else TEXTS_KEPT
     return {name: text for name in kept if (text := loaded.text(name)) is not None}
 
@@ -530,7 +664,9 @@ def set_threads(threads: int | None) -> None:
 
 
 def cell_field(loaded: MeshFile, path: Path, name: str) -> NDArray:
-    """Return a field of a mesh's file, one number per cell; raise InputError with the known fields if it is missing."""
+    """Return a field of a mesh's file, one number per cell; raise InputError with the known
+    fields if it is missing.
+    """
     known = [each for each, values in loaded.cell_data.items() if values.ndim == 1]
     if name not in known:
         raise InputError(f'{path}: has no cell field "{name}"; it has {", ".join(known) or "none"}')

@@ -27,15 +27,21 @@ Record = TypeVar("Record")
 FIRST = ("images", "output", "nodes", "mask", "labels", *kinds_of(SizeOptions))  # as users set them
 SHOWN_LETTERS = 80  # characters of a value in a message
 UNIT_WORDS = {"MM": " in mm", "GB": " in GB", "S": " in seconds"}  # units of numbers, by metavar
-KIND_WORDS = {Path: "a path", float: "a number", int: "a whole number", str: "a string", bool: "True or False"}
+KIND_WORDS = {
+    Path: "a path",
+    float: "a number",
+    int: "a whole number",
+    str: "a string",
+    bool: "True or False",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Job(JobOptions):
     """A run of tetopt on files, with each option of `tetopt mesh` as a field.
 
-    Mappings and loads are strings, as on the command line; a number is a mapping to one value. None means the default,
-    which may depend on the image.
+    Mappings and loads are strings, as on the command line; a number is a mapping to one value. None
+    means the default, which may depend on the image.
 
     Parameters
     ----------
@@ -44,7 +50,8 @@ class Job(JobOptions):
     Raises
     ------
     InputError
-        Values have the wrong type, are out of range, or contradict each other, as far as no file has to be read.
+        Values have the wrong type, are out of range, or contradict each other, as far as no file
+        has to be read.
 
     See Also
     --------
@@ -129,17 +136,25 @@ class Job(JobOptions):
             raise InputError(f"job: expected an object of options, got {type(table).__name__}")
         for name in table:
             if name not in kinds_of(cls):
-                raise InputError(f"job: unknown option {name[:80]!r}" + near_hint(name, kinds_of(cls)))
-        if lost := [each.name for each in fields(cls) if each.default is MISSING and each.name not in table]:
+                raise InputError(
+                    f"job: unknown option {name[:80]!r}" + near_hint(name, kinds_of(cls))
+                )
+        if lost := [
+            each.name for each in fields(cls) if each.default is MISSING and each.name not in table
+        ]:
             raise InputError(f"job: missing {' and '.join(lost)}")
         return cls(**table)
 
 
 def _signature() -> inspect.Signature:
-    """Return the signature of a job in the order of FIRST; all options are keywords, so their order is free."""
+    """Return the signature of a job in the order of FIRST; all options are keywords, so their
+    order is free.
+    """
     plain = inspect.signature(Job)
     parameters = plain.parameters
-    return plain.replace(parameters=[parameters[name] for name in dict.fromkeys((*FIRST, *parameters))])
+    return plain.replace(
+        parameters=[parameters[name] for name in dict.fromkeys((*FIRST, *parameters))]
+    )
 
 
 def _parameters() -> str:
@@ -156,7 +171,10 @@ def _parameters() -> str:
         lines += [
             f"{field.name} : {words}",
             *wrap(
-                re.sub(r"\w+://\S*\w", r"``\g<0>``", option.text), 108, initial_indent="    ", subsequent_indent="    "
+                re.sub(r"\w+://\S*\w", r"``\g<0>``", option.text),
+                108,
+                initial_indent="    ",
+                subsequent_indent="    ",
             ),
         ]
     return "\n".join(lines)
@@ -167,7 +185,11 @@ def _kind_words(kind: Any) -> str:
     own = get_args(kind)[0] if get_origin(kind) in (Union, UnionType) else kind
     if get_origin(own) is Literal:
         return "{" + ", ".join(map(repr, get_args(own))) + "}"
-    return f"list of {_kind_words(get_args(own)[0])}" if get_origin(own) is list else own.__name__.lower()
+    return (
+        f"list of {_kind_words(get_args(own)[0])}"
+        if get_origin(own) is list
+        else own.__name__.lower()
+    )
 
 
 Job.__signature__ = _signature()  # type: ignore[attr-defined]
@@ -176,7 +198,9 @@ if Job.__doc__:  # Python removes its indentation from 3.13 on
 
 
 def in_kinds(record: Callable[..., Record], values: dict[str, Any]) -> Record:
-    """Create a record of options, converting values to the fields' types; raise InputError for an invalid one."""
+    """Create a record of options, converting values to the fields' types; raise InputError for
+    an invalid one.
+    """
     return record(**{name: _of_field(record, name, value) for name, value in values.items()})
 
 
@@ -186,7 +210,9 @@ def _of_field(record: Any, name: str, value: Any) -> Any:
 
 
 def of_option(name: str, kind: Any, value: Any) -> Any:
-    """Convert a value to the type of an option, and check its minimum; raise InputError for an invalid one."""
+    """Convert a value to the type of an option, and check its minimum; raise InputError for an
+    invalid one.
+    """
     value, least = _of_kind(name, get_args(kind)[0], value), option_of(kind).least
     if value is not None and least is not None and value < least:
         raise InputError(f"`{name}`: expected {least} or more, got {value}")
@@ -199,21 +225,31 @@ def _of_kind(name: str, kind: Any, value: Any) -> Any:
     if value is None and is_optional:
         return None
     own = get_args(kind)[0] if is_optional else kind
-    value = value.item() if isinstance(value, np.number) else value  # whose comparisons may overflow
+    # whose comparisons may overflow
+    value = value.item() if isinstance(value, np.number) else value
     if get_origin(own) is list:
         (of_each,) = get_args(own)
         many = [value] if isinstance(value, str | Path) else value
         if not isinstance(many, list | tuple) or not many:
-            raise InputError(f"`{name}`: expected {KIND_WORDS[of_each]} or a list of them, got {_shown(value)}")
+            raise InputError(
+                f"`{name}`: expected {KIND_WORDS[of_each]} or a list of them, got {_shown(value)}"
+            )
         return [_of_kind(name, of_each, each) for each in many]
     is_number = isinstance(value, Real) and not isinstance(value, bool)
-    if own is Path and isinstance(value, str | os.PathLike) and str(value) and "\0" not in str(value):
+    if (
+        own is Path
+        and isinstance(value, str | os.PathLike)
+        and str(value)
+        and "\0" not in str(value)
+    ):
         return Path(value)
     if own is float and is_number:
         return float(value)
     if own is int and is_number and abs(value) <= LARGEST_INTEGER and float(value).is_integer():
         return int(value)
-    if own is str and (isinstance(value, str) or (is_number and name in (*MAPPED_OPTIONS, "background", "bins"))):
+    if own is str and (
+        isinstance(value, str) or (is_number and name in (*MAPPED_OPTIONS, "background", "bins"))
+    ):
         return value if isinstance(value, str) else _number_text(value)
     if own is Path and name == "tissues" and isinstance(value, list | tuple) and value:
         return Path(",".join(str(_of_kind(name, own, each)) for each in value))

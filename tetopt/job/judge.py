@@ -1,4 +1,6 @@
-"""Measures of a mesh's file: its shape, the fit of its cells to an image, and the requirements of its run."""
+"""Measures of a mesh's file: its shape, the fit of its cells to an image, and the requirements
+of its run.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,13 @@ from tetopt.errors import InputError
 from tetopt.geometry.check import check_mesh, manifold_problems, scaled_jacobians
 from tetopt.job.advice import Problem, agreed, sentences, tell, unmet
 from tetopt.job.events import warning
-from tetopt.job.inputs import check_part, label_table, read_companion, read_mesh, warn_of_other_image
+from tetopt.job.inputs import (
+    check_part,
+    label_table,
+    read_companion,
+    read_mesh,
+    warn_of_other_image,
+)
 from tetopt.job.options import WHOLE_IMAGE, ImagePart, MaskedPart, SourceOptions
 from tetopt.job.request import checksum
 from tetopt.job.source import Source, read_source
@@ -38,7 +46,8 @@ class Judgement(NamedTuple):
     is_checked: bool
     source: Source | None = None  # the image, mask and labels it was measured on
     fit: ImageFit | None = None
-    result: MeshingResult | None = None  # the mesh as the result of a run, with violated requirements
+    # the mesh as the result of a run, with violated requirements
+    result: MeshingResult | None = None
     measured: dict[str, Any] = {}  # noqa: RUF012 - fit to mask, labels and contrasts; never modified
     is_compared: bool = True  # with the mask; the mesh's file does not contain the fractions of one
 
@@ -46,7 +55,9 @@ class Judgement(NamedTuple):
     def is_masked(self) -> bool:
         """True if the mesh was built within a mask or without a background."""
         inputs = self.loaded.table("inputs")
-        was_masked = any(inputs.get(name) is not None for name in ("mask", "background", "kept_labels"))
+        was_masked = any(
+            inputs.get(name) is not None for name in ("mask", "background", "kept_labels")
+        )
         is_masked = self.source is not None and self.source.mask is not None
         return was_masked or is_masked or MASK_TEXT in self.loaded.field_data
 
@@ -54,11 +65,17 @@ class Judgement(NamedTuple):
     def mask_word(self) -> str:
         """The name of the meshed region in messages, as in the run that built the mesh."""
         is_given = self.source is not None and self.source.about["inputs"]["mask"] is not None
-        return "mask" if is_given or self.loaded.table("inputs").get("background") is None else "foreground"
+        return (
+            "mask"
+            if is_given or self.loaded.table("inputs").get("background") is None
+            else "foreground"
+        )
 
     @property
     def is_filled(self) -> bool:
-        """True if the mesh should fill the image's box: neither built within a mask nor from another mesh."""
+        """True if the mesh should fill the image's box: neither built within a mask nor from
+        another mesh.
+        """
         return not self.is_masked and self.loaded.table("options").get("start") is None
 
     @property
@@ -66,15 +83,22 @@ class Judgement(NamedTuple):
         """Inputs of the run that built the mesh which are missing here."""
         if self.source is None:
             return []
-        inputs, there = self.loaded.table("inputs"), {"mask": self.source.mask, "labels": self.source.labels}
-        left_out = [name for name, image in there.items() if image is None and inputs.get(name) is not None]
+        inputs, there = (
+            self.loaded.table("inputs"),
+            {"mask": self.source.mask, "labels": self.source.labels},
+        )
+        left_out = [
+            name for name, image in there.items() if image is None and inputs.get(name) is not None
+        ]
         left_out += ["tissues"] * (self.source.labels is None and inputs.get("tissues") is not None)
         images = inputs.get("images")
         return left_out + ["other images"] * (isinstance(images, list) and len(images) > 1)
 
     @property
     def requirements(self) -> dict[str, Any]:
-        """Requirements of the run that built the mesh, from its file; another program's mesh need only fill the box."""
+        """Requirements of the run that built the mesh, from its file; another program's mesh
+        need only fill the box.
+        """
         options = self.loaded.table("options")  # only tetopt's have a method
         is_fast = options.get("method") == "fast"
         return {
@@ -94,42 +118,76 @@ class Judgement(NamedTuple):
         """Return the mesh's problems, worst first; those with a name make it fail."""
         wrong: list[str] = self.numbers.get("problems", [])
         overlap = None if self.fit is None else self.fit.overlap
-        named = [("mesh", each) for each in wrong] + ([] if overlap is None else [("overlap", overlap)])
-        problems = [Problem(f"{self.path}: {each}", name=name, is_failure=True) for name, each in named]
+        named = [("mesh", each) for each in wrong] + (
+            [] if overlap is None else [("overlap", overlap)]
+        )
+        problems = [
+            Problem(f"{self.path}: {each}", name=name, is_failure=True) for name, each in named
+        ]
         if self.source is not None and self.result is not None:
-            known = ("overlap", "manifold") if wrong else ("overlap",)  # named above, with numbers of cells or nodes
-            requirements = {name: words for name, words in self.result.violated.items() if name not in known}
+            # named above, with numbers of cells or nodes
+            known = ("overlap", "manifold") if wrong else ("overlap",)
+            requirements = {
+                name: words for name, words in self.result.violated.items() if name not in known
+            }
             measured = self.measured
             if not self.is_checked:  # only what makes the numbers meaningless
-                requirements, measured = {name: words for name, words in requirements.items() if name == "mask"}, {}
+                requirements, measured = (
+                    {name: words for name, words in requirements.items() if name == "mask"},
+                    {},
+                )
             problems += unmet(requirements, measured, self.mask_word)
         least, smallest = self.requirements["min_dihedral"], self.shape.min_dihedral
         if self.is_checked and self.source is None and least and smallest < least - ANGLE_ROUNDING:
-            text = f"{self.path}: the smallest dihedral angle is {smallest:.2f} degrees, below {least:g}"
+            text = (
+                f"{self.path}: the smallest dihedral angle is {smallest:.2f} degrees, below "
+                f"{least:g}"
+            )
             problems.append(Problem(text, name="min_dihedral"))
         if self.is_checked and self.source is None:
             problems += self._recorded(("min_dihedral", *(name for name, _ in named)))
-        return agreed([*problems, *(Problem(f"{self.path}: {each}") for each in self.numbers.get("remarks", []))])
+        return agreed(
+            [
+                *problems,
+                *(Problem(f"{self.path}: {each}") for each in self.numbers.get("remarks", [])),
+            ]
+        )
 
     def _recorded(self, measured: Collection[str]) -> list[Problem]:
-        """Return requirements that the mesh's run violated, by its file, beyond those `measured` here."""
-        recorded = {name: words for name, words in self.loaded.table("violated").items() if name not in measured}
-        return [Problem(f"{self.path}: when built, {words}", name=name) for name, words in recorded.items()]
+        """Return requirements that the mesh's run violated, by its file, beyond those `measured`
+        here.
+        """
+        recorded = {
+            name: words
+            for name, words in self.loaded.table("violated").items()
+            if name not in measured
+        }
+        return [
+            Problem(f"{self.path}: when built, {words}", name=name)
+            for name, words in recorded.items()
+        ]
 
 
 def judge(
-    mesh: Path, image: Path | None = None, labels: Path | None = None,
-    *, part: MaskedPart = WHOLE_IMAGE, label_names: Path | None = None, check: bool = False,
-) -> Judgement:  # fmt: skip
+    mesh: Path,
+    image: Path | None = None,
+    labels: Path | None = None,
+    *,
+    part: MaskedPart = WHOLE_IMAGE,
+    label_names: Path | None = None,
+    check: bool = False,
+) -> Judgement:
     """Measure a mesh's file: its shape and, given an image, mask and labels, the fit of its cells.
 
-    With `check`, also check that it is a valid mesh and, given an image, that it meets its run's requirements.
+    With `check`, also check that it is a valid mesh and, given an image, that it meets its run's
+    requirements.
 
     Raises
     ------
     InputError
-        Files cannot be read, or the files that they belong to are missing; the image has a different box
-        than that of the mesh's run, unless it is registered and `check` is not requested.
+        Files cannot be read, or the files that they belong to are missing; the image has a
+        different box than that of the mesh's run, unless it is registered and `check` is not
+        requested.
     """
     check_part(image, part)
     if image is None and labels is not None:
@@ -146,15 +204,20 @@ def judge(
     if image is not None:
         source = _source(loaded, image, labels, part, label_names)
         first, is_registered = source.contrasts[0], part.registered
-        is_other = warn_of_other_image(loaded, mesh, image, first, is_registered=is_registered, is_exact=check)
+        is_other = warn_of_other_image(
+            loaded, mesh, image, first, is_registered=is_registered, is_exact=check
+        )
         if not is_other and (words := words_of_other_box(loaded, first)):
             warning(
-                f"{image}: the mesh is of another box of it, {words}; pass the run's `crop`, as measures depend on it"
+                f"{image}: the mesh is of another box of it, {words}; pass the run's `crop`, as "
+                "measures depend on it"
             )
         has_mask = part.mask is not None or loaded.table("inputs").get("background") is not None
         judgement = judgement._replace(source=source, is_compared=has_mask)
         fit, result, measured = _measured(judgement)
-        measured |= _names(measured.get("labels", []), label_table(label_names, loaded, labels).names)
+        measured |= _names(
+            measured.get("labels", []), label_table(label_names, loaded, labels).names
+        )
         numbers |= {**measured, "image": image.name, "fit": fit}
         judgement = judgement._replace(fit=fit, result=result, measured=measured)
     if check:
@@ -165,38 +228,60 @@ def judge(
     return judgement
 
 
-def _source(loaded: MeshFile, image: Path, labels: Path | None, part: MaskedPart, names: Path | None) -> Source:
+def _source(
+    loaded: MeshFile, image: Path, labels: Path | None, part: MaskedPart, names: Path | None
+) -> Source:
     """Read the files that the mesh is measured on, with the weights stated in the mesh's file."""
     inputs = loaded.table("inputs")
     tension, weight = (_number(inputs.get(name)) for name in ("smooth_interfaces", "label_weight"))
     weights, filled = inputs.get("weights"), inputs.get("filled_holes")
     own = _number(weights[0]) if isinstance(weights, list) and len(weights) == 1 else None
     options = SourceOptions(
-        images=[image], labels=labels, mask=part.mask, mask_label=part.mask_label,
+        images=[image],
+        labels=labels,
+        mask=part.mask,
+        mask_label=part.mask_label,
         **{name: getattr(part, name) for name in vars(ImagePart())},
         weights=None if labels is None or own is None else repr(own),
         label_weight=None if labels is None else weight,
         smooth_interfaces=None if labels is None else tension,
         keep_components=False,
         fill_holes=None if labels is None or not isinstance(filled, int) else str(filled),
-    )  # fmt: skip
-    if labels is None and inputs.get("kept_labels") is not None:  # the file's mask is that of all labels
+    )
+    # the file's mask is that of all labels
+    if labels is None and inputs.get("kept_labels") is not None:
         loaded = loaded._replace(
-            field_data={name: text for name, text in loaded.field_data.items() if name not in (MASK_TEXT, "inputs")}
+            field_data={
+                name: text
+                for name, text in loaded.field_data.items()
+                if name not in (MASK_TEXT, "inputs")
+            }
         )
     names = None if part.mask_label is None else names
     numbers = None if labels is None else _merged(inputs, labels, part)
-    return read_source(options, names, numbers=numbers, loaded=loaded, kept=None if labels is None else _kept(inputs))
+    return read_source(
+        options,
+        names,
+        numbers=numbers,
+        loaded=loaded,
+        kept=None if labels is None else _kept(inputs),
+    )
 
 
 def _kept(inputs: Mapping[str, Any]) -> list[int] | None:
     """Return the labels that the mesh's run kept, if it left out others."""
     kept = inputs.get("kept_labels")
-    return [each for each in kept if isinstance(each, int)] if isinstance(kept, list) and kept else None
+    return (
+        [each for each in kept if isinstance(each, int)]
+        if isinstance(kept, list) and kept
+        else None
+    )
 
 
 def _merged(inputs: Mapping[str, Any], labels: Path, part: ImagePart) -> dict[int, int]:
-    """Return the numbers that the mesh's run gave to merged labels; none if the labels have them already."""
+    """Return the numbers that the mesh's run gave to merged labels; none if the labels have them
+    already.
+    """
     table, sums = inputs.get("merged"), inputs.get("sha256")
     numbers = {
         int(old): new
@@ -205,11 +290,17 @@ def _merged(inputs: Mapping[str, Any], labels: Path, part: ImagePart) -> dict[in
     }
     if not numbers or (isinstance(sums, dict) and sums.get(labels.name) == checksum(labels)):
         return numbers
-    return {} if np.isin(read_companion(labels, part.spacing_mm).data, list(numbers.values())).all() else numbers
+    return (
+        {}
+        if np.isin(read_companion(labels, part.spacing_mm).data, list(numbers.values())).all()
+        else numbers
+    )
 
 
 def _measured(judgement: Judgement) -> tuple[ImageFit, MeshingResult, dict[str, Any]]:
-    """Return the fit of the cells to the image, the mesh as the result of a run, and its fit to mask and labels."""
+    """Return the fit of the cells to the image, the mesh as the result of a run, and its fit to
+    mask and labels.
+    """
     source, loaded = cast(Source, judgement.source), judgement.loaded
     mesh, of_cell = loaded.mesh, loaded.cell_data.get("label")
     fit = image_fit(source.contrasts[0], mesh)
@@ -218,10 +309,13 @@ def _measured(judgement: Judgement) -> tuple[ImageFit, MeshingResult, dict[str, 
     result = judged(mesh, source.content, of_cell, **judgement.requirements, dice=dice)
     if result.history[-1].n_voxels == 0:
         raise InputError(
-            f"{judgement.path}: the mesh lies outside the mask and its surroundings; was it built within another mask?"
+            f"{judgement.path}: the mesh lies outside the mask and its surroundings; was it "
+            "built within another mask?"
         )
     is_uniform = source.content.variance == 0.0
-    fit = fit._replace(E_D=result.history[-1].E_D, E_D_fraction_of_variance=None if is_uniform else result.fraction)
+    fit = fit._replace(
+        E_D=result.history[-1].E_D, E_D_fraction_of_variance=None if is_uniform else result.fraction
+    )
     if not judgement.is_compared:
         measured.pop("mask", None)
     if not source.content.is_plain:
@@ -239,8 +333,13 @@ def _checked(judgement: Judgement) -> tuple[list[str], list[str]]:
 
     Non-manifold interfaces of labels are remarks, but problems of a run that smoothed interfaces.
     """
-    mesh, image = judgement.loaded.mesh, None if judgement.source is None else judgement.source.contrasts[0]
-    problems = check_mesh(mesh, image, is_whole=not judgement.is_masked, is_filled=judgement.is_filled)
+    mesh, image = (
+        judgement.loaded.mesh,
+        None if judgement.source is None else judgement.source.contrasts[0],
+    )
+    problems = check_mesh(
+        mesh, image, is_whole=not judgement.is_masked, is_filled=judgement.is_filled
+    )
     labels, touching = judgement.loaded.cell_data.get("label"), []
     if problems or labels is None:
         return problems, []

@@ -1,4 +1,6 @@
-"""The optimised mesh of a run in this process; a target error, or order 2, takes several successive runs."""
+"""The optimised mesh of a run in this process; a target error, or order 2, takes several
+successive runs.
+"""
 
 from __future__ import annotations
 
@@ -39,11 +41,20 @@ from tetopt.model.model import Model
 from tetopt.report.tables import curving_in_words
 from tetopt.start.memory import bytes_of, next_bytes
 from tetopt.start.octree import is_for_walls
-from tetopt.system.budget import BYTES_PER_GB, MemoryLimit, memory_words, peak_bytes, resident_bytes, return_freed
+from tetopt.system.budget import (
+    BYTES_PER_GB,
+    MemoryLimit,
+    memory_words,
+    peak_bytes,
+    resident_bytes,
+    return_freed,
+)
 from tetopt.system.files import check_space, kept_places
 
-CELL_BYTES = 40  # of a file, at least: a VTU with the usual cell fields takes 48, other formats more
-FIRST_TOLD = 3  # iteration after which the time left is told: the first ones, with most exchanges, take longer
+# of a file, at least: a VTU with the usual cell fields takes 48, other formats more
+CELL_BYTES = 40
+# iteration after which the time left is told: the first ones, with most exchanges, take longer
+FIRST_TOLD = 3
 TIME_RATE = 0.65  # a run's time grows with nodes^0.65, on the MNI152 T1 from 1,500 to 50,000 nodes
 PACE_OF = 2  # iterations: the last ones, by which it is estimated
 START_WORDS = "building the initial mesh"
@@ -77,14 +88,25 @@ def meshed(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
         check_room(task, initial)
         first = first or time.perf_counter()
         started("kernels", KERNEL_WORDS)
-        nodes = max(job.nodes or 0, len(initial.points)) if task.plan.order == 1 else len(initial.points)
+        nodes = (
+            max(job.nodes or 0, len(initial.points))
+            if task.plan.order == 1
+            else len(initial.points)
+        )
         if predicted is not None and result is not None:
             _say_predicted(task, result, predicted, most_bytes(predicted))
         note(f"{_described(task, initial)}; about {memory_words(most_bytes(nodes))} of memory")
         _prepare(task)
-        started("optimise", "optimising", options["iterations"], None if ends is None else ends - time.perf_counter())
+        started(
+            "optimise",
+            "optimising",
+            options["iterations"],
+            None if ends is None else ends - time.perf_counter(),
+        )
         kept = run if task.plan.mode == "paper" else partial(run, keep=keep)
-        result = watched(kept, initial, options["iterations"], ends, stop, limit, task.source.surface_words)
+        result = watched(
+            kept, initial, options["iterations"], ends, stop, limit, task.source.surface_words
+        )
         _say_search(task, number, result)
         if job.target_error is not None or job.order == 2:  # a next run may follow
             started("start", START_WORDS)
@@ -92,8 +114,15 @@ def meshed(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
     result = search.result
     if result.curving is not None:
         note(curving_in_words(result.curving))
-    elif task.started is not None and task.started.mesh.midpoints is not None and result.mesh.midpoints is None:
-        note("`start`: curved edges become straight, as there are no labels or mask for their nodes to follow")
+    elif (
+        task.started is not None
+        and task.started.mesh.midpoints is not None
+        and result.mesh.midpoints is None
+    ):
+        note(
+            "`start`: curved edges become straight, as there are no labels or mask for their "
+            "nodes to follow"
+        )
     seconds = {"load": first - begin, "optimize": time.perf_counter() - first}
     return_freed()  # by the search
     n_nodes = max(result.nodes or 0, len(result.initial.points))
@@ -107,7 +136,9 @@ def check_room(task: Task, initial: Mesh) -> None:
 
 
 def check_initial(task: Task, initial: Mesh, fields: dict[str, NDArray] | None = None) -> None:
-    """Raise InputError for what the writer would reject after the run, as far as the initial mesh shows."""
+    """Raise InputError for what the writer would reject after the run, as far as the initial
+    mesh shows.
+    """
     job = task.plan.job
     if not has_model(job) and job.output.suffix.lower() == ".vtu":
         return
@@ -119,7 +150,9 @@ def check_initial(task: Task, initial: Mesh, fields: dict[str, NDArray] | None =
 
 
 def _memory_limit(task: Task, content: Content) -> MemoryLimit | None:
-    """Return the user's limit; raise InputError if the image alone, or the initial mesh, needs more."""
+    """Return the user's limit; raise InputError if the image alone, or the initial mesh, needs
+    more.
+    """
     job = task.plan.job
     if job.max_gb is None:
         return None
@@ -131,23 +164,45 @@ def _memory_limit(task: Task, content: Content) -> MemoryLimit | None:
 def _aim(task: Task) -> Aim:
     """Return the mesh that the run is to make."""
     plan, job = task.plan, task.plan.job
-    kind = kind_of(plan, task.source.content.image.ndim) if plan.mode in ("uniform", "paper") else None
+    kind = (
+        kind_of(plan, task.source.content.image.ndim) if plan.mode in ("uniform", "paper") else None
+    )
     start = None if task.started is None else task.started.mesh
-    return Aim(job.nodes, job.target_error, task.sizes, plan.order, plan.mode, start, job.spacing, kind, job.nodes_max)
+    return Aim(
+        job.nodes,
+        job.target_error,
+        task.sizes,
+        plan.order,
+        plan.mode,
+        start,
+        job.spacing,
+        kind,
+        job.nodes_max,
+    )
 
 
 def _prepare(task: Task) -> None:
-    """Load the compiled kernels, or compile them, before the clock of the first iteration starts."""
+    """Load the compiled kernels, or compile them, before the clock of the first iteration
+    starts.
+    """
     return_freed()  # temporaries of the contents and the initial mesh
     content, k_D, mode = task.source.content, task.plan.engine_options["k_D"], task.plan.mode
-    prepare_kernels(content, k_D, "paper" if mode == "paper" else "fast", mode == "graded", progress)
+    prepare_kernels(
+        content, k_D, "paper" if mode == "paper" else "fast", mode == "graded", progress
+    )
 
 
 def watched(
-    run: Run, initial: Mesh, iterations: int, ends: float | None, stop: Callable[[], bool],
-    limit: MemoryLimit | None = None, followed: str = "",
-) -> MeshingResult:  # fmt: skip
-    """Run and report the records; end early at a time, before a limit of memory, or once `stop` returns true.
+    run: Run,
+    initial: Mesh,
+    iterations: int,
+    ends: float | None,
+    stop: Callable[[], bool],
+    limit: MemoryLimit | None = None,
+    followed: str = "",
+) -> MeshingResult:
+    """Run and report the records; end early at a time, before a limit of memory, or once `stop`
+    returns true.
 
     `followed` names the surfaces that nodes follow, if there are any.
     """
@@ -175,8 +230,12 @@ def watched(
     return result
 
 
-def left_words(history: Sequence[IterationRecord], iterations: int, most_seconds: float | None) -> str:
-    """Return the time left at the pace of the last iterations, from the third on; before, an empty text."""
+def left_words(
+    history: Sequence[IterationRecord], iterations: int, most_seconds: float | None
+) -> str:
+    """Return the time left at the pace of the last iterations, from the third on; before, an
+    empty text.
+    """
     last = history[-1]
     if last.iteration < FIRST_TOLD or last.iteration == iterations:
         return ""
@@ -188,28 +247,38 @@ def left_words(history: Sequence[IterationRecord], iterations: int, most_seconds
 
 
 def _say_search(task: Task, number: int, result: MeshingResult) -> None:
-    """Report one of several runs, repeated until the error, or the number of nodes of order 2, is close enough."""
+    """Report one of several runs, repeated until the error, or the number of nodes of order 2,
+    is close enough.
+    """
     job, content = task.plan.job, task.source.content
     n_nodes = node_count(result.mesh.points, result.mesh.cells, task.plan.order)
     if (target := job.target_error) is not None:
         fraction = unexplained_by(content, result.mesh, result.history[-1])
         note(
-            f"run {number} of up to {ERROR_RUNS}: {n_nodes} nodes leave {fraction:.4g} of the variance unexplained; "
+            f"run {number} of up to {ERROR_RUNS}: {n_nodes} nodes leave {fraction:.4g} of the "
+            "variance unexplained; "
             f"aim: {ERROR_REACHED * target:.4g} to {target:.4g}"
         )
     elif job.order == 2 and job.nodes is not None and task.plan.mode != "start":
         note(
-            f"run {number} of up to {NODE_RUNS}: {n_nodes} of {job.nodes} nodes, including mid-edge nodes, "
+            f"run {number} of up to {NODE_RUNS}: {n_nodes} of {job.nodes} nodes, including "
+            "mid-edge nodes, "
             f"{abs(n_nodes / job.nodes - 1.0):.1%} off; aim: {NODES_NEAR:.0%} or less"
         )
 
 
 def _say_predicted(task: Task, last: MeshingResult, corners: int, n_bytes: float) -> None:
-    """Report the nodes, time and memory that the target error takes, by the last of the runs so far."""
+    """Report the nodes, time and memory that the target error takes, by the last of the runs so
+    far.
+    """
     job, n_corners = task.plan.job, len(last.mesh.points)
-    nodes = round(corners * node_count(last.mesh.points, last.mesh.cells, task.plan.order) / n_corners)
+    nodes = round(
+        corners * node_count(last.mesh.points, last.mesh.cells, task.plan.order) / n_corners
+    )
     seconds = last.history[-1].seconds * (corners / n_corners) ** TIME_RATE
-    words = f"an error of {job.target_error:g} requires about {nodes} nodes, {time_words(seconds)} and "
+    words = (
+        f"an error of {job.target_error:g} requires about {nodes} nodes, {time_words(seconds)} and "
+    )
     words += f"{memory_words(n_bytes)} of memory"
     if nodes > (most := job.nodes_max or nodes):
         words += f"; more than `nodes_max`, so that the next run has {most} nodes"
@@ -223,11 +292,19 @@ def _described(task: Task, initial: Mesh) -> str:
     spacing = " x ".join(f"{s:.4g}" for s in image.spacing)
     start = f"{task.start_name} of {len(initial.points)} nodes, {len(initial.cells)} cells"
     job, plan = task.plan.job, task.plan
-    if plan.mode == "graded" and plan.order == 1 and source.mask is not None and job.nodes is not None:
+    if (
+        plan.mode == "graded"
+        and plan.order == 1
+        and source.mask is not None
+        and job.nodes is not None
+    ):
         start += ", to keep thin walls" if is_for_walls(len(initial.points), job.nodes) else ""
     start += f", edges up to {np.sqrt(squared_edges(initial.points, initial.cells).max()):.3g} mm"
     more = [f"and {len(source.paths) - 1} more"] if len(source.paths) > 1 else []
     more += ["labels"] if source.labels is not None else []
     if source.mask is not None:
-        more += [f"within a {source.mask_word} of {int((source.mask.data >= INSIDE_FRACTION).sum())} voxels"]
+        more += [
+            f"within a {source.mask_word} of {int((source.mask.data >= INSIDE_FRACTION).sum())} "
+            "voxels"
+        ]
     return ", ".join([f"{source.paths[0]}: {size} voxels of {spacing} mm", *more]) + f"; {start}"

@@ -26,7 +26,15 @@ from tetopt.mesh import Mesh
 from tetopt.model.averages import DEFAULT_AVERAGE, parse_average
 from tetopt.model.build import build_model
 from tetopt.model.fields import cell_fields, is_result
-from tetopt.model.file import MATERIAL_FIELDS, MeshFile, completed, loads_in, moduli_in, sets_beside, without_results
+from tetopt.model.file import (
+    MATERIAL_FIELDS,
+    MeshFile,
+    completed,
+    loads_in,
+    moduli_in,
+    sets_beside,
+    without_results,
+)
 from tetopt.model.labels import TABLE_TEXT, labels_of, table_of_words, table_words
 from tetopt.model.loads import FACET_FORCES, check_steps, known_set, parse_load
 from tetopt.model.mappings import parse_any_mapping
@@ -50,10 +58,13 @@ from tetopt.system.files import kept_places
 REACTIONS_TEXT = r"reactions(_step\d+)?"  # texts of a solved mesh's file
 MEAN_FIELD = r"mean(_\d+)?"  # of the image, and of further contrasts
 SET_GROUPS = ("labels", "interfaces", "boundary")  # groups of the sets that every mesh has
-# Each adds an array on the nodes of a VTU or VTK file; sets of labels can be rebuilt from the cells.
+# Each adds an array on the nodes of a VTU or VTK file; sets of labels can be rebuilt from the
+# cells.
 MANY_INTERFACES = 24
-SMALL_FRACTION = 0.1  # of the mesh's length: larger displacements are not small, with strains of about 10 %
-SLOW_MATERIALS = 30_000  # CalculiX takes three times as long with one material per cell (tests/benchmarks)
+# of the mesh's length: larger displacements are not small, with strains of about 10 %
+SMALL_FRACTION = 0.1
+# CalculiX takes three times as long with one material per cell (tests/benchmarks)
+SLOW_MATERIALS = 30_000
 
 
 def check_solver_options(output: Path, solver: SolverOptions, has_materials: bool = False) -> None:
@@ -62,12 +73,16 @@ def check_solver_options(output: Path, solver: SolverOptions, has_materials: boo
     Raises
     ------
     InputError
-        An invalid suffix, mapping, number of bins, unit or convention; options that need moduli without any.
+        An invalid suffix, mapping, number of bins, unit or convention; options that need moduli
+        without any.
     """
     form = format_of(output)
-    if form.is_surface and (solver.young or solver.bins or solver.sets or solver.loads or solver.written_sets):
+    if form.is_surface and (
+        solver.young or solver.bins or solver.sets or solver.loads or solver.written_sets
+    ):
         raise InputError(
-            f"{output}: contains only the boundary; leave out `young`, `bins`, `sets`, `written_sets` and `loads`"
+            f"{output}: contains only the boundary; leave out `young`, `bins`, `sets`, "
+            "`written_sets` and `loads`"
         )
     check_model_options(solver, has_materials)
     if solver.average is not None and solver.young is None:
@@ -76,26 +91,38 @@ def check_solver_options(output: Path, solver: SolverOptions, has_materials: boo
         raise InputError(f"`units`: expected one of {', '.join(STRESS_UNITS)}, got {solver.units}")
     if solver.fields is not None and (solver.fields not in FIELDS or not form.fields):
         able = ", ".join(name for name, kind in FORMATS.items() if kind.fields)
-        raise InputError(f"`fields`: expected {', '.join(FIELDS)} and a file {able}, got {solver.fields} for {output}")
+        raise InputError(
+            f"`fields`: expected {', '.join(FIELDS)} and a file {able}, got {solver.fields} for "
+            f"{output}"
+        )
     if solver.space not in SPACES:
         raise InputError(f"`space`: expected {' or '.join(SPACES)}, got {solver.space}")
     if solver.nonlinear and not form.has_large:
-        raise InputError(f"{output}: `nonlinear` is for {', '.join(s for s, f in FORMATS.items() if f.has_large)} only")
+        raise InputError(
+            f"{output}: `nonlinear` is for "
+            f"{', '.join(s for s, f in FORMATS.items() if f.has_large)} only"
+        )
     if solver.order == 2 and not form.has_quadratic:
         raise InputError(
-            f"{output}: `order` 2 is for {', '.join(s for s, f in FORMATS.items() if f.has_quadratic)} only"
+            f"{output}: `order` 2 is for "
+            f"{', '.join(s for s, f in FORMATS.items() if f.has_quadratic)} only"
         )
 
 
 def check_model_options(options: ModelOptions, has_materials: bool) -> None:
-    """Check the options that depend on neither mesh nor file; `has_materials` is that of the mesh's file, or an image.
+    """Check the options that depend on neither mesh nor file; `has_materials` is that of the mesh's
+    file, or an image.
 
     Raises
     ------
     InputError
         An invalid mapping, average, number of bins or order; options that need moduli without any.
     """
-    for name, mapping in (("young", options.young), ("nu", options.nu), ("density", options.density)):
+    for name, mapping in (
+        ("young", options.young),
+        ("nu", options.nu),
+        ("density", options.density),
+    ):
         if mapping is not None:
             _check_mapping(mapping, name)
             if options.young is None and not has_materials:
@@ -122,7 +149,9 @@ def parsed_bins(text: str | None) -> tuple[int | None, Spacing]:
     count, _, spacing = text.partition(":")
     spacing = spacing or "equal"
     if re.fullmatch("0*[1-9][0-9]{0,8}", count) is None or spacing not in get_args(Spacing):
-        raise InputError(f'`bins`: expected K, K:quantile or K:log with K from 1 to 999999999, got "{text[:80]}"')
+        raise InputError(
+            f'`bins`: expected K, K:quantile or K:log with K from 1 to 999999999, got "{text[:80]}"'
+        )
     return int(count), cast(Spacing, spacing)
 
 
@@ -133,16 +162,23 @@ def parsed_groups(text: str | None) -> tuple[str, ...]:
     words = [] if text == "none" else [word.strip() for word in text.split(",")]
     if unknown := [word for word in words if word not in SET_GROUPS]:
         raise InputError(
-            f'`written_sets`: expected some of {", ".join(SET_GROUPS)}, or all, or none, got "{unknown[0]}"'
+            f"`written_sets`: expected some of {', '.join(SET_GROUPS)}, or all, or none, got "
+            f'"{unknown[0]}"'
         )
     return tuple(words)
 
 
 def solver_model(
-    mesh: Mesh, image: Image | None, solver: ModelOptions, cell_data: dict[str, NDArray], about: dict[str, Any],
+    mesh: Mesh,
+    image: Image | None,
+    solver: ModelOptions,
+    cell_data: dict[str, NDArray],
+    about: dict[str, Any],
     known_sets: Sets,
-) -> Model:  # fmt: skip
-    """Build the model of a mesh with the sets `known_sets`, with the options' materials and loads."""
+) -> Model:
+    """Build the model of a mesh with the sets `known_sets`, with the options' materials and
+    loads.
+    """
     young, nu, density = moduli_in(cell_data, solver.young, solver.nu, solver.density)
     is_of_file = solver.young is None and "young" in cell_data
     if not is_of_file and nu is None and "nu" in cell_data:
@@ -150,41 +186,67 @@ def solver_model(
     fields = {name: values for name, values in cell_data.items() if name not in MATERIAL_FIELDS}
     bins, spacing = parsed_bins(solver.bins)
     model = build_model(
-        mesh, image, young=young, nu=nu, density=density, average=solver.average or DEFAULT_AVERAGE,
-        sets=solver.sets or (), loads=solver.loads or (), bins=bins, spacing=spacing, order=solver.order or 1,
-        cell_data=fields, known_sets=known_sets, about={"tetopt": tetopt.__version__, **about},
-    )  # fmt: skip
+        mesh,
+        image,
+        young=young,
+        nu=nu,
+        density=density,
+        average=solver.average or DEFAULT_AVERAGE,
+        sets=solver.sets or (),
+        loads=solver.loads or (),
+        bins=bins,
+        spacing=spacing,
+        order=solver.order or 1,
+        cell_data=fields,
+        known_sets=known_sets,
+        about={"tetopt": tetopt.__version__, **about},
+    )
     return model._replace(is_nonlinear=isinstance(solver, SolverOptions) and solver.nonlinear)
 
 
 def large_words(mesh: Mesh, moved: float, how: str) -> str | None:
-    """Describe the largest displacement `moved`, mm, if it is not small against the mesh's length; `how` is the advice.
+    """Describe the largest displacement `moved`, mm, if it is not small against the mesh's length;
+    `how` is the advice.
 
     Loads in other units, or a set that is not fixed, show in it first.
     """
     size = float(np.ptp(mesh.points, axis=0).max())
     if not moved > SMALL_FRACTION * size:
         return None
-    return f"the largest displacement, {moved:.4g} mm, is {moved / size:.0%} of the mesh's length, {how}"
+    return (
+        f"the largest displacement, {moved:.4g} mm, is {moved / size:.0%} of the mesh's "
+        f"length, {how}"
+    )
 
 
 def without_stale_results(loaded: MeshFile, solver: ModelOptions) -> MeshFile:
-    """Return the mesh's file without a solver's results if moduli, densities or loads change; note the results."""
+    """Return the mesh's file without a solver's results if moduli, densities or loads change;
+    note the results.
+    """
     if not any((solver.young, solver.nu, solver.density, solver.bins, solver.loads)):
         return loaded
-    names = [name for data in (loaded.cell_data, loaded.point_data) for name in data if is_result(name)]
-    texts = {name: text for name, text in loaded.field_data.items() if re.fullmatch(REACTIONS_TEXT, name) is None}
+    names = [
+        name for data in (loaded.cell_data, loaded.point_data) for name in data if is_result(name)
+    ]
+    texts = {
+        name: text
+        for name, text in loaded.field_data.items()
+        if re.fullmatch(REACTIONS_TEXT, name) is None
+    }
     if not names and len(texts) == len(loaded.field_data):
         return loaded
     note(
-        f"dropped results computed with other moduli or loads: {', '.join(dict.fromkeys(names)) or 'reactions'}; "
+        "dropped results computed with other moduli or loads: "
+        f"{', '.join(dict.fromkeys(names)) or 'reactions'}; "
         "tetopt fem computes them again"
     )
     return without_results(loaded)._replace(field_data=texts)
 
 
 def loads_of(loaded: MeshFile) -> list[str]:
-    """Return the loads in a file of tetopt's, see `tetopt.model.file.loads_in`; note dropped loads."""
+    """Return the loads in a file of tetopt's, see `tetopt.model.file.loads_in`; note dropped
+    loads.
+    """
     loads, lost = loads_in(loaded)
     if lost:
         note(lost)
@@ -212,41 +274,66 @@ def all_sets(
 def with_chosen_sets(model: Model, output: Path, options: ModelOptions) -> Model:
     """Return the model with the sets to write; note interfaces that are left out by default.
 
-    Of the sets that every mesh has, those of `written_sets` are written, by default all, except more than
-    `MANY_INTERFACES` interfaces in a VTK file. Other sets, and those that loads name, are always written.
+    Of the sets that every mesh has, those of `written_sets` are written, by default all, except
+    more than `MANY_INTERFACES` interfaces in a VTK file. Other sets, and those that loads name, are
+    always written.
     """
     groups = set(parsed_groups(options.written_sets))
     labels = labels_of(model.cell_data, len(model.mesh.cells))
     names = table_of_words(model.about.get(TABLE_TEXT)).names
     of_label = {} if labels is None else label_set_names(np.unique(labels).tolist(), names)
     pairs = [(a, b) for a in of_label for b in of_label if a < b]
-    between = {*interface_names(pairs, of_label).values(), *(f"interface_{a}_{b}" for a, b in pairs)}
+    between = {
+        *interface_names(pairs, of_label).values(),
+        *(f"interface_{a}_{b}" for a, b in pairs),
+    }
     interfaces = between & set(model.sets.facets)
-    if options.written_sets is None and output.suffix.lower() in VTK_SUFFIXES and len(interfaces) > MANY_INTERFACES:
+    if (
+        options.written_sets is None
+        and output.suffix.lower() in VTK_SUFFIXES
+        and len(interfaces) > MANY_INTERFACES
+    ):
         note(
-            f"{len(interfaces)} interfaces are not written as sets (`written_sets` all writes them); convert, fem and "
+            f"{len(interfaces)} interfaces are not written as sets (`written_sets` all writes "
+            "them); convert, fem and "
             "view derive them from the cells' labels"
         )
         groups.discard("interfaces")
     left = set()
     for group, members in (
-        ("labels", set(of_label.values())), ("interfaces", interfaces), ("boundary", standard_names(model.mesh.ndim)),
-    ):  # fmt: skip
+        ("labels", set(of_label.values())),
+        ("interfaces", interfaces),
+        ("boundary", standard_names(model.mesh.ndim)),
+    ):
         left |= set() if group in groups else members
     left -= {load.set_name for load in model.loads}
-    facets, cells = ({name: rows for name, rows in kind.items() if name not in left} for kind in model.sets)
+    facets, cells = (
+        {name: rows for name, rows in kind.items() if name not in left} for kind in model.sets
+    )
     return model._replace(sets=Sets(facets, cells))
 
 
 def model_of_file(
-    loaded: MeshFile, image: Image | None, options: ModelOptions, about: dict[str, Any], box: Box | None,
+    loaded: MeshFile,
+    image: Image | None,
+    options: ModelOptions,
+    about: dict[str, Any],
+    box: Box | None,
     has_units: bool = True,
-) -> Model:  # fmt: skip
-    """Build the model of a mesh's file, keeping the file's own data, with the options; warn of implausible units."""
-    mesh, fields = loaded.mesh, loaded.cell_data | ({} if image is None else cell_fields(loaded.mesh, image))
+) -> Model:
+    """Build the model of a mesh's file, keeping the file's own data, with the options; warn of
+    implausible units.
+    """
+    mesh, fields = (
+        loaded.mesh,
+        loaded.cell_data | ({} if image is None else cell_fields(loaded.mesh, image)),
+    )
     if image is not None and (outside := float((beyond_box(mesh, image) > 1.0).mean())) > 0.0:
         if outside == 1.0:
-            raise InputError("mesh and image: no node lies in the image's box; do both use the same world coordinates?")
+            raise InputError(
+                "mesh and image: no node lies in the image's box; do both use the same world "
+                "coordinates?"
+            )
         of_nodes = f"{outside:.1%} of the nodes lie outside the image or its mask"
         warning(f"{of_nodes}: cells there take the nearest voxel's value")
     table, former = label_table(options.label_names, loaded), label_table(None, loaded)
@@ -256,25 +343,34 @@ def model_of_file(
     model = solver_model(mesh, image, options, fields, about | words, sets)
     if has_units:
         warn_of_units(model)
-    model, lost = completed(model, loaded, is_of_file=options.young is None and options.bins is None)
+    model, lost = completed(
+        model, loaded, is_of_file=options.young is None and options.bins is None
+    )
     if lost:
         note(lost)
     return model
 
 
 def check_early(
-    output: Path, solver: SolverOptions, ndim: int, low: float, build: Callable[[SolverOptions], Model]
+    output: Path,
+    solver: SolverOptions,
+    ndim: int,
+    low: float,
+    build: Callable[[SolverOptions], Model],
 ) -> None:
-    """Raise InputError for what would be rejected after the optimisation, as far as the initial mesh shows.
+    """Raise InputError for what would be rejected after the optimisation, as far as the initial
+    mesh shows.
 
-    `low` is the image's least intensity; `build` makes a model of the initial mesh. Requested sets, and interfaces, may
-    be empty until the final mesh: of these, and of loads on them, only words and names are checked.
+    `low` is the image's least intensity; `build` makes a model of the initial mesh. Requested sets,
+    and interfaces, may be empty until the final mesh: of these, and of loads on them, only words
+    and names are checked.
     """
     requests = [parse_set(text, ndim) for text in solver.sets or ()]
     for request in requests:
         if request.kind == "below" and request.vectors[0][0] <= low:
             raise InputError(
-                f"set {request.name}: no cell can have a mean below {request.vectors[0][0]:g}, as the image's "
+                f"set {request.name}: no cell can have a mean below {request.vectors[0][0]:g}, "
+                "as the image's "
                 f"minimum is {low:g}"
             )
     names = {name for request in requests for name in request.names()}
@@ -282,7 +378,8 @@ def check_early(
     check_steps(loads)
     loaded = [load.set_name for load in loads]
     is_certain = not any(name in names or name.startswith(INTERFACE_PREFIX) for name in loaded)
-    with warnings.catch_warnings():  # the final mesh may have cells of further labels, and larger sides
+    # the final mesh may have cells of further labels, and larger sides
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore", Remark)
         model = build(replace(solver, sets=None, loads=solver.loads if is_certain else None))
     warn_of_units(model._replace(loads=tuple(loads)))
@@ -291,21 +388,31 @@ def check_early(
         check_free_names(request, known)
         if request.difference and INTERFACE_PREFIX not in request.difference.lower():
             names_in(request, known)
-        known = Sets(known.facets | dict.fromkeys(request.names(), known.facets[BOUNDARY_SET]), known.cells)
+        known = Sets(
+            known.facets | dict.fromkeys(request.names(), known.facets[BOUNDARY_SET]), known.cells
+        )
     for name in loaded:
         if name and name not in names and not name.startswith(INTERFACE_PREFIX):
             known_set(name, model.sets)
     for load in loads:
-        if load.kind in FACET_FORCES and load.set_name.startswith(INTERFACE_PREFIX) and load.set_name not in names:
+        if (
+            load.kind in FACET_FORCES
+            and load.set_name.startswith(INTERFACE_PREFIX)
+            and load.set_name not in names
+        ):
             raise InputError(
-                f'load: the facets of "{load.set_name}" lie between two cells, where no outside force can act '
-                f"({load.kind}); use a set on the boundary, leave out one side (`drop_labels`), or move the set"
+                f'load: the facets of "{load.set_name}" lie between two cells, where no outside '
+                "force can act "
+                f"({load.kind}); use a set on the boundary, leave out one side (`drop_labels`), "
+                "or move the set"
             )
     file_bytes(output, _with_names(model, requests), space=solver.space, units=solver.units)
 
 
 def _with_names(model: Model, requests: Sequence[SetRequest]) -> Model:
-    """Return the model with a facet and a cell in each requested set, so that a writer rejects bad names now."""
+    """Return the model with a facet and a cell in each requested set, so that a writer rejects
+    bad names now.
+    """
     facets, cells = dict(model.sets.facets), dict(model.sets.cells)
     for request in requests:
         *of_cells, of_facets = request.names()
@@ -322,19 +429,38 @@ def warn_of_units(model: Model) -> None:
 
 def save_for_solver(output: Path, model: Model, solver: SolverOptions) -> None:
     """Write the file with the fields of cells that the options or the format choose."""
-    choice = solver.fields or format_of(output).fields or "all"  # a format without a place for them lists them
+    # a format without a place for them lists them
+    choice = solver.fields or format_of(output).fields or "all"
     names = [name for name in model.cell_data if name != "label" and not is_result(name)]
-    left = [name for name in names if choice == "none" or (choice == "mean" and not re.fullmatch(MEAN_FIELD, name))]
+    left = [
+        name
+        for name in names
+        if choice == "none" or (choice == "mean" and not re.fullmatch(MEAN_FIELD, name))
+    ]
     if left and solver.fields is None:
-        note(f"{output}: {len(left)} fields of cells are not written (`fields` all writes them): {', '.join(left)}")
-    model = model._replace(cell_data={name: rows for name, rows in model.cell_data.items() if name not in left})
-    if model.materials is not None and len(model.materials.young) > SLOW_MATERIALS and output.suffix.lower() == ".inp":
-        note(f"{len(model.materials.young)} materials make CalculiX about three times slower; `bins` 32 groups them")
+        note(
+            f"{output}: {len(left)} fields of cells are not written (`fields` all writes them): "
+            f"{', '.join(left)}"
+        )
+    model = model._replace(
+        cell_data={name: rows for name, rows in model.cell_data.items() if name not in left}
+    )
+    if (
+        model.materials is not None
+        and len(model.materials.young) > SLOW_MATERIALS
+        and output.suffix.lower() == ".inp"
+    ):
+        note(
+            f"{len(model.materials.young)} materials make CalculiX about three times slower; "
+            "`bins` 32 groups them"
+        )
     save_model(output, model, space=solver.space, units=solver.units)
 
 
 def keep_early(mesh: Mesh, labels: NDArray[np.int64] | None, places: Iterable[Path]) -> Path | None:
-    """Keep an optimised mesh in the first possible place until all is written, in case the process ends; return it."""
+    """Keep an optimised mesh in the first possible place until all is written, in case the
+    process ends; return it.
+    """
     data, reason = {} if labels is None else {"label": labels}, ""
     for place in places:
         try:
@@ -355,10 +481,14 @@ def drop_early(early: Path) -> None:
         note(f"{early}: this copy of the mesh cannot be removed ({error.strerror})")
 
 
-def save_anyway(output: Path, mesh: Mesh, build: Callable[[], Model], error: Exception, early: Path | None) -> None:
-    """Save an optimised mesh whose file was rejected or failed, as VTU: beside it, else in a temporary folder.
+def save_anyway(
+    output: Path, mesh: Mesh, build: Callable[[], Model], error: Exception, early: Path | None
+) -> None:
+    """Save an optimised mesh whose file was rejected or failed, as VTU: beside it, else in a
+    temporary folder.
 
-    `build` makes the model to keep; if that also fails, the mesh alone is kept, as in `early` if that is a path.
+    `build` makes the model to keep; if that also fails, the mesh alone is kept, as in `early` if
+    that is a path.
 
     Raises
     ------
@@ -366,15 +496,23 @@ def save_anyway(output: Path, mesh: Mesh, build: Callable[[], Model], error: Exc
         If the user can fix `error`; the message says where the mesh is.
     """
     places = chain([] if early is None else [early], kept_places(output, ".vtu"))
-    kept = _kept_mesh(places, (lambda path: save_model(path, build()), lambda path: save_mesh(path, mesh)))
-    where = "could not be saved anywhere" if kept is None else f"is in {kept}: continue from there with tetopt convert"
+    kept = _kept_mesh(
+        places, (lambda path: save_model(path, build()), lambda path: save_mesh(path, mesh))
+    )
+    where = (
+        "could not be saved anywhere"
+        if kept is None
+        else f"is in {kept}: continue from there with tetopt convert"
+    )
     if isinstance(error, InputError | OSError | MemoryError):
         raise InputError(f"{error_words(error)}; the optimised mesh {where}") from error
     note(f"the optimised mesh {where}")
 
 
 def _kept_mesh(places: Iterable[Path], ways: Sequence[Callable[[Path], None]]) -> Path | None:
-    """Return the first place where one of the ways to save a mesh succeeds, or where it was saved before."""
+    """Return the first place where one of the ways to save a mesh succeeds, or where it was
+    saved before.
+    """
     for path in places:
         for save in ways:
             try:

@@ -29,10 +29,17 @@ def is_image_name(path: Path) -> bool:
 
 
 def write_on_image(
-    mesh: Path, output: Path, options: VoxelOptions, *, like: Path | None = None, results: Path | None = None,
-    space: str = "ras", is_registered: bool = False,
-) -> dict[str, Any]:  # fmt: skip
-    """Write a field of a mesh's file on the voxels of an image or, with `options.warp`, that image moved by it.
+    mesh: Path,
+    output: Path,
+    options: VoxelOptions,
+    *,
+    like: Path | None = None,
+    results: Path | None = None,
+    space: str = "ras",
+    is_registered: bool = False,
+) -> dict[str, Any]:
+    """Write a field of a mesh's file on the voxels of an image or, with `options.warp`, that image
+    moved by it.
 
     Parameters
     ----------
@@ -57,8 +64,8 @@ def write_on_image(
     Raises
     ------
     InputError
-        No field or image is named; files cannot be read, or do not belong together; no voxel lies in the mesh, or one
-        lies in several cells.
+        No field or image is named; files cannot be read, or do not belong together; no voxel lies
+        in the mesh, or one lies in several cells.
     """
     path = options.like or like or options.warp
     _check(output, options, like, space)
@@ -67,7 +74,9 @@ def write_on_image(
     name, values, at = _field_of(loaded, mesh, options, space)
     image = _read(loaded, mesh, path, is_registered)
     if (overlap := overlap_of(image, loaded.mesh)) is not None:
-        raise InputError(f"{mesh}: {overlap}; remove one cell of each pair, or mesh the image again")
+        raise InputError(
+            f"{mesh}: {overlap}; remove one cell of each pair, or mesh the image again"
+        )
     numbers: dict[str, Any] = {"mesh": mesh.name, "output": output.name, "field": name, "at": at}
     if options.warp is None:
         turned = half_turned_fields({name: values})[name]
@@ -90,10 +99,15 @@ def write_on_image(
             None,
         )
         if not options.nearest and is_label_map(other):
-            warning(f"{options.warp}: seems to be a label image, whose values are interpolated; `nearest` keeps them")
+            warning(
+                f"{options.warp}: seems to be a label image, whose values are interpolated; "
+                "`nearest` keeps them"
+            )
         nothing = Image(np.ones_like(other.data), other.affine)
         inside = warped_image(loaded.mesh, values, nothing, image).data > 0.0
-        moved = warped_image(loaded.mesh, values, other, image, is_nearest=options.nearest, outside=outside)
+        moved = warped_image(
+            loaded.mesh, values, other, image, is_nearest=options.nearest, outside=outside
+        )
         _check_any(inside, f"{mesh} and {path}")
         save_image(output, moved)
         on_voxels = moved.data.astype(np.float64)
@@ -104,15 +118,22 @@ def write_on_image(
     where = f"on {np.count_nonzero(inside)} of {inside.size} voxels of {path}, {rest} elsewhere"
     progress(f"{output}: {words}; {least:.4g} to {most:.4g} {where}")
     return numbers | {
-        "like": path.name, "n_voxels": int(np.count_nonzero(inside)), "least": least, "greatest": most,
-        "outside": None if np.isnan(outside) else outside, "space": space_of, "versions": versions(),
-    }  # fmt: skip
+        "like": path.name,
+        "n_voxels": int(np.count_nonzero(inside)),
+        "least": least,
+        "greatest": most,
+        "outside": None if np.isnan(outside) else outside,
+        "space": space_of,
+        "versions": versions(),
+    }
 
 
 def _check(output: Path, options: VoxelOptions, like: Path | None, space: str) -> None:
     """Raise InputError for options that contradict one another."""
     if options.like is not None and like is not None:
-        raise InputError(f"`like`: {options.like} and {like}: give only one image whose voxels get the field")
+        raise InputError(
+            f"`like`: {options.like} and {like}: give only one image whose voxels get the field"
+        )
     if (options.like or like or options.warp) is None:
         raise InputError(f"{output}: on the voxels of which image? pass `like`")
     if options.warp is None and options.nearest:
@@ -120,25 +141,37 @@ def _check(output: Path, options: VoxelOptions, like: Path | None, space: str) -
     if options.warp is not None and space != "ras":
         raise InputError("`space`: has no effect on an image that is moved")
     outside = options.outside
-    if outside is not None and (np.isinf(outside) or (np.isnan(outside) and options.warp is not None)):
+    if outside is not None and (
+        np.isinf(outside) or (np.isnan(outside) and options.warp is not None)
+    ):
         raise InputError(f"`outside`: expected a finite number, got {outside}")
 
 
 def _read(loaded: MeshFile, mesh: Path, path: Path, is_registered: bool) -> Image:
-    """Read an image in the mesh's world; raise InputError for another dimension or, unless registered, another box."""
+    """Read an image in the mesh's world; raise InputError for another dimension or, unless
+    registered, another box.
+    """
     image = read_companion(path)
     if image.ndim != loaded.mesh.ndim:
-        raise InputError(f"{path}: expected a {loaded.mesh.ndim}-D image like the mesh, got a {image.ndim}-D one")
+        raise InputError(
+            f"{path}: expected a {loaded.mesh.ndim}-D image like the mesh, got a {image.ndim}-D one"
+        )
     if not is_registered and (words := words_of_other_box(loaded, image)):
         remedy = "if it is in the same world, pass `registered`"
         raise InputError(f"{path}: expected the box of {mesh}'s image, {words}; {remedy}")
     return image
 
 
-def _field_of(loaded: MeshFile, mesh: Path, options: VoxelOptions, space: str) -> tuple[str, NDArray, At]:
-    """Return a field of nodes or cells, and which; raise InputError with the known fields if there is none."""
+def _field_of(
+    loaded: MeshFile, mesh: Path, options: VoxelOptions, space: str
+) -> tuple[str, NDArray, At]:
+    """Return a field of nodes or cells, and which; raise InputError with the known fields if
+    there is none.
+    """
     name = options.field_name
-    fields: dict[str, tuple[NDArray, At]] = {each: (rows, "cells") for each, rows in loaded.cell_data.items()}
+    fields: dict[str, tuple[NDArray, At]] = {
+        each: (rows, "cells") for each, rows in loaded.cell_data.items()
+    }
     fields |= {each: (rows, "nodes") for each, rows in loaded.point_data.items()}
     if name is None or name not in fields:
         known = ", ".join(fields) or "none"
@@ -147,7 +180,8 @@ def _field_of(loaded: MeshFile, mesh: Path, options: VoxelOptions, space: str) -
     if name in loaded.cell_data and name in loaded.point_data:
         note(f'{mesh}: has "{name}" at nodes and in cells; that at nodes is written')
     values, at = fields[name]
-    if at == "nodes" and loaded.mesh.ndim == 2 and values.shape[1:] == (3,):  # as VTK stores vectors
+    # as VTK stores vectors
+    if at == "nodes" and loaded.mesh.ndim == 2 and values.shape[1:] == (3,):
         values = values[:, :2]
     if values.dtype.kind not in "biuf" or not np.isfinite(values).all():
         raise InputError(f"{mesh}: expected finite numbers in {name}")
@@ -155,14 +189,19 @@ def _field_of(loaded: MeshFile, mesh: Path, options: VoxelOptions, space: str) -
     if is_unknown and "lps" in (space, loaded.space):
         what = "its file" if loaded.space == "lps" else "`space`"
         raise InputError(
-            f"{mesh}: the axes of {name} are unknown, and {what} is lps; rename it displacement if it is one"
+            f"{mesh}: the axes of {name} are unknown, and {what} is lps; rename it displacement "
+            "if it is one"
         )
     if options.warp is not None and (at != "nodes" or values.shape[1:] != (loaded.mesh.ndim,)):
         kind = f"a field of {at} with {values[0].size} number{'s' * (values[0].size > 1)} each"
-        raise InputError(f"`warp`: expected a displacement of nodes, but {name} in {mesh} is {kind}")
+        raise InputError(
+            f"`warp`: expected a displacement of nodes, but {name} in {mesh} is {kind}"
+        )
     return name, values, at
 
 
 def _check_any(inside: NDArray[np.bool_], what: str) -> None:
     if not inside.any():
-        raise InputError(f"{what}: no voxel centre is inside the mesh; do both use the same world coordinates?")
+        raise InputError(
+            f"{what}: no voxel centre is inside the mesh; do both use the same world coordinates?"
+        )

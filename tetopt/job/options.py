@@ -1,7 +1,8 @@
 """Options of a run: each once, with its type, its unit, its default, and a line of help.
 
-Records group options that belong together, and commands share them; a `Job` has all of them. Messages and help texts
-put an option's name between backticks, which the command line replaces by its own name.
+Records group options that belong together, and commands share them; a `Job` has all of them.
+Messages and help texts put an option's name between backticks, which the command line replaces by
+its own name.
 """
 
 from __future__ import annotations
@@ -47,21 +48,25 @@ class Option(NamedTuple):
 
 
 IMAGE_FILES = (
-    "NIfTI, MGZ, NRRD, MetaImage, OME-Zarr, a TIFF stack, a folder of slices, a DICOM file or folder, or a 2-D picture."
+    "NIfTI, MGZ, NRRD, MetaImage, OME-Zarr, a TIFF stack, a folder of slices, a DICOM "
+    "file or folder, or a 2-D picture."
 )
 JsonOption = Annotated[Path | None, Option("FILE", "Write every number here.", "json")]
 ForceOption = Annotated[bool, Option(None, "Replace existing outputs.")]
 AVERAGE_OPTION = Option(
     "WORD",
-    "Average of a cell's voxel moduli: mean (the paper's), geometric, harmonic, power:P, hill (between mean and "
-    "harmonic); or gauss (one per Gauss point of quadratic cells), nodes (linear between nodes) (default "
+    "Average of a cell's voxel moduli: mean (the paper's), geometric, harmonic, power:P, hill "
+    "(between mean and "
+    "harmonic); or gauss (one per Gauss point of quadratic cells), nodes (linear between nodes) "
+    "(default "
     f"{DEFAULT_AVERAGE}).",
 )
 LabelNamesOption = Annotated[
     Path | None,
     Option(
         "TABLE",
-        "Names and colours of labels, kept in the mesh's file: FreeSurfer, ITK-SNAP, 3D Slicer (also .seg.nrrd), "
+        "Names and colours of labels, kept in the mesh's file: FreeSurfer, ITK-SNAP, 3D Slicer "
+        "(also .seg.nrrd), "
         "DICOM SEG, BIDS dseg.tsv, or CSV (default: those in the file of labels).",
     ),
 ]
@@ -73,9 +78,14 @@ class BoxPart:
     """Selected part of a volume file."""
 
     volume: Annotated[int | None, Option("K", "Volume of a 4-D file, from 0.")] = None
-    crop: Annotated[str | None, Option("A:B,C:D,E:F", "Keep voxels A to B - 1 and so on; an end may be empty.")] = None
+    crop: Annotated[
+        str | None, Option("A:B,C:D,E:F", "Keep voxels A to B - 1 and so on; an end may be empty.")
+    ] = None
     spacing_mm: Annotated[
-        str | None, Option("MM|X,Y,Z", "Voxel sizes of TIFF stacks and folders of slices that do not state them.")
+        str | None,
+        Option(
+            "MM|X,Y,Z", "Voxel sizes of TIFF stacks and folders of slices that do not state them."
+        ),
     ] = None
 
 
@@ -83,25 +93,40 @@ class BoxPart:
 class ImagePart(BoxPart):
     """Selected part of an image file; a slice is a 2-D image."""
 
-    slice_: Annotated[str | None, Option("AXIS=INDEX", "One slice, as a 2-D image; for example k=90.", "slice")] = None
+    slice_: Annotated[
+        str | None, Option("AXIS=INDEX", "One slice, as a 2-D image; for example k=90.", "slice")
+    ] = None
 
 
 MaskLabelOption = Annotated[
-    str | None, Option("LABEL,...", "Labels of the `mask`, a label image, that are in the mask: numbers or names.")
+    str | None,
+    Option(
+        "LABEL,...", "Labels of the `mask`, a label image, that are in the mask: numbers or names."
+    ),
 ]
 
 
 @dataclass(frozen=True, kw_only=True)
 class MaskPart:
-    """Mask of the voxels that count for a mesh's file, and whether the image may be another than the mesh's."""
+    """Mask of the voxels that count for a mesh's file, and whether the image may be another than
+    the mesh's.
+    """
 
     mask: Annotated[
         Path | None,
-        Option("MASK", "The mask that the mesh was built within, unless its file contains it: no other voxel counts."),
+        Option(
+            "MASK",
+            "The mask that the mesh was built within, unless its file contains it: no other "
+            "voxel counts.",
+        ),
     ] = None
     mask_label: MaskLabelOption = None
     registered: Annotated[
-        bool, Option(None, "Accept an image other than the mesh's, registered to it, even if its box differs.")
+        bool,
+        Option(
+            None,
+            "Accept an image other than the mesh's, registered to it, even if its box differs.",
+        ),
     ] = False
 
 
@@ -116,7 +141,11 @@ class LabelledPart(MaskedPart):
 
     labels: Annotated[
         Path | None,
-        Option("LABELS", "Label image: each cell gets its voxels' majority label, for modulus mappings and sets."),
+        Option(
+            "LABELS",
+            "Label image: each cell gets its voxels' majority label, for modulus mappings and "
+            "sets.",
+        ),
     ] = None
 
 
@@ -126,16 +155,26 @@ class VoxelOptions:
 
     field_name: Annotated[
         str | None,
-        Option("NAME", "Write this field of nodes or cells on an image's voxels (.nii, .nii.gz).", "field"),
+        Option(
+            "NAME",
+            "Write this field of nodes or cells on an image's voxels (.nii, .nii.gz).",
+            "field",
+        ),
     ] = None
     like: Annotated[Path | None, Option("IMAGE", "The image whose voxels get the field.")] = None
     outside: Annotated[
-        float | None, Option("VALUE", "Value of voxels outside the mesh (default NaN; 0 with `warp`).")
+        float | None,
+        Option("VALUE", "Value of voxels outside the mesh (default NaN; 0 with `warp`)."),
     ] = None
     warp: Annotated[
-        Path | None, Option("IMAGE", "Write this image moved by `field`, a displacement, linear between voxels.")
+        Path | None,
+        Option(
+            "IMAGE", "Write this image moved by `field`, a displacement, linear between voxels."
+        ),
     ] = None
-    nearest: Annotated[bool, Option(None, "With `warp`: take the nearest voxel's value, as for labels.")] = False
+    nearest: Annotated[
+        bool, Option(None, "With `warp`: take the nearest voxel's value, as for labels.")
+    ] = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,7 +182,10 @@ class LabelChoice:
     """The labels that stay, by numbers or names."""
 
     keep_labels: Annotated[
-        str | None, Option("LABEL,...", "Keep only cells of these labels, numbers or names; the rest is left out.")
+        str | None,
+        Option(
+            "LABEL,...", "Keep only cells of these labels, numbers or names; the rest is left out."
+        ),
     ] = None
     drop_labels: Annotated[str | None, Option("LABEL,...", "Leave out these labels.")] = None
 
@@ -156,42 +198,69 @@ class RegionOptions(LabelChoice):
     """Region to mesh, with its labels and weights."""
 
     mask: Annotated[
-        Path | None, Option("MASK", "Mesh only this region (0/1, or 0 to 1), with its boundary on the mask's surface.")
+        Path | None,
+        Option(
+            "MASK",
+            "Mesh only this region (0/1, or 0 to 1), with its boundary on the mask's surface.",
+        ),
     ] = None
     mask_label: MaskLabelOption = None
     background: Annotated[
         str | None,
         Option(
-            "VALUE|auto", "Leave out the air: voxels up to VALUE connected to the box's sides. Labels above 0 stay."
+            "VALUE|auto",
+            "Leave out the air: voxels up to VALUE connected to the box's sides. Labels above 0 "
+            "stay.",
         ),
     ] = None
     fill_holes: Annotated[
         str | None,
-        Option("LABEL", "Give this label, a number or name, to voxels of label 0 that other labels enclose."),
+        Option(
+            "LABEL",
+            "Give this label, a number or name, to voxels of label 0 that other labels enclose.",
+        ),
     ] = None
-    keep_components: Annotated[bool, Option(None, "Keep small components of the mesh that the mask does not have.")] = (
-        False
+    keep_components: Annotated[
+        bool, Option(None, "Keep small components of the mesh that the mask does not have.")
+    ] = False
+    labels: Annotated[Path | None, Option("LABELS", "Label image: each cell gets one label.")] = (
+        None
     )
-    labels: Annotated[Path | None, Option("LABELS", "Label image: each cell gets one label.")] = None
     tissues: Annotated[
         Path | None,
-        Option("FILE,...", "Tissue probabilities instead of labels: one file each, or a 4-D file; 0 is the remainder."),
+        Option(
+            "FILE,...",
+            "Tissue probabilities instead of labels: one file each, or a 4-D file; 0 is the "
+            "remainder.",
+        ),
     ] = None
     merge: Annotated[
         str | None,
         Option(
             "GROUPS",
-            'Merge labels: "white=2,41; grey=3,42; soft=500-530; other=*", aseg, synthseg or simnibs, or a .toml or '
+            'Merge labels: "white=2,41; grey=3,42; soft=500-530; other=*", aseg, synthseg or '
+            "simnibs, or a .toml or "
             ".csv file.",
         ),
     ] = None
-    weights: Annotated[str | None, Option("W,...", "Weight of each IMAGE (default 1 each; 0: ignored).")] = None
+    weights: Annotated[
+        str | None, Option("W,...", "Weight of each IMAGE (default 1 each; 0: ignored).")
+    ] = None
     smooth_interfaces: Annotated[
         float | None,
-        Option("W", "Smoothing of surfaces between labels, in voxels, up to 10 (default 0.3; 0 keeps voxel steps)."),
+        Option(
+            "W",
+            "Smoothing of surfaces between labels, in voxels, up to 10 (default 0.3; 0 keeps "
+            "voxel steps).",
+        ),
     ] = None
     free_volumes: Annotated[
-        bool, Option(None, "Do not make up for the volume that labels thinner than cells lose (by default, in part).")
+        bool,
+        Option(
+            None,
+            "Do not make up for the volume that labels thinner than cells lose (by default, in "
+            "part).",
+        ),
     ] = False
     label_weight: Annotated[
         float | None, Option("W", "Weight of the labels relative to the first IMAGE (default 1).")
@@ -211,7 +280,11 @@ class SourceOptions(ContentOptions):
 
     images: Annotated[
         list[Path],
-        Option("IMAGE...", f"{IMAGE_FILES} Further images are contrasts, resampled to the first.", is_argument=True),
+        Option(
+            "IMAGE...",
+            f"{IMAGE_FILES} Further images are contrasts, resampled to the first.",
+            is_argument=True,
+        ),
     ]
 
 
@@ -230,34 +303,56 @@ class SizeOptions:
     ] = None
     target_error: Annotated[
         float | None,
-        Option("T", "Instead of a number of nodes: the fraction of the image's variance left unexplained."),
+        Option(
+            "T",
+            "Instead of a number of nodes: the fraction of the image's variance left unexplained.",
+        ),
     ] = None
     nodes_max: Annotated[
         int | None,
-        Option("N", f"With `target_error`: the most nodes that it may take (default {TARGET_NODES_MAX}).", least=5),
+        Option(
+            "N",
+            f"With `target_error`: the most nodes that it may take (default {TARGET_NODES_MAX}).",
+            least=5,
+        ),
     ] = None
-    size_min: Annotated[float | None, Option("MM", "Minimum edge length produced by splits.")] = None
+    size_min: Annotated[float | None, Option("MM", "Minimum edge length produced by splits.")] = (
+        None
+    )
     edge_size: Annotated[
-        float | None, Option("MM", "Target edge length: longer edges are split while nodes are available.")
+        float | None,
+        Option("MM", "Target edge length: longer edges are split while nodes are available."),
     ] = None
     edge_max: Annotated[
-        float | None, Option("MM", "Maximum edge length (default 1.4 x a uniform mesh's; with `edge_size` none).")
+        float | None,
+        Option(
+            "MM", "Maximum edge length (default 1.4 x a uniform mesh's; with `edge_size` none)."
+        ),
     ] = None
     gradation: Annotated[
-        float | None, Option("G", "Gradation, 0.05 (gentle) to 1 (default): each size is 1/G or more blocks wide.")
+        float | None,
+        Option(
+            "G", "Gradation, 0.05 (gentle) to 1 (default): each size is 1/G or more blocks wide."
+        ),
     ] = None
     cells_across: Annotated[
-        float | None, Option("N", "Number of cells across thin labels: target edges are the local thickness / N.")
+        float | None,
+        Option(
+            "N", "Number of cells across thin labels: target edges are the local thickness / N."
+        ),
     ] = None
     label_size: Annotated[
         str | None,
         Option(
             "LABEL=SIZE,...",
-            'Target edge by label or name, mm or a fraction of the local thickness t: "fluid=1.5,bone=0.6t[1:10],*=6", '
+            "Target edge by label or name, mm or a fraction of the local thickness t: "
+            '"fluid=1.5,bone=0.6t[1:10],*=6", '
             "or a .toml or .csv file.",
         ),
     ] = None
-    sizing: Annotated[Path | None, Option("SIZES.nii.gz", "Image of target edges, mm; 0 or less: no target.")] = None
+    sizing: Annotated[
+        Path | None, Option("SIZES.nii.gz", "Image of target edges, mm; 0 or less: no target.")
+    ] = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -269,14 +364,18 @@ class StartOptions:
         Lattice | None,
         Option(
             "KIND",
-            "Initial mesh: octree (default), with nodes where the image has detail, or the uniform bcc, five-tet or, "
+            "Initial mesh: octree (default), with nodes where the image has detail, or the "
+            "uniform bcc, five-tet or, "
             "in 2-D, criss-cross.",
         ),
     ] = None
-    uniform: Annotated[bool, Option(None, "Use the paper's uniform lattice, bcc (criss-cross in 2-D).")] = False
+    uniform: Annotated[
+        bool, Option(None, "Use the paper's uniform lattice, bcc (criss-cross in 2-D).")
+    ] = False
     spacing: Annotated[float | None, Option("MM", "Use a uniform lattice of this spacing.")] = None
     start: Annotated[
-        Path | None, Option("MESH", "Improve this mesh and keep its boundary, instead of building a new one.")
+        Path | None,
+        Option("MESH", "Improve this mesh and keep its boundary, instead of building a new one."),
     ] = None
 
 
@@ -303,24 +402,37 @@ class EngineOptions:
         ),
     ] = None
     boundary: Annotated[
-        Boundary | None, Option(None, "Motion of boundary nodes (default slide; with `start` fixed).")
+        Boundary | None,
+        Option(None, "Motion of boundary nodes (default slide; with `start` fixed)."),
     ] = None
     method: Annotated[
-        Method, Option(None, "fast: gradients, flips, a minimum dihedral angle; paper: the paper's scheme.")
+        Method,
+        Option(
+            None, "fast: gradients, flips, a minimum dihedral angle; paper: the paper's scheme."
+        ),
     ] = "fast"
     shape_power: Annotated[
         float | None,
-        Option("P", f"Fast method: 1 is the paper's E_G, 10 penalises flat cells most (default {SHAPE_POWER:g})."),
+        Option(
+            "P",
+            "Fast method: 1 is the paper's E_G, 10 penalises flat cells most (default "
+            f"{SHAPE_POWER:g}).",
+        ),
     ] = None
     min_dihedral: Annotated[
         float | None,
-        Option("DEG", f"Fast method, 3-D: smallest dihedral angle allowed, 0 (none) to 70 (default {MIN_DIHEDRAL:g})."),
+        Option(
+            "DEG",
+            "Fast method, 3-D: smallest dihedral angle allowed, 0 (none) to 70 (default "
+            f"{MIN_DIHEDRAL:g}).",
+        ),
     ] = None
     n_t: Annotated[
         int | None,
         Option(
             "T",
-            "Paper's method: retessellate in the first T iterations (default half; all for k_D = 0).",
+            "Paper's method: retessellate in the first T iterations (default half; all for k_D = "
+            "0).",
             "n-t",
             least=0,
         ),
@@ -329,17 +441,24 @@ class EngineOptions:
         Retessellate | None,
         Option(
             None,
-            "Paper's method: retessellate in the first n_t iterations (default), only if that lowers E, or never.",
+            "Paper's method: retessellate in the first n_t iterations (default), only if that "
+            "lowers E, or never.",
         ),
     ] = None
-    threads: Annotated[int | None, Option("N", "Number of threads; the result does not depend on it.")] = None
-    max_seconds: Annotated[float | None, Option("S", "Stop after S seconds and write the current mesh.")] = None
-    max_gb: Annotated[float | None, Option("GB", "Stop before exceeding this memory and write the current mesh.")] = (
-        None
-    )
+    threads: Annotated[
+        int | None, Option("N", "Number of threads; the result does not depend on it.")
+    ] = None
+    max_seconds: Annotated[
+        float | None, Option("S", "Stop after S seconds and write the current mesh.")
+    ] = None
+    max_gb: Annotated[
+        float | None, Option("GB", "Stop before exceeding this memory and write the current mesh.")
+    ] = None
 
 
-WorkersOption = Annotated[int | None, Option("N", "Maximum number of simultaneous tasks on this machine.", least=1)]
+WorkersOption = Annotated[
+    int | None, Option("N", "Maximum number of simultaneous tasks on this machine.", least=1)
+]
 SchedulerOption = Annotated[
     str | None, Option("ADDRESS", "A running dask scheduler with its workers: tcp://host:8786.")
 ]
@@ -352,10 +471,16 @@ class PartsOptions:
     panel: ClassVar[str] = "Meshing in parts"
     parts: Annotated[
         int | None,
-        Option("K", "Mesh in K or more parts, each with its own voxels (default 1, or as memory requires).", least=1),
+        Option(
+            "K",
+            "Mesh in K or more parts, each with its own voxels (default 1, or as memory requires).",
+            least=1,
+        ),
     ] = None
     workers: WorkersOption = None
-    worker_gb: Annotated[float | None, Option("GB", "Memory limit of each worker on this machine.")] = None
+    worker_gb: Annotated[
+        float | None, Option("GB", "Memory limit of each worker on this machine.")
+    ] = None
     scheduler: SchedulerOption = None
 
 
@@ -368,24 +493,33 @@ class ModelOptions:
         str | None,
         Option(
             "MAPPING",
-            'Young\'s modulus, kPa: a number, a formula of the intensity, "0.5 + 0.01*h", a table "0:1,100:5", '
+            'Young\'s modulus, kPa: a number, a formula of the intensity, "0.5 + 0.01*h", a '
+            'table "0:1,100:5", '
             'by label "1=2.1,liver=1.9,*=5", or a .toml or .csv file with such columns.',
         ),
     ] = None
-    nu: Annotated[str | None, Option("MAPPING", f"Poisson's ratio, in the same forms (default {DEFAULT_NU:g}).")] = None
+    nu: Annotated[
+        str | None,
+        Option("MAPPING", f"Poisson's ratio, in the same forms (default {DEFAULT_NU:g})."),
+    ] = None
     density: Annotated[
-        str | None, Option("MAPPING", "Density, kg/m3, in the same forms (water: 1000); needed for gravity.")
+        str | None,
+        Option("MAPPING", "Density, kg/m3, in the same forms (water: 1000); needed for gravity."),
     ] = None
     average: Annotated[str | None, AVERAGE_OPTION] = None
     bins: Annotated[
         str | None,
-        Option("K[:quantile|:log]", "Group cells into K materials: bins of equal width, equal count or log width."),
+        Option(
+            "K[:quantile|:log]",
+            "Group cells into K materials: bins of equal width, equal count or log width.",
+        ),
     ] = None
     sets: Annotated[
         list[str] | None,
         Option(
             "NAME=...",
-            "Add a set: NAME=below:T, NAME=point:X,Y,Z:D, NAME=plane:X,Y,Z:NX,NY,NZ:D (mm, RAS+), or of other "
+            "Add a set: NAME=below:T, NAME=point:X,Y,Z:D, NAME=plane:X,Y,Z:NX,NY,NZ:D (mm, "
+            "RAS+), or of other "
             "sets: NAME=A-B, NAME=outer:A-B, NAME=inner:A-B. May be repeated.",
             "set",
         ),
@@ -402,8 +536,10 @@ class ModelOptions:
         list[str] | None,
         Option(
             "...",
-            "compress:5%, hold:SET, move:SET:X,Y,Z (mm, or free), pressure:SET:P (kPa, inwards), traction:SET:X,Y,Z "
-            "(kPa), spring:SET:K (kPa/mm), gravity:X,Y,Z (mm/s2; the earth's is 9810); 2/... acts in step 2 only. "
+            "compress:5%, hold:SET, move:SET:X,Y,Z (mm, or free), pressure:SET:P (kPa, inwards), "
+            "traction:SET:X,Y,Z "
+            "(kPa), spring:SET:K (kPa/mm), gravity:X,Y,Z (mm/s2; the earth's is 9810); 2/... "
+            "acts in step 2 only. "
             "May be repeated.",
             "load",
         ),
@@ -423,15 +559,22 @@ class ModelOptions:
 class SolverOptions(ModelOptions):
     """Settings of a solver's file."""
 
-    nonlinear: Annotated[bool, Option(None, "Make the step a large-deformation one (.inp; FEBio always does).")] = False
+    nonlinear: Annotated[
+        bool, Option(None, "Make the step a large-deformation one (.inp; FEBio always does).")
+    ] = False
     units: Annotated[
-        str, Option("kPa|MPa|Pa", "Unit of stress in the file; with Pa, lengths are in m. `young` is in kPa.")
+        str,
+        Option(
+            "kPa|MPa|Pa",
+            "Unit of stress in the file; with Pa, lengths are in m. `young` is in kPa.",
+        ),
     ] = "kPa"
     fields: Annotated[
         str | None,
         Option(
             "none|mean|all",
-            "Fields of cells to write besides labels and results (default none in .msh; all in .vtu, .vtk, .xdmf).",
+            "Fields of cells to write besides labels and results (default none in .msh; all in "
+            ".vtu, .vtk, .xdmf).",
         ),
     ] = None
     space: SpaceOption = "ras"
@@ -445,7 +588,8 @@ class OutputOptions:
     output: Annotated[Path, Option("MESH", f"The mesh to write: {', '.join(FORMATS)}.", letter="o")]
     json_path: JsonOption = None
     figures: Annotated[
-        Path | None, Option("DIR", "Folder for slice.png, rho.png, energies.png and others; created if needed.")
+        Path | None,
+        Option("DIR", "Folder for slice.png, rho.png, energies.png and others; created if needed."),
     ] = None
     force: ForceOption = False
 
@@ -456,7 +600,15 @@ class RunOptions(SolverOptions, EngineOptions, StartOptions, SizeOptions, Conten
 
 
 @dataclass(frozen=True, kw_only=True)
-class JobOptions(OutputOptions, SolverOptions, PartsOptions, EngineOptions, StartOptions, SizeOptions, SourceOptions):
+class JobOptions(
+    OutputOptions,
+    SolverOptions,
+    PartsOptions,
+    EngineOptions,
+    StartOptions,
+    SizeOptions,
+    SourceOptions,
+):
     """Every option of a run; `tetopt.job.plan` checks that they are consistent."""
 
 
@@ -467,12 +619,18 @@ def stated_part(part: ImagePart) -> dict[str, int | str | None]:
 
 def has_model(options: SolverOptions) -> bool:
     """Return whether a file contains more than the mesh and the names of labels."""
-    own = {each.name: getattr(options, each.name) for each in fields(SolverOptions) if each.name != "label_names"}
+    own = {
+        each.name: getattr(options, each.name)
+        for each in fields(SolverOptions)
+        if each.name != "label_names"
+    }
     return SolverOptions(**own) != SolverOptions()
 
 
 def near_hint(name: str, names: Iterable[str]) -> str:
-    """Return a suggestion for the end of a message if one of the names resembles the unknown one."""
+    """Return a suggestion for the end of a message if one of the names resembles the unknown
+    one.
+    """
     near = get_close_matches(name, list(names), 1)
     return f"; did you mean {near[0]}?" if near else ""
 
@@ -499,15 +657,22 @@ def option_of(kind: Any) -> Option:
 
 
 def option_name(name: str, kind: Any) -> str:
-    """Return the name of a record's field on the command line, without leading hyphens, e.g. "k-d"."""
+    """Return the name of a record's field on the command line, without leading hyphens, e.g.
+    "k-d".
+    """
     return option_of(kind).name or name.replace("_", "-").lower()
 
 
 def given_options(record: Any) -> dict[str, Any]:
-    """Return a record's values that differ from the default, by command-line names; arguments by their fields' names.
+    """Return a record's values that differ from the default, by command-line names; arguments by
+    their fields' names.
 
     Records of the same fields and values have equal dictionaries.
     """
     kinds = kinds_of(type(record))
     values = ((field, getattr(record, field.name)) for field in fields(record))
-    return {option_name(field.name, kinds[field.name]): value for field, value in values if value != field.default}
+    return {
+        option_name(field.name, kinds[field.name]): value
+        for field, value in values
+        if value != field.default
+    }

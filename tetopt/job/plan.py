@@ -41,7 +41,16 @@ from tetopt.system.files import checked_output, results_folder
 
 VOXEL_BYTES = 16.0  # of an image that is read whole, in addition to meshing
 FEWEST_NODES = 5  # of the smallest mesh, an octree in 2-D: a square's corners and its middle
-SIZE_NAMES = ("size_min", "edge_size", "edge_max", "gradation", "sizing", "cells_across", "label_size")  # of options
+# of options
+SIZE_NAMES = (
+    "size_min",
+    "edge_size",
+    "edge_max",
+    "gradation",
+    "sizing",
+    "cells_across",
+    "label_size",
+)
 
 
 class Plan(NamedTuple):
@@ -56,7 +65,8 @@ class Plan(NamedTuple):
     bare : JobOptions
         The options as given, without defaults.
     pictures : sequence of Path
-        Pictures to draw: slice, rho, energies; with a mask, its boundary; with labels, the labels; a thumbnail.
+        Pictures to draw: slice, rho, energies; with a mask, its boundary; with labels, the labels;
+        a thumbnail.
 
     Examples
     --------
@@ -100,13 +110,21 @@ def kind_of(plan: Plan, ndim: int) -> str:
 
 
 def whole_bytes(plan: Plan) -> float:
-    """Return the bytes that a graded mesh of an image that could stay in its file takes in one piece; 0 for others."""
+    """Return the bytes that a graded mesh of an image that could stay in its file takes in one
+    piece; 0 for others.
+    """
     path = plan.job.images[0]
     check_local(path)
-    if not path.name.lower().endswith(STORED_SUFFIXES) or plan.job.slice_ is not None or plan.mode != "graded":
+    if (
+        not path.name.lower().endswith(STORED_SUFFIXES)
+        or plan.job.slice_ is not None
+        or plan.mode != "graded"
+    ):
         return 0.0
     n_voxels = voxels_in_file(plan)
-    return VOXEL_BYTES * n_voxels + meshing_bytes(n_voxels, len(plan.job.images), plan.job.nodes or DEFAULT_NODES[3])
+    return VOXEL_BYTES * n_voxels + meshing_bytes(
+        n_voxels, len(plan.job.images), plan.job.nodes or DEFAULT_NODES[3]
+    )
 
 
 def voxels_in_file(plan: Plan) -> int:
@@ -122,19 +140,31 @@ def stated_options(plan: Plan, ndim: int) -> dict[str, Any]:
     """Return the options as the mesh's file and run.json state them; files by their names."""
     job = plan.job
     return {
-        "nodes": job.nodes, "target_error": job.target_error, "nodes_max": job.nodes_max, "spacing": job.spacing,
-        "lattice": kind_of(plan, ndim), "size_min": job.size_min, "edge_size": job.edge_size,
-        "edge_max": job.edge_max, "gradation": job.gradation,
-        "cells_across": job.cells_across, "label_size": job.label_size,
+        "nodes": job.nodes,
+        "target_error": job.target_error,
+        "nodes_max": job.nodes_max,
+        "spacing": job.spacing,
+        "lattice": kind_of(plan, ndim),
+        "size_min": job.size_min,
+        "edge_size": job.edge_size,
+        "edge_max": job.edge_max,
+        "gradation": job.gradation,
+        "cells_across": job.cells_across,
+        "label_size": job.label_size,
         "sizing": None if job.sizing is None else job.sizing.name,
-        **stated_part(job), "method": job.method, "max_seconds": job.max_seconds, "max_gb": job.max_gb,
-        "start": None if job.start is None else job.start.name, **plan.engine_options,
+        **stated_part(job),
+        "method": job.method,
+        "max_seconds": job.max_seconds,
+        "max_gb": job.max_gb,
+        "start": None if job.start is None else job.start.name,
+        **plan.engine_options,
         **({} if job.parts is None else {"parts": job.parts}),
-    }  # fmt: skip
+    }
 
 
 def plan(job: JobOptions) -> Plan:
-    """Plan a job: check it, and fill in the defaults that do not depend on the image; no voxel is read.
+    """Plan a job: check it, and fill in the defaults that do not depend on the image; no voxel is
+    read.
 
     Parameters
     ----------
@@ -182,12 +212,16 @@ def resolved(job: JobOptions) -> Plan:
     for name in (*SIZE_NAMES, "target_error"):
         if mode != "graded" and getattr(job, name) is not None:
             raise InputError(
-                f"`{name}`: needs a graded mesh; leave out `uniform`, `spacing`, `lattice`, `method`, `start`"
+                f"`{name}`: needs a graded mesh; leave out `uniform`, `spacing`, `lattice`, "
+                "`method`, `start`"
             )
     completed = _completed(job, mode)
     is_plain = len(job.images) == 1 and not (has_region(job) or job.labels or job.tissues)
     if mode == "paper" and not is_plain:
-        raise InputError("`method` paper: needs one IMAGE and its whole box; leave out mask, labels and other images")
+        raise InputError(
+            "`method` paper: needs one IMAGE and its whole box; leave out mask, labels and other "
+            "images"
+        )
     return Plan(mode, completed, job)
 
 
@@ -198,7 +232,9 @@ def changed(job: JobOptions, **values: Any) -> JobOptions:
 
 def has_region(job: JobOptions) -> bool:
     """Return whether the options leave out a part of the image's box."""
-    return any(each is not None for each in (job.mask, job.background, job.keep_labels, job.drop_labels))
+    return any(
+        each is not None for each in (job.mask, job.background, job.keep_labels, job.drop_labels)
+    )
 
 
 def _check_source(job: JobOptions) -> None:
@@ -216,9 +252,18 @@ def _check_source(job: JobOptions) -> None:
     if job.merge is not None and job.labels is None:
         raise InputError("`merge`: needs `labels`")
     if job.labels is None and job.tissues is None:
-        names = ("keep_labels", "drop_labels", "fill_holes", "label_names", "label_weight", "smooth_interfaces")
+        names = (
+            "keep_labels",
+            "drop_labels",
+            "fill_holes",
+            "label_names",
+            "label_weight",
+            "smooth_interfaces",
+        )
         for name in (*names, "cells_across", "label_size"):
-            if getattr(job, name) is not None and not (name == "label_names" and job.mask_label is not None):
+            if getattr(job, name) is not None and not (
+                name == "label_names" and job.mask_label is not None
+            ):
                 raise InputError(f"`{name}`: needs `labels`")
         if job.free_volumes:
             raise InputError("`free_volumes`: needs `labels`")
@@ -237,13 +282,17 @@ def _check_numbers(job: JobOptions) -> None:
         parse_slice(job.slice_)
     most = round(MAX_NODES * nodes_per_corner(3, job.order or 1))
     if job.nodes is not None and not FEWEST_NODES <= job.nodes <= most:
-        raise InputError(f"`nodes`: expected a whole number from {FEWEST_NODES} to {most}, got {job.nodes}")
+        raise InputError(
+            f"`nodes`: expected a whole number from {FEWEST_NODES} to {most}, got {job.nodes}"
+        )
     if job.spacing is not None and not 0.0 < job.spacing < np.inf:
         raise InputError(f"`spacing`: expected a length above 0 mm, got {job.spacing}")
     if job.target_error is not None:
         check_target_error(job.target_error)
     elif job.nodes_max is not None:
-        raise InputError("`nodes_max`: needs `target_error`; without it, `nodes` is the number of nodes")
+        raise InputError(
+            "`nodes_max`: needs `target_error`; without it, `nodes` is the number of nodes"
+        )
     _limits(changed(job, sizing=None, label_size=None))
     if job.label_size is not None:
         label_sizes_of(job.label_size)
@@ -261,17 +310,28 @@ def _mode(job: JobOptions) -> Mode:
         if is_paper:
             raise InputError("`lattice` octree: only with `method` fast, got `method` paper")
         if job.spacing is not None:
-            raise InputError("`lattice` octree: has no single spacing; use `nodes` instead of `spacing`")
+            raise InputError(
+                "`lattice` octree: has no single spacing; use `nodes` instead of `spacing`"
+            )
     if job.start is not None:
         others = {
-            **numbers, "`lattice`": job.lattice, "`mask`": job.mask, "`background`": job.background,
-            "`keep_labels`": job.keep_labels, "`drop_labels`": job.drop_labels,
-        }  # fmt: skip
+            **numbers,
+            "`lattice`": job.lattice,
+            "`mask`": job.mask,
+            "`background`": job.background,
+            "`keep_labels`": job.keep_labels,
+            "`drop_labels`": job.drop_labels,
+        }
         others["`uniform`"] = job.uniform or None
         if names := [name for name, value in others.items() if value is not None]:
-            raise InputError(f"`start` and {names[0]}: {job.start} already has nodes and a boundary; leave one out")
+            raise InputError(
+                f"`start` and {names[0]}: {job.start} already has nodes and a boundary; leave "
+                "one out"
+            )
         if is_paper:
-            raise InputError("`start`: only with `method` fast, which preserves a non-convex boundary")
+            raise InputError(
+                "`start`: only with `method` fast, which preserves a non-convex boundary"
+            )
         return "start"
     if is_paper:
         return "paper"
@@ -291,7 +351,11 @@ def _completed(job: JobOptions, mode: Mode) -> JobOptions:
     if job.max_gb is not None and not job.max_gb > 0.0:
         raise InputError(f"`max_gb`: expected more than 0, got {job.max_gb}")
     boundary = job.boundary or default.boundary
-    nodes_max = TARGET_NODES_MAX if job.nodes_max is None and job.target_error is not None else job.nodes_max
+    nodes_max = (
+        TARGET_NODES_MAX
+        if job.nodes_max is None and job.target_error is not None
+        else job.nodes_max
+    )
     job = changed(job, k_D=k_D, iterations=iterations, boundary=boundary, nodes_max=nodes_max)
     _check_method(job, "paper", ("n_t", "retessellate"))
     _check_method(job, "fast", ("shape_power", "min_dihedral"))
@@ -325,10 +389,11 @@ def _pictures(job: JobOptions) -> list[Path]:
 def with_numbers(
     plan: Plan, content: Content, table: LabelTable = NO_TABLE
 ) -> tuple[Plan, Sizes | None, SizesByLabel | None]:
-    """Return the plan with the defaults that depend on the image, the sizes, and those by label; `table` names labels.
+    """Return the plan with the defaults that depend on the image, the sizes, and those by label;
+    `table` names labels.
 
-    The defaults are the number of nodes, as the sizes require or fewer on small images, and the longest edge, which
-    applies anyway and is stated.
+    The defaults are the number of nodes, as the sizes require or fewer on small images, and the
+    longest edge, which applies anyway and is stated.
     """
     image, job = content.image, plan.job
     is_counted = job.nodes is not None or job.target_error is not None or job.spacing is not None
@@ -351,17 +416,22 @@ def with_numbers(
 
 
 def nodes_of_targets(plan: Plan, content: Content, sizes: Sizes | None) -> int | None:
-    """Return the number of nodes that target sizes take, for order 2 with mid-edge nodes; None without targets."""
+    """Return the number of nodes that target sizes take, for order 2 with mid-edge nodes; None
+    without targets.
+    """
     if sizes is None or not sizes.has_target:
         return None
-    return round(nodes_of_sizes(content, sizes)[0] * nodes_per_corner(content.image.ndim, plan.order))
+    return round(
+        nodes_of_sizes(content, sizes)[0] * nodes_per_corner(content.image.ndim, plan.order)
+    )
 
 
 def expected_nodes(plan: Plan, content: Content) -> int:
     """Return the requested number of nodes, or the usual one if only the run can tell."""
     ndim, spacing = content.image.ndim, plan.job.spacing
     if spacing is not None:
-        return round(2.0 * content.volume / spacing**ndim)  # two per block, in five-tet lattices one
+        # two per block, in five-tet lattices one
+        return round(2.0 * content.volume / spacing**ndim)
     return plan.job.nodes or DEFAULT_NODES[ndim]
 
 
@@ -370,8 +440,13 @@ def _limits(job: JobOptions, table: LabelTable = NO_TABLE) -> Sizes | None:
     by_label = None if job.label_size is None else label_sizes_of(job.label_size, table)
     field = None if job.sizing is None else read_companion(job.sizing, job.spacing_mm)
     values = {
-        "smallest": job.size_min, "edge_size": job.edge_size, "gradation": job.gradation, "field": field,
-        "longest": job.edge_max, "cells_across": job.cells_across, "by_label": by_label,
-    }  # fmt: skip
+        "smallest": job.size_min,
+        "edge_size": job.edge_size,
+        "gradation": job.gradation,
+        "field": field,
+        "longest": job.edge_max,
+        "cells_across": job.cells_across,
+        "by_label": by_label,
+    }
     limits: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
     return Sizes(**limits) if limits else None

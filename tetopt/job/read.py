@@ -41,8 +41,8 @@ def read(job: Job) -> Task:
     Raises
     ------
     InputError
-        As for `plan`; a file cannot be read, or does not match the others; a run in parts has options that parts do not
-        support.
+        As for `plan`; a file cannot be read, or does not match the others; a run in parts has
+        options that parts do not support.
 
     See Also
     --------
@@ -61,14 +61,17 @@ def read(job: Job) -> Task:
     started("read", "reading and preparing the image, with its mask and labels")
     is_asked = any(getattr(job, name) is not None for name in kinds_of(PartsOptions))
     if is_asked or whole_bytes(checked) > available_bytes():
-        from tetopt.job.in_parts import read_in_parts  # loaded where it is needed, like all that it imports
+        # loaded where it is needed, like all that it imports
+        from tetopt.job.in_parts import read_in_parts
 
         return read_in_parts(checked) or read_planned(checked)
     return read_planned(checked)
 
 
 def read_planned(plan: Plan) -> Task:
-    """Read the files of a plan, and fill in the defaults that depend on them, for a mesh in one piece."""
+    """Read the files of a plan, and fill in the defaults that depend on them, for a mesh in one
+    piece.
+    """
     start = None if plan.job.start is None else read_mesh(plan.job.start)
     source = read_source(plan.job, plan.job.label_names, loaded=start)
     if start is not None:
@@ -91,11 +94,19 @@ def read_planned(plan: Plan) -> Task:
 def _check_place(mesh: Mesh, image: Image, path: str) -> None:
     """Raise InputError for a mesh outside the image; warn of one partly outside."""
     if mesh.ndim != image.ndim:
-        raise InputError(f"{path}: expected a {image.ndim}-D mesh like the image, got a {mesh.ndim}-D one")
+        raise InputError(
+            f"{path}: expected a {image.ndim}-D mesh like the image, got a {mesh.ndim}-D one"
+        )
     index = image.to_index(centroids(mesh.points, mesh.cells))
     low, high = box_sides(image.shape).T
     is_in = ((index >= low) & (index <= high)).all(axis=1)
     if not is_in.any():
-        raise InputError(f"{path}: the mesh lies outside the image; do both use the same world coordinates (mm, RAS+)?")
+        raise InputError(
+            f"{path}: the mesh lies outside the image; do both use the same world coordinates "
+            "(mm, RAS+)?"
+        )
     if not is_in.all():
-        warning(f"{path}: {np.mean(~is_in):.1%} of its cells lie outside the image, and are not affected by it")
+        warning(
+            f"{path}: {np.mean(~is_in):.1%} of its cells lie outside the image, and are not "
+            "affected by it"
+        )

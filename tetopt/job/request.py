@@ -1,4 +1,6 @@
-"""The request of a run, with checksums: equal for runs with the same mesh, and stored in their run.json."""
+"""The request of a run, with checksums: equal for runs with the same mesh, and stored in their
+run.json.
+"""
 
 from __future__ import annotations
 
@@ -13,26 +15,40 @@ import tetopt
 from tetopt.io.images import sha256
 from tetopt.io.stored_images import stored_checksum
 from tetopt.job.inputs import file_and_volume, tissue_files
-from tetopt.job.options import JobOptions, OutputOptions, PartsOptions, given_options, kinds_of, option_name
+from tetopt.job.options import (
+    JobOptions,
+    OutputOptions,
+    PartsOptions,
+    given_options,
+    kinds_of,
+    option_name,
+)
 from tetopt.model.mappings import FILES_IN_TEXTS, named_file
 
 # Options that do not affect the outputs: names of outputs, threads, and the workers of parts.
 OPTIONS_IGNORED = (
     "threads",
-    *(each.name for each in (*fields(OutputOptions), *fields(PartsOptions)) if each.name != "parts"),
+    *(
+        each.name
+        for each in (*fields(OutputOptions), *fields(PartsOptions))
+        if each.name != "parts"
+    ),
 )
 
 
 def requested(job: JobOptions) -> dict[str, Any]:
-    """Return all that determines the outputs of a run: options, the files' names and checksums, the version.
+    """Return all that determines the outputs of a run: options, the files' names and checksums, the
+    version.
 
-    Names of outputs and of folders, the number of threads and the workers of parts are not included.
+    Names of outputs and of folders, the number of threads and the workers of parts are not
+    included.
 
     Returns
     -------
     dict
-        `options`, the given ones, with `format`, the suffix of the mesh's file; `files`, for each option with files
-        a list of [name, SHA-256]; `tetopt`, the version; and `sha256` of all this.
+        `options`, the given ones, with `format`, the suffix of the mesh's file; `files`, for each
+        option with files a list of [name, SHA-256]; `tetopt`, the version; and `sha256` of all
+        this.
 
     Raises
     ------
@@ -46,10 +62,14 @@ def requested(job: JobOptions) -> dict[str, Any]:
     stated = {name: value for name, value in options.items() if name not in files}
     whole: dict[str, Any] = {
         "options": {**stated, "format": job.output.suffix.lower()},
-        "files": {name: [[path.name, checksum(path)] for path in paths] for name, paths in files.items()},
+        "files": {
+            name: [[path.name, checksum(path)] for path in paths] for name, paths in files.items()
+        },
         "tetopt": tetopt.__version__,
     }
-    return whole | {"sha256": hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()}
+    return whole | {
+        "sha256": hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()
+    }
 
 
 def _files(name: str, value: Any) -> list[Path]:
@@ -58,11 +78,15 @@ def _files(name: str, value: Any) -> list[Path]:
         return [] if (file := named_file(value)) is None else [file]
     if name == "tissues":
         return tissue_files(value)
-    return [each for each in (value if isinstance(value, list) else [value]) if isinstance(each, Path)]
+    return [
+        each for each in (value if isinstance(value, list) else [value]) if isinstance(each, Path)
+    ]
 
 
 def checksum(path: Path) -> str:
-    """SHA-256 of an option's file or folder, as hexadecimal digits; computed again only after a change."""
+    """SHA-256 of an option's file or folder, as hexadecimal digits; computed again only after a
+    change.
+    """
     file, _ = file_and_volume(path)
     return _kept_checksum(file, stored_checksum(file))
 

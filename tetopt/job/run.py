@@ -22,7 +22,7 @@ from tetopt.job.advice import (
     sentences,
     tell,
     unmet,
-)  # fmt: skip
+)
 from tetopt.job.events import Listener, listened, started
 from tetopt.job.job import Job
 from tetopt.job.read import read
@@ -48,8 +48,8 @@ class Result(NamedTuple):
     numbers : dict
         Every number of the run, as in run.json.
     violated : dict of str to str
-        By name, a sentence on each violated requirement and on each failed measurement; empty if the mesh meets all
-        requirements.
+        By name, a sentence on each violated requirement and on each failed measurement; empty if
+        the mesh meets all requirements.
     task : Task
         The task, with all defaults, and the files as read.
     meshed : Meshed
@@ -90,7 +90,8 @@ def run(job: Job, on: Listener | None = None, stop: Callable[[], bool] | None = 
     job : Job
         The job to run.
     on : callable, optional
-        Called with each `Event`; without it, warnings and violated requirements are Python's warnings.
+        Called with each `Event`; without it, warnings and violated requirements are Python's
+        warnings.
     stop : callable, optional
         Called between colours of nodes; True ends the run with the current mesh.
 
@@ -102,8 +103,8 @@ def run(job: Job, on: Listener | None = None, stop: Callable[[], bool] | None = 
     Raises
     ------
     InputError
-        As for `Job`; files cannot be read or do not belong together; an output may not or cannot be written, and the
-        message says where the mesh is.
+        As for `Job`; files cannot be read or do not belong together; an output may not or cannot be
+        written, and the message says where the mesh is.
 
     See Also
     --------
@@ -111,11 +112,13 @@ def run(job: Job, on: Listener | None = None, stop: Callable[[], bool] | None = 
 
     Notes
     -----
-    In parts, workers are processes that first import your program: call this function under
-    ``if __name__ == "__main__":``. For processes of your own, use ``multiprocessing.get_context("spawn")``: a pool
-    that forks after a run never ends, as OpenMP's threads do not survive a fork.
+    In parts, workers are processes that first import your program: call this function under ``if
+    __name__ == "__main__":``. For processes of your own, use
+    ``multiprocessing.get_context("spawn")``: a pool that forks after a run never ends, as OpenMP's
+    threads do not survive a fork.
 
-    Ctrl-C raises KeyboardInterrupt, and an unwritten mesh is lost; to keep the current mesh, return True from `stop`.
+    Ctrl-C raises KeyboardInterrupt, and an unwritten mesh is lost; to keep the current mesh, return
+    True from `stop`.
 
     Examples
     --------
@@ -154,7 +157,9 @@ def run(job: Job, on: Listener | None = None, stop: Callable[[], bool] | None = 
 
 
 def _undrawn(result: Result, failed: dict[str, str]) -> Exception | None:
-    """Draw the pictures; return the error if that fails, which the numbers state, too, as they are written first."""
+    """Draw the pictures; return the error if that fails, which the numbers state, too, as they
+    are written first.
+    """
     try:
         if result.task.plan.pictures:
             draw(result.task, result.meshed, result.model)
@@ -167,7 +172,11 @@ def _undrawn(result: Result, failed: dict[str, str]) -> Exception | None:
 def _shapes(outcome: Meshed, failed: dict[str, str]) -> Shapes:
     meshes = {"quality_initial": outcome.initial, "quality": outcome.result.mesh}
     shapes = measured_each(
-        {name: partial(quality, each.points, each.cells, each.midpoints) for name, each in meshes.items()}, failed
+        {
+            name: partial(quality, each.points, each.cells, each.midpoints)
+            for name, each in meshes.items()
+        },
+        failed,
     )
     return shapes.get("quality_initial"), shapes.get("quality")
 
@@ -181,17 +190,25 @@ def _problems(result: Result, failed: dict[str, str]) -> list[Problem]:
     expected = job.nodes if mode == "graded" and job.target_error is None else None
     n_nodes = node_count(result.model.mesh.points, result.model.mesh.cells, result.model.order)
     spacing = task.source.contrasts[0].spacing
-    n_empty = 0 if task.source.is_constant else measured.get("cells_without_voxel", 0)  # their values are right anyway
-    is_most = has_most_empty(outcome.result, n_empty)  # else fewer nodes hardly help cells that follow labels
+    # their values are right anyway
+    n_empty = 0 if task.source.is_constant else measured.get("cells_without_voxel", 0)
+    # else fewer nodes hardly help cells that follow labels
+    is_most = has_most_empty(outcome.result, n_empty)
     is_free = mode != "start" and (is_most or task.source.labels is None)
     is_free &= measured.get("nodes_of_sizes", 0) <= n_nodes
     empty = list(of_empty(outcome.result, is_free, n_empty, spacing, task.source.mask is not None))
     problems = [*empty, *problems] if is_most else problems
     if job.cells_across is not None:
-        problems += of_layers(measured.get("labels", []), job.cells_across, measured.get("label_names", {}))
+        problems += of_layers(
+            measured.get("labels", []), job.cells_across, measured.get("label_names", {})
+        )
     has_sizes = task.plan.has_sizes
-    problems += of_result(outcome.result, job.method, mode, n_nodes, expected, measured, job.k_D, has_sizes)
+    problems += of_result(
+        outcome.result, job.method, mode, n_nodes, expected, measured, job.k_D, has_sizes
+    )
     if task.sizes is not None and (edges := result.shapes[1]) is not None:
         sizes = task.sizes._replace(longest=task.plan.bare.edge_max)  # without a default
-        problems += of_sizes(sizes, edges.min_edge, edges.max_edge, measured.get("edges_over_target"))
+        problems += of_sizes(
+            sizes, edges.min_edge, edges.max_edge, measured.get("edges_over_target")
+        )
     return agreed(problems if is_most else [*problems, *empty])

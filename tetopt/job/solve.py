@@ -15,7 +15,13 @@ from tetopt.io.formats import save_model
 from tetopt.io.images import sha256
 from tetopt.job.events import warning
 from tetopt.job.inputs import check_part, read_mesh, texts_of, voxels_of
-from tetopt.job.model import check_model_options, large_words, loads_of, model_of_file, with_chosen_sets
+from tetopt.job.model import (
+    check_model_options,
+    large_words,
+    loads_of,
+    model_of_file,
+    with_chosen_sets,
+)
 from tetopt.job.options import LabelledPart, ModelOptions, stated_part
 from tetopt.model.averages import DEFAULT_AVERAGE
 from tetopt.model.file import MeshFile, without_results
@@ -28,7 +34,8 @@ if TYPE_CHECKING:
     from tetopt.fem.conditioning import Conditioning
     from tetopt.fem.solution import Solution
 
-INTENSITY_MAPPING = "h"  # without a modulus, the image's intensities are the moduli, as in the paper
+# without a modulus, the image's intensities are the moduli, as in the paper
+INTENSITY_MAPPING = "h"
 PAPER_PERCENT = 1.0  # compression of the paper's test, only a scale for a linear law
 
 
@@ -43,16 +50,23 @@ class SolvedModel(NamedTuple):
 
 
 def solve_file(
-    mesh: Path, image: Path | None = None, output: Path | None = None, *, model: ModelOptions, part: LabelledPart,
-    compress: float | None = None, conditioning: bool | None = None,
-) -> SolvedModel:  # fmt: skip
+    mesh: Path,
+    image: Path | None = None,
+    output: Path | None = None,
+    *,
+    model: ModelOptions,
+    part: LabelledPart,
+    compress: float | None = None,
+    conditioning: bool | None = None,
+) -> SolvedModel:
     """Solve a mesh with its loads, and write the results.
 
     Parameters
     ----------
     mesh : Path
     image : Path, optional
-        Source of mappings. Without loads its box is compressed; without a mapping its intensities are the moduli.
+        Source of mappings. Without loads its box is compressed; without a mapping its intensities
+        are the moduli.
     output : Path, optional
         A VTK file for the mesh with displacements, strains and stresses.
     model : ModelOptions
@@ -65,10 +79,13 @@ def solve_file(
     Raises
     ------
     InputError
-        Files cannot be read or do not belong together; the mesh has no moduli or loads, or is not fixed.
+        Files cannot be read or do not belong together; the mesh has no moduli or loads, or is not
+        fixed.
     """
     if image is not None:
-        model = replace(model, young=model.young or INTENSITY_MAPPING, average=model.average or DEFAULT_AVERAGE)
+        model = replace(
+            model, young=model.young or INTENSITY_MAPPING, average=model.average or DEFAULT_AVERAGE
+        )
     _check_options(image, compress, model, part)
     task = _model(mesh, image, model, part, compress)
     of_box = image is not None and not model.loads
@@ -79,7 +96,9 @@ def solve_file(
     options = {**asdict(model), "compress_percent": compress, **stated_part(part)}
     options["label_names"] = None if model.label_names is None else model.label_names.name
     files = {"mesh": mesh.name}
-    files |= {name: path.name for name in ("labels", "mask") if (path := getattr(part, name)) is not None}
+    files |= {
+        name: path.name for name in ("labels", "mask") if (path := getattr(part, name)) is not None
+    }
     if image is not None:
         files |= {"image": image.name, "image_sha256": sha256(image)}
     about = {**files, "versions": versions(), "options": options}
@@ -87,29 +106,43 @@ def solve_file(
     return SolvedModel(task, model, solutions, extremes, numbers)
 
 
-def _check_options(image: Path | None, compress: float | None, model: ModelOptions, part: LabelledPart) -> None:
+def _check_options(
+    image: Path | None, compress: float | None, model: ModelOptions, part: LabelledPart
+) -> None:
     """Raise InputError for options that are invalid for any file."""
     if compress is not None and not 0.0 < compress <= MOST_COMPRESSION_PERCENT:
         most = f"{MOST_COMPRESSION_PERCENT:g}"
-        raise InputError(f"`compress`: expected a percentage above 0 and up to {most}, got {compress:g}")
+        raise InputError(
+            f"`compress`: expected a percentage above 0 and up to {most}, got {compress:g}"
+        )
     if compress is not None and model.loads:
-        raise InputError("`compress` and `loads`: combine them as `loads` compress:5% `loads` pressure:left:1.5")
+        raise InputError(
+            "`compress` and `loads`: combine them as `loads` compress:5% `loads` pressure:left:1.5"
+        )
     check_part(image, part, part.labels)
     if image is None and model.average is not None:
         raise InputError("`average`: averages over an image's voxels; pass `image`")
     check_model_options(model, has_materials=True)
 
 
-def _filled(model: ModelOptions, loaded: MeshFile, image: Image | None, compress: float | None) -> ModelOptions:
-    """Return the options, completed from the mesh's file, or for an image's box from the paper's test."""
+def _filled(
+    model: ModelOptions, loaded: MeshFile, image: Image | None, compress: float | None
+) -> ModelOptions:
+    """Return the options, completed from the mesh's file, or for an image's box from the paper's
+    test.
+    """
     if model.order is None:
         model = replace(model, order=loaded.order)
     if compress is not None or (image is not None and not model.loads):
-        model = replace(model, loads=[f"compress:{PAPER_PERCENT if compress is None else compress!r}%"])
+        model = replace(
+            model, loads=[f"compress:{PAPER_PERCENT if compress is None else compress!r}%"]
+        )
     elif not model.loads:
         model = replace(model, loads=loads_of(loaded))
     if model.young is None and "young" not in loaded.cell_data:
-        raise InputError("the mesh's file has no moduli: pass `young`, such as `young` 3.5, or `image`")
+        raise InputError(
+            "the mesh's file has no moduli: pass `young`, such as `young` 3.5, or `image`"
+        )
     if not model.loads:
         raise InputError(
             "the mesh's file has no loads: pass `loads`, such as `loads` compress:5%, "
@@ -126,9 +159,13 @@ def _check_box(image: Image, loaded: MeshFile) -> None:
     check_fills_box(image, loaded.mesh)
 
 
-def _model(path: Path, image: Path | None, model: ModelOptions, part: LabelledPart, compress: float | None) -> Model:
+def _model(
+    path: Path, image: Path | None, model: ModelOptions, part: LabelledPart, compress: float | None
+) -> Model:
     """Build the model to solve, of the mesh's file and the image."""
-    loaded, what, is_other = voxels_of(without_results(read_mesh(path)), path, image, part, part.labels)
+    loaded, what, is_other = voxels_of(
+        without_results(read_mesh(path)), path, image, part, part.labels
+    )
     about, box, whole, voxels = texts_of(loaded, is_other=is_other), loaded.box, None, None
     if what is not None:
         whole, voxels = what.given, what.image
@@ -137,7 +174,9 @@ def _model(path: Path, image: Path | None, model: ModelOptions, part: LabelledPa
         box = box_of(whole)
     about |= {} if box is None else {"box": box_text(box)}
     model = _filled(model, loaded, whole, compress)
-    return model_of_file(loaded, voxels, model, about, box, has_units=model.young != INTENSITY_MAPPING)
+    return model_of_file(
+        loaded, voxels, model, about, box, has_units=model.young != INTENSITY_MAPPING
+    )
 
 
 def _solved(model: Model, is_conditioned: bool) -> tuple[list[Solution], Conditioning | None]:
@@ -149,7 +188,9 @@ def _solved(model: Model, is_conditioned: bool) -> tuple[list[Solution], Conditi
         solutions = [solve(model, step) for step in range(1, count_of_steps(model.loads) + 1)]
         return solutions, conditioning(solutions[0].system) if is_conditioned else None
     except RuntimeError as error:
-        raise InputError(f"{error}; for this mesh the moduli differ too much, or nu is too close to 0.5") from error
+        raise InputError(
+            f"{error}; for this mesh the moduli differ too much, or nu is too close to 0.5"
+        ) from error
 
 
 def _with_results(model: Model, solutions: list[Solution]) -> Model:
@@ -170,12 +211,16 @@ def _lists(reactions: dict[str, NDArray[np.float64]]) -> dict[str, list[float]]:
 
 
 def _advise(model: Model, solutions: list[Solution]) -> None:
-    """Warn if the order is unsuitable for the material, or the displacements are too large for the method."""
+    """Warn if the order is unsuitable for the material, or the displacements are too large for
+    the method.
+    """
     if words := locking_words(model):
         warning(words)
     moved = max(float(np.sqrt((solution.u**2).sum(axis=1).max())) for solution in solutions)
     remedy = "check loads and fixed sets, or write a file for CalculiX with `nonlinear`"
-    if (large := large_words(model.mesh, moved, f"too large for this linear solution; {remedy}")) is not None:
+    if (
+        large := large_words(model.mesh, moved, f"too large for this linear solution; {remedy}")
+    ) is not None:
         warning(large)
 
 
@@ -196,7 +241,9 @@ def _numbers_of(solution: Solution) -> dict[str, Any]:
     }
 
 
-def _numbers(model: Model, solutions: list[Solution], extremes: Conditioning | None) -> dict[str, Any]:
+def _numbers(
+    model: Model, solutions: list[Solution], extremes: Conditioning | None
+) -> dict[str, Any]:
     """Return all numbers for the JSON file; the strain energy is the first step's."""
     numbers: dict[str, Any] = {
         "n_nodes": len(model.mesh.points),
@@ -209,6 +256,15 @@ def _numbers(model: Model, solutions: list[Solution], extremes: Conditioning | N
         "steps": [_numbers_of(solution) for solution in solutions],
     }
     if extremes is not None:
-        numbers |= {"lambda_max": extremes.lambda_max, "cond": extremes.cond, "cg_iterations": extremes.cg_iterations}
-    units = {"lambda_max": "mN/mm", "strain_energy": "uJ", "reactions": "mN", "largest_von_mises": "kPa"}
+        numbers |= {
+            "lambda_max": extremes.lambda_max,
+            "cond": extremes.cond,
+            "cg_iterations": extremes.cg_iterations,
+        }
+    units = {
+        "lambda_max": "mN/mm",
+        "strain_energy": "uJ",
+        "reactions": "mN",
+        "largest_von_mises": "kPa",
+    }
     return numbers | {"units": units}

@@ -51,7 +51,14 @@ from tetopt.measure.fidelity import cell_labels, unexplained_of
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
 from tetopt.model.file import MASK_TEXT, MeshFile
-from tetopt.model.labels import TABLE_TEXT, kept_labels, label_words, labels_named, table_of_labels, table_words
+from tetopt.model.labels import (
+    TABLE_TEXT,
+    kept_labels,
+    label_words,
+    labels_named,
+    table_of_labels,
+    table_words,
+)
 from tetopt.model.sets import box_of, box_text
 from tetopt.model.tissues import is_preset, merge_labels, numbers_by_name, renumbered
 
@@ -71,7 +78,9 @@ class Source(NamedTuple):
 
     @property
     def image(self) -> Image:
-        """The first contrast on its own voxels, continued beyond the mask, around which alone voxels are kept."""
+        """The first contrast on its own voxels, continued beyond the mask, around which alone
+        voxels are kept.
+        """
         return continued(self.contrasts[0], self.content.continuation)
 
     @property
@@ -97,9 +106,11 @@ class Source(NamedTuple):
         return spread.low == spread.high
 
     def fields(self, mesh: Mesh, labels: NDArray[np.int64] | None = None) -> dict[str, NDArray]:
-        """Return the fields of the mesh's file: those of `cell_fields`, means of further contrasts, and the label.
+        """Return the fields of the mesh's file: those of `cell_fields`, means of further contrasts,
+        and the label.
 
-        `labels` (M,) are those of the optimisation; without them, a cell has the majority label of its voxels.
+        `labels` (M,) are those of the optimisation; without them, a cell has the majority label of
+        its voxels.
         """
         fields = cell_fields(mesh, self.image)
         for number, contrast in enumerate(self.contrasts[1:], 2):
@@ -117,34 +128,50 @@ class Source(NamedTuple):
         return self._replace(table=table, about=self.about | words)
 
     def by_contrast(self, fields: dict[str, NDArray]) -> list[dict[str, Any]]:
-        """Return, for each contrast, the fraction of its variance that is left within cells with these fields."""
+        """Return, for each contrast, the fraction of its variance that is left within cells with
+        these fields.
+        """
         rows = []
         for number, (path, weight) in enumerate(zip(self.paths, self.weights, strict=True), 1):
-            mean, variance = (fields[field if number == 1 else f"{field}_{number}"] for field in ("mean", "variance"))
+            mean, variance = (
+                fields[field if number == 1 else f"{field}_{number}"]
+                for field in ("mean", "variance")
+            )
             fraction = unexplained_of(fields["n_voxels"], mean, variance)
-            rows.append({"image": path.name, "weight": weight, "E_D_fraction_of_variance": fraction})
+            rows.append(
+                {"image": path.name, "weight": weight, "E_D_fraction_of_variance": fraction}
+            )
         return rows
 
 
 def read_source(
-    options: SourceOptions, label_names: Path | None = None, numbers: Mapping[int, int] | None = None,
-    loaded: MeshFile | None = None, kept: Sequence[int] | None = None,
-) -> Source:  # fmt: skip
+    options: SourceOptions,
+    label_names: Path | None = None,
+    numbers: Mapping[int, int] | None = None,
+    loaded: MeshFile | None = None,
+    kept: Sequence[int] | None = None,
+) -> Source:
     """Read images, labels with their names, and mask, on the voxels of the first image.
 
-    Labels get other `numbers` if given; otherwise they are merged by the options and their names. Only the labels in
-    `kept` stay, if given; otherwise the options choose. Without a mask or a background in the options, that of a mesh's
-    file counts, if one was `loaded`.
+    Labels get other `numbers` if given; otherwise they are merged by the options and their names.
+    Only the labels in `kept` stay, if given; otherwise the options choose. Without a mask or a
+    background in the options, that of a mesh's file counts, if one was `loaded`.
     """
     paths = options.images
     finest: Originals = read_mask(options, label_names)
     if options.labels is not None:
         key = (options.labels, _align_of_labels(options, numbers))
         finest = {**finest, key: read_companion(options.labels, options.spacing_mm)}
-    image, beside, factors = image_and_others(read_image(paths[0], options), paths[0], options, finest)
+    image, beside, factors = image_and_others(
+        read_image(paths[0], options), paths[0], options, finest
+    )
     labels, table, numbers, is_own = _labelling(options, image, beside, label_names, numbers)
     labels, filled = _without_holes(options, labels, table)
-    if labels is not None and is_own and (numbers or (filled is not None and options.tissues is None)):
+    if (
+        labels is not None
+        and is_own
+        and (numbers or (filled is not None and options.tissues is None))
+    ):
         image = labels
     contrasts = [image, *(beside(path, resample_contrast) for path in paths[1:])]
     level = None
@@ -152,27 +179,43 @@ def read_source(
         mask = mask_for(options, image, beside, loaded)
     else:
         is_auto = options.background == "auto"
-        level = background_level(image) if is_auto else number_of("`background`", options.background)
+        level = (
+            background_level(image) if is_auto else number_of("`background`", options.background)
+        )
         mask = _foreground(image, level, labels)
     labels, mask, kept = _chosen(options, labels, mask, table, kept)
     del finest, beside  # the files as read: their memory is needed
     balance = balance_of(options)
     if options.weights is None and is_own:
-        whose, used = ("the label image", "labels") if options.tissues is None else ("one of the tissues", "tissues")
+        whose, used = (
+            ("the label image", "labels")
+            if options.tissues is None
+            else ("one of the tissues", "tissues")
+        )
         note(f"the image is also {whose}: only the {used} are used")
         balance = balance._replace(weights=[0.0])
     combined = content(
-        contrasts, labels, mask, **balance._asdict(), keep_components=options.keep_components,
+        contrasts,
+        labels,
+        mask,
+        **balance._asdict(),
+        keep_components=options.keep_components,
         keep_volumes=not options.free_volumes,
-    )  # fmt: skip
+    )
     if max(factors) > 1:
         combined = combined._replace(repeats=factors)
     of_tissues = [file_and_volume(path)[0] for path in tissue_files(options.tissues)]
-    files = [*paths[1:], *(path for path in (options.mask, options.labels, *of_tissues) if path is not None)]
+    files = [
+        *paths[1:],
+        *(path for path in (options.mask, options.labels, *of_tissues) if path is not None),
+    ]
     inputs = {
-        "images": [path.name for path in paths], "weights": balance.weights,
-        "mask": None if options.mask is None else options.mask.name, "background": level,
-        "labels": None if options.labels is None else options.labels.name, "label_weight": options.label_weight,
+        "images": [path.name for path in paths],
+        "weights": balance.weights,
+        "mask": None if options.mask is None else options.mask.name,
+        "background": level,
+        "labels": None if options.labels is None else options.labels.name,
+        "label_weight": options.label_weight,
         **({} if options.tissues is None else {"tissues": [path.name for path in of_tissues]}),
         **({} if labels is None else {"smooth_interfaces": balance.smooth_interfaces}),
         **({"free_volumes": True} if options.free_volumes else {}),
@@ -183,7 +226,7 @@ def read_source(
         **({} if kept is None else {"kept_labels": kept}),
         **({} if filled is None else {"filled_holes": filled}),
         "sha256": {path.name: checksum(path) for path in files},
-    }  # fmt: skip
+    }
     about = {
         "image": paths[0].name,
         "image_sha256": checksum(paths[0]),
@@ -191,13 +234,17 @@ def read_source(
         "box": box_text(box_of(image)),
         **({} if mask is None else {MASK_TEXT: mask_text(mask)}),
     }
-    return Source(paths, balance.weights, combined, contrasts, labels, mask, about, NO_TABLE, image).with_table(table)
+    return Source(
+        paths, balance.weights, combined, contrasts, labels, mask, about, NO_TABLE, image
+    ).with_table(table)
 
 
 def _without_holes(
     options: SourceOptions, labels: Image | None, table: LabelTable
-) -> tuple[Image | None, int | None]:  # fmt: skip
-    """Return the labels, and the label that enclosed voxels of label 0 have got, if any; report these."""
+) -> tuple[Image | None, int | None]:
+    """Return the labels, and the label that enclosed voxels of label 0 have got, if any; report
+    these.
+    """
     if options.fill_holes is None:
         return labels, None
     assert labels is not None, "the plan requires labels"
@@ -205,13 +252,25 @@ def _without_holes(
     filled, sizes, around = filled_holes(labels, label)
     if len(sizes):
         volumes = sizes * float(np.prod(labels.spacing))
-        by_label = sorted(((float(volumes[around == each].sum()), each) for each in np.unique(around)), reverse=True)
-        words = f"{counted(len(sizes), 'hole')} of {volumes.sum():.4g} mm{labels.ndim}, the largest {volumes.max():.4g}"
+        by_label = sorted(
+            ((float(volumes[around == each].sum()), each) for each in np.unique(around)),
+            reverse=True,
+        )
+        words = (
+            f"{counted(len(sizes), 'hole')} of {volumes.sum():.4g} mm{labels.ndim}, the "
+            f"largest {volumes.max():.4g}"
+        )
         note(f"label 0: {words}, filled by {label_words(label, table.names)}")
-        parts = [f"{label_words(each, table.names)} {size:.4g} mm{labels.ndim}" for size, each in by_label]
+        parts = [
+            f"{label_words(each, table.names)} {size:.4g} mm{labels.ndim}"
+            for size, each in by_label
+        ]
         note(f"labels around most of each hole: {listed(parts)}")
     else:
-        warning("`fill_holes`: no voxel of label 0 is enclosed: all are connected by faces to the box's sides")
+        warning(
+            "`fill_holes`: no voxel of label 0 is enclosed: all are connected by faces to the "
+            "box's sides"
+        )
     return filled, label if len(sizes) else None
 
 
@@ -222,14 +281,22 @@ def _label_of_holes(text: str, table: LabelTable) -> int:
     except InputError as error:
         raise InputError(f"`fill_holes`: {error}") from error
     if others or not BACKGROUND_LABEL < label <= LARGEST_LABEL:
-        raise InputError(f'`fill_holes`: expected one label from 1 to {LARGEST_LABEL}, got "{text}"')
+        raise InputError(
+            f'`fill_holes`: expected one label from 1 to {LARGEST_LABEL}, got "{text}"'
+        )
     return label
 
 
 def _chosen(
-    options: SourceOptions, labels: Image | None, mask: Image | None, table: LabelTable, kept: Sequence[int] | None
-) -> tuple[Image | None, Image | None, Sequence[int] | None]:  # fmt: skip
-    """Return the labels that stay and the mask of their voxels, within another mask; and their numbers, if chosen."""
+    options: SourceOptions,
+    labels: Image | None,
+    mask: Image | None,
+    table: LabelTable,
+    kept: Sequence[int] | None,
+) -> tuple[Image | None, Image | None, Sequence[int] | None]:
+    """Return the labels that stay and the mask of their voxels, within another mask; and their
+    numbers, if chosen.
+    """
     if kept is None and options.keep_labels is None and options.drop_labels is None:
         return labels, mask, None
     assert labels is not None, "the plan requires labels"
@@ -238,7 +305,9 @@ def _chosen(
         kept = kept_labels(options.keep_labels, options.drop_labels, present, table.names)
     is_kept = np.isin(labels.data, kept)
     if not (is_kept if mask is None else is_kept & (mask.data >= INSIDE_FRACTION)).any():
-        raise InputError(f"labels that stay, {listed(kept)}: no voxel within the mask has one of them")
+        raise InputError(
+            f"labels that stay, {listed(kept)}: no voxel within the mask has one of them"
+        )
     mask = Image(is_kept if mask is None else np.where(is_kept, mask.data, 0.0), labels.affine)
     # Those left out on purpose are not reported as missing.
     return Image(np.where(is_kept, labels.data, BACKGROUND_LABEL), labels.affine), mask, kept
@@ -264,9 +333,12 @@ class ReadLabels(NamedTuple):
 
 
 def _labelling(
-    options: SourceOptions, image: Image, beside: Beside, label_names: Path | None,
+    options: SourceOptions,
+    image: Image,
+    beside: Beside,
+    label_names: Path | None,
     numbers: Mapping[int, int] | None,
-) -> ReadLabels:  # fmt: skip
+) -> ReadLabels:
     """Read the labels, merged by the options, or the tissues."""
     table, is_alone = label_table(label_names, labels_path=options.labels), len(options.images) == 1
     if options.tissues is not None:
@@ -285,7 +357,9 @@ def _labelling(
 
 
 def _align_of_labels(options: SourceOptions, numbers: Mapping[int, int] | None) -> Align:
-    """Return how to resample labels: if some may be left out on purpose, without a warning of those outside."""
+    """Return how to resample labels: if some may be left out on purpose, without a warning of
+    those outside.
+    """
     return _some_labels if options.merge or options.crop or numbers else resample_labels
 
 
@@ -295,8 +369,10 @@ def _some_labels(labels: Image, image: Image, name: str) -> Image:
 
 def _merged(
     labels: Image, table: LabelTable, options: SourceOptions, numbers: Mapping[int, int] | None
-) -> tuple[Image, LabelTable, Mapping[int, int]]:  # fmt: skip
-    """Merge labels by the options, or by shared names; return them, their table, and their new numbers."""
+) -> tuple[Image, LabelTable, Mapping[int, int]]:
+    """Merge labels by the options, or by shared names; return them, their table, and their new
+    numbers.
+    """
     if numbers is not None:
         return renumbered(labels, numbers), table, numbers
     if options.merge is not None:
@@ -304,7 +380,9 @@ def _merged(
             merged = merge_labels(labels, options.merge, table.names)
         except InputError as error:
             raise InputError(f"{options.labels}: {error}") from error
-        missing = [name for label, name in merged.names.items() if label not in merged.numbers.values()]
+        missing = [
+            name for label, name in merged.names.items() if label not in merged.numbers.values()
+        ]
         if missing and not is_preset(options.merge):
             warning(f"`merge`: {options.labels} has no label for {listed(missing)}")
         sizes = sorted(Counter(merged.numbers.values()).items())
@@ -322,7 +400,13 @@ def _merged(
 
 
 def whose_variance(content: Content) -> str:
-    """Name the variance that E_D is a fraction of; labels that are their own image are the only channels."""
+    """Name the variance that E_D is a fraction of; labels that are their own image are the only
+    channels.
+    """
     if content.n_contrasts == 1 and content.n_channels == 1:
         return "the image's variance"
-    return "the labels' variance" if content.n_contrasts == 0 else "the variance of all images and labels"
+    return (
+        "the labels' variance"
+        if content.n_contrasts == 0
+        else "the variance of all images and labels"
+    )

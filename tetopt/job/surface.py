@@ -32,15 +32,28 @@ MOST_LISTED = 12  # interfaces in the table; the file of numbers has all
 class SurfacePart:
     """Surface of a mesh to write, and its coordinates."""
 
-    below: Annotated[float | None, Option("T", "Surface of the largest connected set of cells with means below T.")] = (
+    below: Annotated[
+        float | None,
+        Option("T", "Surface of the largest connected set of cells with means below T."),
+    ] = None
+    label: Annotated[
+        str | None, Option("L", "Surface of all cells with this label, by number or name.")
+    ] = None
+    cell_set: Annotated[str | None, Option("NAME", "Surface of a named set of cells.", "set")] = (
         None
     )
-    label: Annotated[str | None, Option("L", "Surface of all cells with this label, by number or name.")] = None
-    cell_set: Annotated[str | None, Option("NAME", "Surface of a named set of cells.", "set")] = None
-    boundary: Annotated[bool, Option(None, "Surface of the whole mesh; with `interfaces`, add it to these.")] = False
-    interface: Annotated[str | None, Option("J,K", "Interface of two labels, normals out of J; may be open.")] = None
+    boundary: Annotated[
+        bool, Option(None, "Surface of the whole mesh; with `interfaces`, add it to these.")
+    ] = False
+    interface: Annotated[
+        str | None, Option("J,K", "Interface of two labels, normals out of J; may be open.")
+    ] = None
     interfaces: Annotated[
-        bool, Option(None, "All interfaces of labels as one surface, each triangle with the labels on both sides.")
+        bool,
+        Option(
+            None,
+            "All interfaces of labels as one surface, each triangle with the labels on both sides.",
+        ),
     ] = False
     space: SpaceOption = "ras"
     label_names: LabelNamesOption = None
@@ -78,14 +91,23 @@ def write_surface(mesh: Path, output: Path, part: SurfacePart) -> WrittenSurface
 
 def _check_part(part: SurfacePart, output: Path) -> None:
     """Raise InputError unless one surface is requested, and the file can hold it."""
-    chosen = [part.below is not None, part.label is not None, part.cell_set is not None, part.interface is not None]
+    chosen = [
+        part.below is not None,
+        part.label is not None,
+        part.cell_set is not None,
+        part.interface is not None,
+    ]
     if sum([*chosen, part.boundary or part.interfaces]) != 1:
         raise InputError(
-            "surface: give exactly one of `below`, `label`, `cell_set`, `boundary`, `interface` and `interfaces` "
+            "surface: give exactly one of `below`, `label`, `cell_set`, `boundary`, `interface` "
+            "and `interfaces` "
             "(`boundary` may be added to `interfaces`)"
         )
     if part.interfaces and output.suffix.lower() not in LABELLED_SUFFIXES:
-        raise InputError(f"{output}: STL cannot store the labels of triangles; use {' or '.join(LABELLED_SUFFIXES)}")
+        raise InputError(
+            f"{output}: STL cannot store the labels of triangles; use "
+            f"{' or '.join(LABELLED_SUFFIXES)}"
+        )
     if part.space not in SPACES:
         raise InputError(f"`space`: expected {' or '.join(SPACES)}, got {part.space}")
 
@@ -111,13 +133,18 @@ def _write_closed(
     ]
     if surface.n_parted:
         note(
-            f"{surface.n_parted} nodes and edges where the structure touches itself were separated, by "
+            f"{surface.n_parted} nodes and edges where the structure touches itself were "
+            "separated, by "
             f"{surface.largest_shift:.2g} mm at most, so that each edge has two triangles"
         )
     is_sound = written.is_watertight and written.is_winding_consistent and written.volume > 0.0
     if not is_sound:
         violated(f"{output}: not watertight according to trimesh; please report this")
-    measured = {"volume_mm3": written.volume, "area_mm2": written.area, "n_pieces": written.n_pieces}
+    measured = {
+        "volume_mm3": written.volume,
+        "area_mm2": written.area,
+        "n_pieces": written.n_pieces,
+    }
     parted = {"n_parted": surface.n_parted, "largest_shift_mm": surface.largest_shift}
     lines = ["checked with trimesh: watertight, normals out"] if is_sound else []
     numbers = {"is_watertight": is_sound} | measured | parted
@@ -127,7 +154,9 @@ def _write_closed(
 def _write_interfaces(
     loaded: MeshFile, path: Path, output: Path, part: SurfacePart, names: dict[int, str]
 ) -> WrittenSurface:
-    """Write the mesh's facets between labels, with normals out of the smaller label, and read them back."""
+    """Write the mesh's facets between labels, with normals out of the smaller label, and read
+    them back.
+    """
     labels = cell_field(loaded, path, "label").astype(np.int64)
     every = label_surfaces(facets(loaded.mesh.cells), labels)
     sides = every.label, every.beyond
@@ -135,13 +164,17 @@ def _write_interfaces(
         one, other = _two_sides(part.interface, names)
         rows = np.flatnonzero(np.isin(sides[0], one) & np.isin(sides[1], other))
         if len(rows) == 0:
-            words = " and ".join(" or ".join(label_words(k, names) for k in side) for side in (one, other))
+            words = " and ".join(
+                " or ".join(label_words(k, names) for k in side) for side in (one, other)
+            )
             raise InputError(f"{path}: no facet lies between labels {words}")
     else:
         is_outer = (sides[1] == OUTSIDE_LABEL) & part.boundary
         rows = np.flatnonzero((sides[0] != OUTSIDE_LABEL) & ((sides[0] < sides[1]) | is_outer))
         if len(rows) == 0:
-            raise InputError(f"{path}: all cells have one label, so there are no interfaces; use `boundary`")
+            raise InputError(
+                f"{path}: all cells have one label, so there are no interfaces; use `boundary`"
+            )
     shown = LabelSurfaces(*(each[rows] for each in every))
     of_triangle = {"label_inside": shown.label, "label_outside": shown.beyond}
     used, triangles = np.unique(shown.nodes, return_inverse=True)
@@ -152,28 +185,46 @@ def _write_interfaces(
 
 
 def _of_interfaces(
-    output: Path, surface: Surface, shown: LabelSurfaces, names: dict[int, str], written: SurfaceCheck
+    output: Path,
+    surface: Surface,
+    shown: LabelSurfaces,
+    names: dict[int, str],
+    written: SurfaceCheck,
 ) -> WrittenSurface:
     """Return area and triangles of each pair of labels, and the numbers for the file of numbers."""
     areas = surface_areas(FacetSurface(surface.points, surface.triangles))
-    # For all triangles together, whatever their labels: an edge of a rim has one, an edge of a seam three or more.
+    # For all triangles together, whatever their labels: an edge of a rim has one, an edge of a seam
+    # three or more.
     together = LabelSurfaces(np.zeros_like(shown.label), shown.beyond, shown.nodes)
     n_facets = surface_ridges(together).n_facets
     pairs, which, counts = np.unique(
-        np.column_stack([shown.label, shown.beyond]), axis=0, return_inverse=True, return_counts=True
+        np.column_stack([shown.label, shown.beyond]),
+        axis=0,
+        return_inverse=True,
+        return_counts=True,
     )
     of_pair = np.bincount(which.ravel(), areas)
     rows = []
     for k in np.argsort(-of_pair, kind="stable")[:MOST_LISTED]:
         inside, beyond = pairs[k].tolist()
         words = "outside" if beyond == OUTSIDE_LABEL else label_words(beyond, names)
-        rows.append((f"{label_words(inside, names)} to {words}", str(counts[k]), f"{of_pair[k]:.6g}"))
+        rows.append(
+            (f"{label_words(inside, names)} to {words}", str(counts[k]), f"{of_pair[k]:.6g}")
+        )
     if len(pairs) > 1:
         rows.append((f"all {len(pairs)}", str(len(areas)), f"{areas.sum():.6g}"))
     rim, seam = int((n_facets == 1).sum()), int((n_facets > 2).sum())
-    last = f"{rim} edges in one triangle, {seam} in more than two; area in the file: {written.area:.6g} mm2"
+    last = (
+        f"{rim} edges in one triangle, {seam} in more than two; area in the file: "
+        f"{written.area:.6g} mm2"
+    )
     of_pairs = [
-        {"label_inside": pairs[k, 0], "label_outside": pairs[k, 1], "n_triangles": counts[k], "area_mm2": of_pair[k]}
+        {
+            "label_inside": pairs[k, 0],
+            "label_outside": pairs[k, 1],
+            "n_triangles": counts[k],
+            "area_mm2": of_pair[k],
+        }
         for k in range(len(pairs))
     ]
     edges = {"n_rim_edges": rim, "n_seam_edges": seam}
@@ -185,19 +236,25 @@ def _two_sides(text: str, names: dict[int, str]) -> tuple[list[int], list[int]]:
     """Parse "J,K" into the labels on both sides of the interface."""
     sides = text.split(",")
     if len(sides) != 2:
-        raise InputError(f'`interface`: expected two labels as J,K, by number or name, got "{text}"')
+        raise InputError(
+            f'`interface`: expected two labels as J,K, by number or name, got "{text}"'
+        )
     one, other = labels_named(sides[0], names), labels_named(sides[1], names)
     if set(one) & set(other):
         raise InputError(f'`interface`: expected two different labels, got "{text}"')
     return one, other
 
 
-def _with_label(loaded: MeshFile, path: Path, chosen: list[int], names: dict[int, str]) -> NDArray[np.int64]:
+def _with_label(
+    loaded: MeshFile, path: Path, chosen: list[int], names: dict[int, str]
+) -> NDArray[np.int64]:
     """Return the numbers of the cells with these labels."""
     labels = cell_field(loaded, path, "label")
     cells = np.flatnonzero(np.isin(labels, chosen))
     if len(cells) == 0:
-        known = ", ".join(label_words(each, names) for each in np.unique(labels)[:20].astype(np.int64).tolist())
+        known = ", ".join(
+            label_words(each, names) for each in np.unique(labels)[:20].astype(np.int64).tolist()
+        )
         words = " or ".join(label_words(each, names) for each in chosen)
         raise InputError(f"{path}: no cell has label {words}; the mesh has {known}")
     return cells
@@ -215,12 +272,17 @@ def _chosen(loaded: MeshFile, path: Path, part: SurfacePart) -> NDArray[np.int64
     mean = cell_field(loaded, path, "mean")
     chosen = largest_component(loaded.mesh.cells, mean < part.below)
     if len(chosen) == 0:
-        raise InputError(f"{path}: no cell has a mean below {part.below:g}; the smallest is {mean.min():g}")
+        raise InputError(
+            f"{path}: no cell has a mean below {part.below:g}; the smallest is {mean.min():g}"
+        )
     of_faces = face_sets(loaded.mesh, boundary_rows(loaded.mesh), loaded.box)
-    touched = [name for name in chain(*FACE_NAMES[3]) if np.isin(of_faces[name][:, 0], chosen).any()]
+    touched = [
+        name for name in chain(*FACE_NAMES[3]) if np.isin(of_faces[name][:, 0], chosen).any()
+    ]
     if touched and len(chosen) < len(mean):
         note(
-            f"the largest connected component below {part.below:g} touches the box's faces {', '.join(touched)} and "
+            f"the largest connected component below {part.below:g} touches the box's faces "
+            f"{', '.join(touched)} and "
             "may be the air around the body; use `label` or `cell_set` to select a structure"
         )
     if len(chosen) == len(mean):

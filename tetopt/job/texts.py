@@ -12,7 +12,10 @@ from tetopt.errors import InputError
 from tetopt.job.job import of_option
 from tetopt.job.options import RunOptions, kinds_of, near_hint, option_name
 
-SWITCH_WORDS = {**dict.fromkeys(("1", "true", "yes"), True), **dict.fromkeys(("0", "false", "no"), False)}
+SWITCH_WORDS = {
+    **dict.fromkeys(("1", "true", "yes"), True),
+    **dict.fromkeys(("0", "false", "no"), False),
+}
 
 
 def option_words(options: dict[str, Any]) -> list[str]:
@@ -22,15 +25,17 @@ def option_words(options: dict[str, Any]) -> list[str]:
         if value is True:
             words.append(f"--{name}")
         else:
-            words += [f"--{name}={each}" for each in (value if isinstance(value, list) else [value])]
+            words += [
+                f"--{name}={each}" for each in (value if isinstance(value, list) else [value])
+            ]
     return words
 
 
 def with_options(options: RunOptions, texts: dict[str, str]) -> RunOptions:
     """Return the options with some values replaced by texts, by names of the command line.
 
-    A switch is on by "1", "true" or "yes" and off by "0", "false" or "no"; several values of an option that may be
-    repeated are separated by semicolons.
+    A switch is on by "1", "true" or "yes" and off by "0", "false" or "no"; several values of an
+    option that may be repeated are separated by semicolons.
 
     Raises
     ------

@@ -42,10 +42,17 @@ from tetopt.system.files import kept_places
 
 
 def model_with(
-    task: Task, mesh: Mesh, solver: SolverOptions, about: dict[str, Any], is_told: bool = True,
-    labels: NDArray[np.int64] | None = None, fields: dict[str, NDArray] | None = None,
-) -> Model:  # fmt: skip
-    """Build the model of a mesh with the options; `fields` of its cells are computed if not given."""
+    task: Task,
+    mesh: Mesh,
+    solver: SolverOptions,
+    about: dict[str, Any],
+    is_told: bool = True,
+    labels: NDArray[np.int64] | None = None,
+    fields: dict[str, NDArray] | None = None,
+) -> Model:
+    """Build the model of a mesh with the options; `fields` of its cells are computed if not
+    given.
+    """
     source, started = task.source, task.started
     if fields is None:
         fields = source.fields(mesh, labels)
@@ -55,29 +62,47 @@ def model_with(
         if source.labels is not None:  # whose sets are rebuilt
             names = label_table(None, started).names
             of_labels = label_set_names(names, names).values()
-            lost = [name for name in lost if not name.startswith(("label_", "interface_")) and name not in of_labels]
+            lost = [
+                name
+                for name in lost
+                if not name.startswith(("label_", "interface_")) and name not in of_labels
+            ]
         if lost:
             note(f"dropped sets whose cells or faces changed during remeshing: {', '.join(lost)}")
         has_results = any(is_result(name) for name in (*started.cell_data, *started.point_data))
         if "young" in started.cell_data or started.text("loads") is not None or has_results:
-            note("moduli, loads and results of the input mesh are not kept; pass `young` and `loads`")
-    known_sets = all_sets(mesh, box_of(source.contrasts[0]), fields, own, source.table.names, is_told=is_told)
+            note(
+                "moduli, loads and results of the input mesh are not kept; pass `young` and `loads`"
+            )
+    known_sets = all_sets(
+        mesh, box_of(source.contrasts[0]), fields, own, source.table.names, is_told=is_told
+    )
     return solver_model(mesh, source.image.in_memory, solver, fields, about, known_sets)
 
 
 def saved(task: Task, outcome: Meshed, failed: dict[str, str]) -> tuple[Model, dict[str, Any]]:
-    """Write the mesh, or save it elsewhere; return the model, and the files' statements about the run.
+    """Write the mesh, or save it elsewhere; return the model, and the files' statements about the
+    run.
 
-    Until its file is whole, a copy of the mesh is kept next to it, as cell fields are measured first, or in the file
-    itself if the run was cut short. Measurements that fail are left out, and noted in `failed`.
+    Until its file is whole, a copy of the mesh is kept next to it, as cell fields are measured
+    first, or in the file itself if the run was cut short. Measurements that fail are left out, and
+    noted in `failed`.
     """
-    plan, job, source, result, fields = task.plan, task.plan.job, task.source, outcome.result, outcome.fields
+    plan, job, source, result, fields = (
+        task.plan,
+        task.plan.job,
+        task.source,
+        outcome.result,
+        outcome.fields,
+    )
     options = stated_options(plan, source.content.image.ndim)
     if job.target_error is not None:
         options["nodes"] = result.nodes
     about = {**source.about, "options": options}
     about |= {"violated": result.violated} if result.violated else {}
-    places = islice(kept_places(job.output, ".vtu"), 1) if outcome.early is None else [outcome.early]
+    places = (
+        islice(kept_places(job.output, ".vtu"), 1) if outcome.early is None else [outcome.early]
+    )
     early = None if outcome.end is not None else keep_early(result.mesh, result.labels, places)
     if fields is None:
         fields = _measured_fields(source, result, failed)
@@ -89,7 +114,15 @@ def saved(task: Task, outcome: Meshed, failed: dict[str, str]) -> tuple[Model, d
 
         def bare() -> Model:
             options = SolverOptions()
-            return model_with(task, result.mesh, options, about, is_told=False, labels=result.labels, fields=fields)
+            return model_with(
+                task,
+                result.mesh,
+                options,
+                about,
+                is_told=False,
+                labels=result.labels,
+                fields=fields,
+            )
 
         kept, early = early, None
         save_anyway(job.output, result.mesh, bare, error, kept)
@@ -100,18 +133,33 @@ def saved(task: Task, outcome: Meshed, failed: dict[str, str]) -> tuple[Model, d
     return model, about
 
 
-def _measured_fields(source: Source, result: MeshingResult, failed: dict[str, str]) -> dict[str, NDArray]:
-    """Return the fields of the result's cells; only shapes and labels if the image's cannot be computed."""
-    if measured := measured_each({"fields": partial(source.fields, result.mesh, result.labels)}, failed):
+def _measured_fields(
+    source: Source, result: MeshingResult, failed: dict[str, str]
+) -> dict[str, NDArray]:
+    """Return the fields of the result's cells; only shapes and labels if the image's cannot be
+    computed.
+    """
+    if measured := measured_each(
+        {"fields": partial(source.fields, result.mesh, result.labels)}, failed
+    ):
         return dict(measured["fields"])
     return cell_fields(result.mesh) | ({} if result.labels is None else {"label": result.labels})
 
 
-def measured_of(task: Task, result: MeshingResult, model: Model, failed: dict[str, str]) -> dict[str, Any]:
+def measured_of(
+    task: Task, result: MeshingResult, model: Model, failed: dict[str, str]
+) -> dict[str, Any]:
     """Measure the fit to mask, labels, contrasts and sizes."""
     return_freed()  # by writing the mesh
     source = task.source
-    measured = fidelity(source.labels, source.mask, result.mesh, model.cell_data.get("label"), failed, source.content)
+    measured = fidelity(
+        source.labels,
+        source.mask,
+        result.mesh,
+        model.cell_data.get("label"),
+        failed,
+        source.content,
+    )
     if (table := _table_of(source)) is not None and table.names:
         measured["label_names"] = table.names
     counted = measured_each(_counts(task, result, model), failed)
@@ -128,25 +176,36 @@ def _table_of(source: Source) -> LabelTable | None:
 
 def numbers_of(
     task: Task, outcome: Meshed, shapes: Shapes, model: Model, about: dict[str, Any], seconds: float
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """Return every number of a run except measurements: the begin of run.json."""
     source = task.source
     table = _table_of(source)
-    texts = {name: text for name, text in about.items() if name != MASK_TEXT}  # which is for the mesh's file
+    # which is for the mesh's file
+    texts = {name: text for name, text in about.items() if name != MASK_TEXT}
     texts |= {} if table is None else {TABLE_TEXT: table_words(table)}
     summary = run_summary(
-        source.content, outcome.initial, outcome.result, texts, {**outcome.seconds, "all": seconds}, shapes
+        source.content,
+        outcome.initial,
+        outcome.result,
+        texts,
+        {**outcome.seconds, "all": seconds},
+        shapes,
     )
     summary["request"] = task.request
     if task.by_label is not None:
         made = task.by_label
-        rows = [{"label": row.label, "thickness": row.thickness, "target": row.edge} for row in made.layers]
+        rows = [
+            {"label": row.label, "thickness": row.thickness, "target": row.edge}
+            for row in made.layers
+        ]
         summary["label_sizes"] = {"nodes": made.nodes, "scale": made.scale, "labels": rows}
     return summary | {"memory": {"peak_bytes": peak_bytes(), **outcome.memory}}
 
 
 def _counts(task: Task, result: MeshingResult, model: Model) -> dict[str, Callable[[], Any]]:
-    """Return further measures of a mesh, by name; their value is None if there is nothing to report."""
+    """Return further measures of a mesh, by name; their value is None if there is nothing to
+    report.
+    """
     source, sizes, mesh, fields = task.source, task.sizes, result.mesh, model.cell_data
     measures: dict[str, Callable[[], Any]] = {}
     has_image = "n_voxels" in fields
@@ -159,7 +218,9 @@ def _counts(task: Task, result: MeshingResult, model: Model) -> dict[str, Callab
         measures["nodes_of_sizes"] = lambda: nodes_of_targets(task.plan, source.content, sizes)
     if source.mask is not None:
         measures["dropped_components"] = lambda: result.n_dropped
-        measures["dropped_volumes"] = lambda: {str(label): volume for label, volume in result.dropped.items()}
+        measures["dropped_volumes"] = lambda: {
+            str(label): volume for label, volume in result.dropped.items()
+        }
     if (labels := result.labels) is not None:
         measures["nodes_of_many_labels"] = lambda: crowded_nodes(mesh.cells, labels)
     return measures
@@ -173,13 +234,27 @@ def draw(task: Task, outcome: Meshed, model: Model) -> None:
     image = source.drawn
     own = continued(image, source.content.continuation)
     figures.save_run_figures(
-        pictures[:3], own, outcome.initial, outcome.result, task.start_name, image, source.mask, model.order
+        pictures[:3],
+        own,
+        outcome.initial,
+        outcome.result,
+        task.start_name,
+        image,
+        source.mask,
+        model.order,
     )
     of_cell = model.cell_data.get("label")
-    if source.mask is not None and "boundary" in pictures[3].stem:  # none for the mask of a mesh to start from
-        figures.save_figure(figures.boundary_figure(image, source.mask, mesh, word=source.mask_word), pictures[3])
+    # none for the mask of a mesh to start from
+    if source.mask is not None and "boundary" in pictures[3].stem:
+        figures.save_figure(
+            figures.boundary_figure(image, source.mask, mesh, word=source.mask_word), pictures[3]
+        )
     if source.labels is not None:
         other = None if np.array_equal(image.data, source.labels.data) else image
-        figure = figures.label_figure(source.labels, mesh, of_cell, other, source.table, model.order)
+        figure = figures.label_figure(
+            source.labels, mesh, of_cell, other, source.table, model.order
+        )
         figures.save_figure(figure, pictures[-2])
-    thumbnail.save_thumbnail(pictures[-1], image, mesh, source.mask, source.labels, of_cell, source.table)
+    thumbnail.save_thumbnail(
+        pictures[-1], image, mesh, source.mask, source.labels, of_cell, source.table
+    )

@@ -1,10 +1,13 @@
-"""Fidelity of a mesh to labels or a mask: overlaps, distances between surfaces, connected components.
+"""Fidelity of a mesh to labels or a mask: overlaps, distances between surfaces, connected
+components.
 
-A label's surface in the image is its half level: marching cubes at 1/2 of the array that is 1 in the label's voxels and
-0 elsewhere. Its surface in the mesh consists of the facets between cells with the label and other cells. The faces of
-the image's box belong to neither, and distances exclude them, as the space behind them is unknown.
+A label's surface in the image is its half level: marching cubes at 1/2 of the array that is 1 in
+the label's voxels and 0 elsewhere. Its surface in the mesh consists of the facets between cells
+with the label and other cells. The faces of the image's box belong to neither, and distances
+exclude them, as the space behind them is unknown.
 
-Distances are exact, from points spread evenly over one surface to the other, so that means and percentiles are by area.
+Distances are exact, from points spread evenly over one surface to the other, so that means and
+percentiles are by area.
 """
 
 from __future__ import annotations
@@ -42,7 +45,8 @@ CHUNK_CELLS = 4096  # compared at a time, as voxels near one another stay in a p
 MOST_POINTS = 20_000  # on a surface, for measuring distances
 FEWEST_POINTS = 1_000  # the least number on the larger of two surfaces
 POINTS_PER_FACE = 4.0  # per area of a voxel's face: the half level bends no faster than that
-# Steps of an even sequence in the unit square and cube: powers of 1/g with g^3 = g + 1 and g^4 = g + 1 (Roberts 2018).
+# Steps of an even sequence in the unit square and cube: powers of 1/g with g^3 = g + 1 and g^4 = g
+# + 1 (Roberts 2018).
 EVEN_STEPS = {2: 0.7548776662466927 ** np.arange(1, 3), 3: 0.8191725133961645 ** np.arange(1, 4)}
 
 
@@ -59,7 +63,8 @@ class Thickness(NamedTuple):
     Parameters
     ----------
     p5, p50, p95 : float
-        The 5th percentile, the median and the 95th percentile over the voxel centres in the label, mm.
+        The 5th percentile, the median and the 95th percentile over the voxel centres in the label,
+        mm.
     limit : float
         Thickness beyond this is clipped, mm.
 
@@ -97,7 +102,8 @@ class LabelFidelity(NamedTuple):
     volume_dice : float
         Dice of its cells with its voxels as boxes, which cells as small as voxels cannot evade.
     distance_mean : float
-        Mean distance between its surfaces in the mesh and in the image, both ways, mm; nan if one is missing.
+        Mean distance between its surfaces in the mesh and in the image, both ways, mm; nan if one
+        is missing.
     distance_p95 : float
         95th percentile of the same, mm.
     components : int
@@ -109,20 +115,23 @@ class LabelFidelity(NamedTuple):
     distance_max : float
         The largest distance, mm: it shows single spikes, unlike a percentile.
     one_layer_fraction : float
-        Fraction of its cells' volume in cells whose nodes all lie on its surface, one cell thick; nan without cells.
+        Fraction of its cells' volume in cells whose nodes all lie on its surface, one cell thick;
+        nan without cells.
     dice_majority : float
-        `dice` if each cell had the label of most of its voxels: what the mesh allows, whatever its labels.
+        `dice` if each cell had the label of most of its voxels: what the mesh allows, whatever its
+        labels.
     covered_voxels : int
         Number of its voxels that cells should represent: those in the mesh or, with a mask, all.
     lost_components : tuple of LostComponent
         Components of these voxels, none of which lies in a cell with the label, the largest first.
     thickness_voxels, thickness_mesh : Thickness, optional
-        Thickness of the smooth surface of its voxels, and of its cells, by `tetopt.label_thickness`; None if not
-        measured.
+        Thickness of the smooth surface of its voxels, and of its cells, by
+        `tetopt.label_thickness`; None if not measured.
     edge : float
         Mean edge of the label's cells, mm: the median over its voxels in them; nan if not measured.
     cells_across : float
-        Thickness of the label, up to ten voxels, over the mean edge of the cell there: the median over the same voxels.
+        Thickness of the label, up to ten voxels, over the mean edge of the cell there: the median
+        over the same voxels.
 
     Examples
     --------
@@ -165,8 +174,9 @@ class LabelFidelity(NamedTuple):
 class MaskFidelity(NamedTuple):
     """Fidelity of a mesh to the mask that it should fill. Volumes are areas in 2-D.
 
-    Distances are between the mesh's boundary and the mask's half level, off the faces of the box; nan if one is
-    missing. They are in index space if in voxels, where every voxel is a unit cube, and in the world if in mm.
+    Distances are between the mesh's boundary and the mask's half level, off the faces of the box;
+    nan if one is missing. They are in index space if in voxels, where every voxel is a unit cube,
+    and in the world if in mm.
 
     Parameters
     ----------
@@ -189,9 +199,11 @@ class MaskFidelity(NamedTuple):
     mesh_components : int
         Connected components of the cells, linked by facets.
     euler : int
-        Euler characteristic of the mask's half level: 2 for each closed component, minus 2 for each handle.
+        Euler characteristic of the mask's half level: 2 for each closed component, minus 2 for each
+        handle.
     mesh_euler : int
-        Euler characteristic of the mesh's boundary. Both exclude the box's faces: a disc that ends there has 1.
+        Euler characteristic of the mesh's boundary. Both exclude the box's faces: a disc that ends
+        there has 1.
     lost_components : tuple of LostComponent
         Components of these voxels, none of which lies in a cell, the largest first.
 
@@ -225,7 +237,8 @@ class MaskFidelity(NamedTuple):
 
 
 def cell_labels(labels: Image, mesh: Mesh) -> NDArray[np.int64]:
-    """The label of each cell: the most frequent one among its voxels, the smallest of equally frequent ones.
+    """The label of each cell: the most frequent one among its voxels, the smallest of equally
+    frequent ones.
 
     A cell without voxel centre has the label of the voxel nearest to its centroid.
 
@@ -262,21 +275,25 @@ def cell_labels(labels: Image, mesh: Mesh) -> NDArray[np.int64]:
 
 
 def label_fidelity(
-    labels: Image, mesh: Mesh, of_cell: ArrayLike | None = None, mask: Image | None = None,
+    labels: Image,
+    mesh: Mesh,
+    of_cell: ArrayLike | None = None,
+    mask: Image | None = None,
     owner: NDArray[np.integer] | None = None,
-) -> list[LabelFidelity]:  # fmt: skip
+) -> list[LabelFidelity]:
     """Measure how well cells represent each label of an image.
 
-    Without a mask, the space outside the mesh counts as label 0: its voxels get label 0, the mesh's boundary off the
-    box is a surface between 0 and the labels inside, and label 0 is not lost there. With a mask, label 0 is a label
-    like the others, and no label has the space outside.
+    Without a mask, the space outside the mesh counts as label 0: its voxels get label 0, the mesh's
+    boundary off the box is a surface between 0 and the labels inside, and label 0 is not lost
+    there. With a mask, label 0 is a label like the others, and no label has the space outside.
 
     Parameters
     ----------
     labels : Image
         Whole numbers from 0 to `tetopt.contents.labels.LARGEST_LABEL`.
     mesh : Mesh
-        Points in world coordinates, mm; curved cells as their `Mesh.straight_pieces`, their volumes exact.
+        Points in world coordinates, mm; curved cells as their `Mesh.straight_pieces`, their volumes
+        exact.
     of_cell : (M,) array of whole numbers, optional
         Label of each cell; `cell_labels` by default.
     mask : Image, optional
@@ -292,8 +309,8 @@ def label_fidelity(
     Raises
     ------
     InputError
-        Values that are not labels, not one label per cell, a mask on other voxels, or the reasons of
-        `tetopt.cell_moments`.
+        Values that are not labels, not one label per cell, a mask on other voxels, or the reasons
+        of `tetopt.cell_moments`.
 
     Examples
     --------
@@ -308,17 +325,28 @@ def label_fidelity(
     """
     labels, (pieces, n_pieces) = checked_labels("labels", labels), mesh.straight_pieces()
     owner = voxel_cells(labels, mesh) if owner is None else owner
-    label_of_cell = cell_labels(labels, mesh) if of_cell is None else checked_cell_labels(of_cell, mesh)
+    label_of_cell = (
+        cell_labels(labels, mesh) if of_cell is None else checked_cell_labels(of_cell, mesh)
+    )
     values, true, label_of_cell = by_row(labels_in_mask(labels, mask), label_of_cell)
     outside = BACKGROUND_LABEL if mask is None else OUTSIDE_LABEL
-    painted, is_covered = painted_voxels(owner, label_of_cell, outside), (owner >= 0) | (mask is not None)
-    n_true, n_cells = _voxel_counts(true, len(values)), np.bincount(label_of_cell, minlength=len(values))
+    painted, is_covered = (
+        painted_voxels(owner, label_of_cell, outside),
+        (owner >= 0) | (mask is not None),
+    )
+    n_true, n_cells = (
+        _voxel_counts(true, len(values)),
+        np.bincount(label_of_cell, minlength=len(values)),
+    )
     n_covered = _voxel_counts(np.where(is_covered, true, OUTSIDE_LABEL), len(values))
     is_met = (painted == true) | ~is_covered
     dice = _voxel_dice(true, painted, n_true)
     of_most = painted_voxels(owner, _most_frequent(true, owner, label_of_cell), outside)
     dice_majority = _voxel_dice(true, of_most, n_true)
-    of_piece, n_owned = np.repeat(label_of_cell, n_pieces), np.bincount(owner[owner >= 0], minlength=len(mesh.cells))
+    of_piece, n_owned = (
+        np.repeat(label_of_cell, n_pieces),
+        np.bincount(owner[owner >= 0], minlength=len(mesh.cells)),
+    )
     mesh_volume = np.bincount(label_of_cell, mesh.cell_volumes, len(values))
     n_empty = np.bincount(label_of_cell[n_owned == 0], minlength=len(values))
     overlap, size, beyond = _overlaps(labels, true, pieces, of_piece, len(n_true))
@@ -326,7 +354,9 @@ def label_fidelity(
     boxes = scipy.ndimage.find_objects(true + 1)
     shared = facets(pieces.cells)
     nodes, sides = _labels_beside_facets(labels, pieces, of_piece, shared, outside)
-    one_layer = one_layer_fractions(mesh, label_of_cell, shared if n_pieces == 1 else facets(mesh.cells))
+    one_layer = one_layer_fractions(
+        mesh, label_of_cell, shared if n_pieces == 1 else facets(mesh.cells)
+    )
     face = _face(labels.voxel_volume, labels.ndim)
     rows = []
     for row in np.flatnonzero(n_true):
@@ -334,7 +364,11 @@ def label_fidelity(
         n_components, lost = voxel_components(true[box] == row, is_met[box], labels.affine, box)
         is_side = (sides == row).sum(axis=1) == 1
         distances = np.concatenate(
-            _distances(FacetSurface(pieces.points, nodes[is_side]), half_level_surface(part == row, affine), face)
+            _distances(
+                FacetSurface(pieces.points, nodes[is_side]),
+                half_level_surface(part == row, affine),
+                face,
+            )
         )
         rows.append(
             LabelFidelity(
@@ -365,35 +399,62 @@ def label_fidelity(
 
 
 def _overlaps(
-    labels: Image, rows: NDArray[np.integer], mesh: Mesh, label_of_cell: NDArray[np.int64], n_labels: int
+    labels: Image,
+    rows: NDArray[np.integer],
+    mesh: Mesh,
+    label_of_cell: NDArray[np.int64],
+    n_labels: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[float, float]]:
-    """Volume of each label's voxels in its cells, of these cells, and outside the mesh, of label 0 and of all labels.
+    """Volume of each label's voxels in its cells, of these cells, and outside the mesh, of label 0
+    and of all labels.
 
     Estimated from `POINTS_PER_CELL` points that fill each cell evenly.
     """
     n, size = mesh.ndim, volumes(mesh.points, mesh.cells)
-    steps = np.sort(np.mod(0.5 + np.outer(np.arange(1, POINTS_PER_CELL + 1), EVEN_STEPS[3][:n]), 1.0), axis=1)
-    weights = np.diff(steps, axis=1, prepend=0.0, append=1.0)  # gaps between sorted numbers are uniform in a simplex
-    own, none, inverse = np.zeros(len(size)), np.zeros(len(size)), np.linalg.inv(labels.affine[:-1, :-1])
+    steps = np.sort(
+        np.mod(0.5 + np.outer(np.arange(1, POINTS_PER_CELL + 1), EVEN_STEPS[3][:n]), 1.0), axis=1
+    )
+    # gaps between sorted numbers are uniform in a simplex
+    weights = np.diff(steps, axis=1, prepend=0.0, append=1.0)
+    own, none, inverse = (
+        np.zeros(len(size)),
+        np.zeros(len(size)),
+        np.linalg.inv(labels.affine[:-1, :-1]),
+    )
     for first in range(0, len(size), CHUNK_CELLS):
         part = slice(first, first + CHUNK_CELLS)
-        corners, counts = mesh.points[mesh.cells[part]], (own[part], none[part], label_of_cell[part])
+        corners, counts = (
+            mesh.points[mesh.cells[part]],
+            (own[part], none[part], label_of_cell[part]),
+        )
         for weight in weights:
             places = np.einsum("k,mkn->mn", weight, corners)
-            _count_labels(*counts, places, labels.affine[:-1, -1], inverse, rows.ravel(), rows.shape)
+            _count_labels(
+                *counts, places, labels.affine[:-1, -1], inverse, rows.ravel(), rows.shape
+            )
     overlap = np.bincount(label_of_cell, own * size / POINTS_PER_CELL, n_labels).astype(np.float64)
     rest = max(labels.volume - float(size.sum()), 0.0)
-    background = float((rows == 0).sum()) * labels.voxel_volume - float((none * size).sum() / POINTS_PER_CELL)
+    background = float((rows == 0).sum()) * labels.voxel_volume - float(
+        (none * size).sum() / POINTS_PER_CELL
+    )
     filled = np.bincount(label_of_cell, size, n_labels).astype(np.float64)
     return overlap, filled, (min(max(background, 0.0), rest), rest)
 
 
 @njit(cache=True, nogil=True)
 def _count_labels(
-    own: NDArray, none: NDArray, label_of_cell: NDArray, places: NDArray, origin: NDArray, inverse: NDArray,
-    rows: NDArray, shape: tuple[int, ...],
-) -> None:  # fmt: skip
-    """Add 1 for each cell at whose place (M, n) is its label, and where label 0 is, as `nearest_values` finds them."""
+    own: NDArray,
+    none: NDArray,
+    label_of_cell: NDArray,
+    places: NDArray,
+    origin: NDArray,
+    inverse: NDArray,
+    rows: NDArray,
+    shape: tuple[int, ...],
+) -> None:
+    """Add 1 for each cell at whose place (M, n) is its label, and where label 0 is, as
+    `nearest_values` finds them.
+    """
     for cell in range(len(places)):
         at = 0
         for axis in range(places.shape[1]):
@@ -405,7 +466,9 @@ def _count_labels(
         none[cell] += rows[at] == 0
 
 
-def mask_fidelity(mask: Image, mesh: Mesh, owner: NDArray[np.integer] | None = None) -> MaskFidelity:
+def mask_fidelity(
+    mask: Image, mesh: Mesh, owner: NDArray[np.integer] | None = None
+) -> MaskFidelity:
     """Measure how well a mesh fills a mask and follows its boundary.
 
     Parameters
@@ -413,7 +476,8 @@ def mask_fidelity(mask: Image, mesh: Mesh, owner: NDArray[np.integer] | None = N
     mask : Image
         From 0, outside, to 1, inside; fractions are partial volumes.
     mesh : Mesh
-        Points in world coordinates, mm; curved cells as their `Mesh.straight_pieces`, their volumes exact.
+        Points in world coordinates, mm; curved cells as their `Mesh.straight_pieces`, their volumes
+        exact.
     owner : (s_0, ..., s_{n-1}) array of int, optional
         Cell of each voxel, -1 outside the mesh, if known.
 
@@ -439,7 +503,10 @@ def mask_fidelity(mask: Image, mesh: Mesh, owner: NDArray[np.integer] | None = N
     """
     low, high = mask.range
     if low < 0.0 or high > 1.0:
-        raise InputError(f"mask: expected values from 0 to 1, got {low:g} to {high:g}; threshold or rescale it first")
+        raise InputError(
+            f"mask: expected values from 0 to 1, got {low:g} to {high:g}; threshold or rescale "
+            "it first"
+        )
     pieces = mesh.straight_pieces()[0]
     is_filled = (voxel_cells(mask, mesh) if owner is None else owner) >= 0
     is_inside = mask.data >= INSIDE_FRACTION
@@ -473,10 +540,11 @@ def mask_fidelity(mask: Image, mesh: Mesh, owner: NDArray[np.integer] | None = N
 
 
 def half_level_surface(level: NDArray, affine: NDArray[np.float64]) -> FacetSurface:
-    """The surface where a field of 0 to 1 on voxels is 1/2, by marching cubes (marching squares in 2-D).
+    """The surface where a field of 0 to 1 on voxels is 1/2, by marching cubes (marching squares in
+    2-D).
 
-    Beyond the outermost voxel centres the field is constant, so the surface continues straight to the faces of the
-    box, ends there, and has no part on them.
+    Beyond the outermost voxel centres the field is constant, so the surface continues straight to
+    the faces of the box, ends there, and has no part on them.
 
     Parameters
     ----------
@@ -488,7 +556,8 @@ def half_level_surface(level: NDArray, affine: NDArray[np.float64]) -> FacetSurf
     Returns
     -------
     FacetSurface
-        World coordinates in mm, accurate to 1e-5 voxel; without facets if the field does not cross 1/2.
+        World coordinates in mm, accurate to 1e-5 voxel; without facets if the field does not cross
+        1/2.
     """
     import pyvista  # slow to load, and only needed with a mask or labels
     from vtkmodules.util.numpy_support import vtk_to_numpy
@@ -496,34 +565,56 @@ def half_level_surface(level: NDArray, affine: NDArray[np.float64]) -> FacetSurf
     level = np.asarray(level)
     n = level.ndim
     padded = np.pad(level, 1, mode="edge")
-    grid = pyvista.ImageData(dimensions=padded.shape + (1,) * (3 - n), origin=(-1.0,) * n + (0.0,) * (3 - n))
-    grid.point_data["level"] = (padded.astype(np.uint8) if level.dtype == bool else padded).ravel(order="F")
-    surface = grid.contour([INSIDE_FRACTION], scalars="level", compute_normals=False, compute_gradients=False)
-    nodes = vtk_to_numpy((surface.GetPolys() if n == 3 else surface.GetLines()).GetConnectivityArray())
-    # Between the outermost centres and their copies the field is constant along the axis: a point of the surface at a
-    # copy, one voxel out, has the same coordinates along the other axes at the face of the box, half a voxel out.
-    index = np.clip(np.asarray(surface.points, dtype=np.float64)[:, :n], -0.5, np.array(level.shape) - 0.5)
-    return FacetSurface(transformed(index, affine[:-1, :-1]) + affine[:-1, -1], nodes.reshape(-1, n).astype(np.int64))
+    grid = pyvista.ImageData(
+        dimensions=padded.shape + (1,) * (3 - n), origin=(-1.0,) * n + (0.0,) * (3 - n)
+    )
+    grid.point_data["level"] = (padded.astype(np.uint8) if level.dtype == bool else padded).ravel(
+        order="F"
+    )
+    surface = grid.contour(
+        [INSIDE_FRACTION], scalars="level", compute_normals=False, compute_gradients=False
+    )
+    nodes = vtk_to_numpy(
+        (surface.GetPolys() if n == 3 else surface.GetLines()).GetConnectivityArray()
+    )
+    # Between the outermost centres and their copies the field is constant along the axis: a point
+    # of the surface at a copy, one voxel out, has the same coordinates along the other axes at the
+    # face of the box, half a voxel out.
+    index = np.clip(
+        np.asarray(surface.points, dtype=np.float64)[:, :n], -0.5, np.array(level.shape) - 0.5
+    )
+    return FacetSurface(
+        transformed(index, affine[:-1, :-1]) + affine[:-1, -1],
+        nodes.reshape(-1, n).astype(np.int64),
+    )
 
 
 def surface_distances(points: NDArray[np.float64], surface: FacetSurface) -> NDArray[np.float64]:
-    """Distance of points (K, n) from the nearest point of a surface, (K,) float64 in their unit; exact.
+    """Distance of points (K, n) from the nearest point of a surface, (K,) float64 in their unit;
+    exact.
 
     The surface has at least one facet; flat facets count, too.
     """
     nodes, corners = surface
     if points.shape[1] == 2:  # segments are flat triangles
-        points, nodes, corners = (*(np.pad(each, ((0, 0), (0, 1))) for each in (points, nodes)), corners[:, [0, 1, 1]])
+        points, nodes, corners = (
+            *(np.pad(each, ((0, 0), (0, 1))) for each in (points, nodes)),
+            corners[:, [0, 1, 1]],
+        )
     return triangle_distances(points, nodes, corners)
 
 
-def evenly_spread(surface: FacetSurface, count: int, areas: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-    """`count` points on a surface, (count, n) float64, each for the same area (length in 2-D); deterministic.
+def evenly_spread(
+    surface: FacetSurface, count: int, areas: NDArray[np.float64] | None = None
+) -> NDArray[np.float64]:
+    """`count` points on a surface, (count, n) float64, each for the same area (length in 2-D);
+    deterministic.
 
     `areas` (T,) are its facets' areas, if known.
 
-    The facets' areas are laid in a row, and point i falls into the i-th of `count` equal parts of it. Its place in the
-    part varies from point to point: points in the middle could skip every second of equal facets.
+    The facets' areas are laid in a row, and point i falls into the i-th of `count` equal parts of
+    it. Its place in the part varies from point to point: points in the middle could skip every
+    second of equal facets.
     """
     points, nodes = surface
     place = np.arange(1, count + 1)[:, None] * EVEN_STEPS[points.shape[1]] % 1.0
@@ -531,35 +622,46 @@ def evenly_spread(surface: FacetSurface, count: int, areas: NDArray[np.float64] 
     at = np.searchsorted(end, (np.arange(count) + place[:, 0]) / count * end[-1], side="right")
     at, place = np.minimum(at, len(nodes) - 1), place[:, 1:]  # rounding may exceed the last
     is_beyond = place.sum(axis=1) > 1.0
-    place[is_beyond] = 1.0 - place[is_beyond]  # from the far half of the parallelogram into the triangle
+    # from the far half of the parallelogram into the triangle
+    place[is_beyond] = 1.0 - place[is_beyond]
     first = points[nodes[at, 0]]
     return first + ((points[nodes[at, 1:]] - first[:, None]) * place[..., None]).sum(axis=1)
 
 
 def euler_characteristic(surface_facets: NDArray[np.int64]) -> int:
-    """Points minus edges plus triangles of a surface (T, 3); points minus segments of a curve (T, 2)."""
+    """Points minus edges plus triangles of a surface (T, 3); points minus segments of a curve
+    (T, 2).
+    """
     if len(surface_facets) == 0:
         return 0
     nodes, total = np.sort(surface_facets, axis=1).T, 0
     for size in range(1, len(nodes) + 1):
         chosen = np.array(list(combinations(range(len(nodes)), size)))
-        is_new = lexicographic_order(np.column_stack([nodes[column].ravel() for column in chosen.T]))[1]
+        is_new = lexicographic_order(
+            np.column_stack([nodes[column].ravel() for column in chosen.T])
+        )[1]
         total += (-1) ** (size - 1) * int(np.count_nonzero(is_new))
     return total
 
 
 def labels_in_mask(labels: Image, mask: Image | None) -> NDArray[np.int32]:
-    """Labels of the voxels, `OUTSIDE_LABEL` where a mask is below 1/2; raise InputError for a mask on other voxels."""
+    """Labels of the voxels, `OUTSIDE_LABEL` where a mask is below 1/2; raise InputError for a
+    mask on other voxels.
+    """
     data = labels.data.astype(np.int32)
     if mask is not None and mask.shape != labels.shape:
-        raise InputError(f"mask: expected the labels' shape {labels.shape}, got {mask.shape}; resample it first")
+        raise InputError(
+            f"mask: expected the labels' shape {labels.shape}, got {mask.shape}; resample it first"
+        )
     if mask is not None:
         data[mask.data < INSIDE_FRACTION] = OUTSIDE_LABEL
     return data
 
 
 def voxel_cells(image: Image, mesh: Mesh) -> NDArray[np.int32]:
-    """Number of the cell of each voxel, -1 outside the mesh; curved cells as their straight pieces."""
+    """Number of the cell of each voxel, -1 outside the mesh; curved cells as their straight
+    pieces.
+    """
     pieces, n_pieces = mesh.straight_pieces()
     owner = cell_of_voxel(image, pieces).astype(np.int32)
     return owner if n_pieces == 1 else owner // np.int32(n_pieces)
@@ -568,7 +670,9 @@ def voxel_cells(image: Image, mesh: Mesh) -> NDArray[np.int32]:
 def _most_frequent(
     rows: NDArray[np.integer], owner: NDArray[np.integer], otherwise: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """The most frequent row of the voxels of each cell, the smallest of equally frequent ones, or `otherwise` (M,)."""
+    """The most frequent row of the voxels of each cell, the smallest of equally frequent ones,
+    or `otherwise` (M,).
+    """
     of_cell, most = otherwise.copy(), np.zeros_like(otherwise)
     for row, box in enumerate(scipy.ndimage.find_objects(rows + 1)):
         if box is not None:
@@ -578,7 +682,9 @@ def _most_frequent(
     return of_cell
 
 
-def painted_voxels(owner: NDArray[np.integer], of_cell: NDArray[np.int64], outside: int) -> NDArray[np.integer]:
+def painted_voxels(
+    owner: NDArray[np.integer], of_cell: NDArray[np.int64], outside: int
+) -> NDArray[np.integer]:
     """Row of the cell that owns each voxel, in the image's shape; `outside` where there is none."""
     table = _narrow(np.append(of_cell, outside))
     painted = np.empty(owner.shape, dtype=table.dtype)
@@ -607,21 +713,27 @@ def _voxel_counts(rows: NDArray[np.integer], n: int) -> NDArray[np.int64]:
 def _voxel_dice(
     true: NDArray[np.integer], painted: NDArray[np.integer], n_true: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Dice of the voxels of each label, (K,), with those that cells give it; `n_true` are the numbers of the former."""
+    """Dice of the voxels of each label, (K,), with those that cells give it; `n_true` are the
+    numbers of the former.
+    """
     both = _voxel_counts(np.where(true == painted, true, OUTSIDE_LABEL), len(n_true))
     return 2.0 * both / np.maximum(n_true + _voxel_counts(painted, len(n_true)), 1)
 
 
 def checked_cell_labels(of_cell: ArrayLike, mesh: Mesh) -> NDArray[np.int64]:
-    """One label for each cell, (M,) int64; raise InputError unless all are whole numbers from 0 to `LARGEST_LABEL`."""
+    """One label for each cell, (M,) int64; raise InputError unless all are whole numbers from 0
+    to `LARGEST_LABEL`.
+    """
     values = np.asarray(of_cell)
     if values.shape != (len(mesh.cells),):
         raise InputError(
-            f"of_cell: expected one label for each of the mesh's {len(mesh.cells)} cells, got shape {values.shape}"
+            f"of_cell: expected one label for each of the mesh's {len(mesh.cells)} cells, got "
+            f"shape {values.shape}"
         )
     if not ((np.rint(values) == values) & (values >= 0) & (values <= LARGEST_LABEL)).all():
         raise InputError(
-            f"of_cell: labels must be whole numbers from 0 to {LARGEST_LABEL}, got {values.min():g} to {values.max():g}"
+            f"of_cell: labels must be whole numbers from 0 to {LARGEST_LABEL}, got "
+            f"{values.min():g} to {values.max():g}"
         )
     return values.astype(np.int64)
 
@@ -629,7 +741,9 @@ def checked_cell_labels(of_cell: ArrayLike, mesh: Mesh) -> NDArray[np.int64]:
 def by_row(
     labels: NDArray[np.int32], of_cell: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.integer], NDArray[np.int64]]:
-    """Return all labels (K,), ascending and from 0, and of voxels and cells their rows; -1 for `OUTSIDE_LABEL`."""
+    """Return all labels (K,), ascending and from 0, and of voxels and cells their rows; -1 for
+    `OUTSIDE_LABEL`.
+    """
     parts = over_slabs(lambda first, stop: np.unique(labels[first:stop]), len(labels), labels.size)
     values = np.unique(np.concatenate([[OUTSIDE_LABEL, 0], *parts, of_cell]))
     numbers = _narrow(np.arange(-1, len(values) - 1))
@@ -643,7 +757,8 @@ def by_row(
 
 
 def one_layer_fractions(mesh: Mesh, of_cell: NDArray[np.int64], shared: Facets) -> dict[int, float]:
-    """Fraction of each label's volume in cells whose nodes all lie on its surface; `shared` are the mesh's facets.
+    """Fraction of each label's volume in cells whose nodes all lie on its surface; `shared` are the
+    mesh's facets.
 
     The surface separates the label's cells from everything else, including the outside of the mesh.
     """
@@ -662,7 +777,9 @@ def one_layer_fractions(mesh: Mesh, of_cell: NDArray[np.int64], shared: Facets) 
 def _labels_beside_facets(
     labels: Image, mesh: Mesh, of_cell: NDArray[np.int64], shared: Facets, outside: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """All facets (F, n) and the labels on both sides (F, 2), the same label on both sides of the box."""
+    """All facets (F, n) and the labels on both sides (F, 2), the same label on both sides of the
+    box.
+    """
     sides = of_cell[shared.cells]
     is_outer = shared.n_cells == 1
     is_on_box = facets_on_box(mesh, labels, shared)[1]  # in the order of the facets
@@ -673,11 +790,15 @@ def _labels_beside_facets(
 def _with_margin(
     labels: Image, data: NDArray[np.integer], box: tuple[slice, ...]
 ) -> tuple[NDArray[np.integer], NDArray[np.float64]]:
-    """The part of an array in a box with a margin of one voxel, where available, and the part's affine."""
+    """The part of an array in a box with a margin of one voxel, where available, and the part's
+    affine.
+    """
     low = np.array([max(side.start - 1, 0) for side in box])
     affine = labels.affine.copy()
     affine[:-1, -1] = labels.to_world(low)
-    return data[tuple(slice(first, side.stop + 1) for first, side in zip(low, box, strict=True))], affine
+    return data[
+        tuple(slice(first, side.stop + 1) for first, side in zip(low, box, strict=True))
+    ], affine
 
 
 def _face(voxel_volume: float, n: int) -> float:
@@ -685,8 +806,12 @@ def _face(voxel_volume: float, n: int) -> float:
     return voxel_volume ** ((n - 1) / n)
 
 
-def _distances(one: FacetSurface, other: FacetSurface, face: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Distances from equally dense points on each of two surfaces to the other; none if a surface is empty."""
+def _distances(
+    one: FacetSurface, other: FacetSurface, face: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Distances from equally dense points on each of two surfaces to the other; none if a
+    surface is empty.
+    """
     if len(one.facets) == 0 or len(other.facets) == 0:
         return np.empty(0), np.empty(0)
     areas, areas_there = surface_areas(one), surface_areas(other)
@@ -713,8 +838,16 @@ def facet_vectors(points: NDArray, nodes: NDArray) -> NDArray:
     vectors = np.empty((len(nodes), 3))
     for t in range(len(nodes)):
         a, b, c = nodes[t, 0], nodes[t, 1], nodes[t, 2]
-        x, y, z = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
-        u, v, w = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
+        x, y, z = (
+            points[b, 0] - points[a, 0],
+            points[b, 1] - points[a, 1],
+            points[b, 2] - points[a, 2],
+        )
+        u, v, w = (
+            points[c, 0] - points[a, 0],
+            points[c, 1] - points[a, 1],
+            points[c, 2] - points[a, 2],
+        )
         vectors[t, 0], vectors[t, 1], vectors[t, 2] = y * w - z * v, z * u - x * w, x * v - y * u
     return vectors
 
@@ -737,7 +870,8 @@ class ImageFit(NamedTuple):
     """Fit of the cells of a mesh to an image; curved edges count as straight."""
 
     E_D: float  # intensity^2 mm^n
-    E_D_fraction_of_variance: float | None  # over the voxels that the mesh covers; None if they are all equal
+    # over the voxels that the mesh covers; None if they are all equal
+    E_D_fraction_of_variance: float | None
     n_voxels: int  # voxel centres inside
     n_empty_cells: int  # cells without voxel centre
     overlap: Overlap | None  # voxels that lie in several cells
@@ -752,9 +886,15 @@ def image_fit(image: Image, mesh: Mesh) -> ImageFit:
         The mesh contains no voxel centre.
     """
     moments = cell_moments(image, mesh)
-    E_D, n_voxels = float((moments.n_voxels * moments.variance).sum()) * image.voxel_volume, int(moments.n_voxels.sum())
+    E_D, n_voxels = (
+        float((moments.n_voxels * moments.variance).sum()) * image.voxel_volume,
+        int(moments.n_voxels.sum()),
+    )
     if n_voxels == 0:
-        raise InputError("mesh and image: no voxel centre is inside the mesh; do both use the same world coordinates?")
+        raise InputError(
+            "mesh and image: no voxel centre is inside the mesh; do both use the same world "
+            "coordinates?"
+        )
     n_empty = int((moments.n_voxels == 0).sum())
     return ImageFit(E_D, unexplained_of(*moments), n_voxels, n_empty, overlap_of(image, mesh))
 
@@ -762,7 +902,9 @@ def image_fit(image: Image, mesh: Mesh) -> ImageFit:
 def unexplained_of(
     n_voxels: NDArray[np.int64], mean: NDArray[np.float64], variance: NDArray[np.float64]
 ) -> float | None:
-    """Return the fraction of the variance of the voxels in cells that is left within cells; None if they are equal."""
+    """Return the fraction of the variance of the voxels in cells that is left within cells; None
+    if they are equal.
+    """
     within = float((n_voxels * variance).sum())
     middle = float((n_voxels * mean).sum()) / max(int(n_voxels.sum()), 1)
     total = within + float((n_voxels * (mean - middle) ** 2).sum())

@@ -1,14 +1,15 @@
 """Smoothness, connectivity and manifoldness of the surfaces of labels.
 
-A label's surface consists of the facets between its cells and everything else: other labels, and the outside of the
-mesh, so that it is closed. It is compared with a closed smooth surface of the label's voxels: surface nets (Gibson
-1998), relaxed within a voxel's diagonal, by VTK's vtkSurfaceNets3D. As these shrink small shapes, a ball of radius 6
-voxels to 0.87 of its area, the area in 3-D is that at the voxels' volume: within 2 % for balls and tubes of radius 4 or
-more. The rim of a thin sheet still retracts: a disc of radius 24, two voxels thick, has 0.93 of its area.
+A label's surface consists of the facets between its cells and everything else: other labels, and
+the outside of the mesh, so that it is closed. It is compared with a closed smooth surface of the
+label's voxels: surface nets (Gibson 1998), relaxed within a voxel's diagonal, by VTK's
+vtkSurfaceNets3D. As these shrink small shapes, a ball of radius 6 voxels to 0.87 of its area, the
+area in 3-D is that at the voxels' volume: within 2 % for balls and tubes of radius 4 or more. The
+rim of a thin sheet still retracts: a disc of radius 24, two voxels thick, has 0.93 of its area.
 
-Connected components, holes and cavities are those of the label's inside, without its surface: cells are connected by
-facets and voxels by faces (6 neighbours, and 26 outside), so that a ring that closes only in an edge or a node has no
-hole.
+Connected components, holes and cavities are those of the label's inside, without its surface: cells
+are connected by facets and voxels by faces (6 neighbours, and 26 outside), so that a ring that
+closes only in an edge or a node has no hole.
 """
 
 from __future__ import annotations
@@ -21,7 +22,13 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from tetopt.contents.labels import checked_labels, component_runs
-from tetopt.geometry.manifold import LabelSurfaces, Ridges, label_surfaces, surface_fans, surface_ridges
+from tetopt.geometry.manifold import (
+    LabelSurfaces,
+    Ridges,
+    label_surfaces,
+    surface_fans,
+    surface_ridges,
+)
 from tetopt.geometry.quadratic import edge_ends
 from tetopt.geometry.topology import Facets, facets, linked
 from tetopt.image import Image, transformed
@@ -36,12 +43,16 @@ from tetopt.measure.fidelity import (
 from tetopt.mesh import Mesh
 from tetopt.system.kernel_cache import njit
 
-FOLD_DEGREES = 60.0  # least turn of the normals at a folded ridge: a dihedral angle below 120 degrees
+# least turn of the normals at a folded ridge: a dihedral angle below 120 degrees
+FOLD_DEGREES = 60.0
 NET_ITERATIONS = 16  # of the relaxation of surface nets; these values are VTK's
-NET_VOXELS = {2: 34, 3: 200}  # by dimension: with fewer voxels the nets shrink by half of their area or more
+# by dimension: with fewer voxels the nets shrink by half of their area or more
+NET_VOXELS = {2: 34, 3: 200}
 SHIFTED_VOLUME = 1e-3  # of the volume in a net, by which it is shifted to see how its area grows
-VOLUME_NEAR = 0.01  # relative: the area of nets that enclose the voxels' volume this nearly is at most 0.7 % off
-MOST_GROWN = 3.0  # times the volume in a net: a ball of radius 3 voxels takes 2.5, nets of specks have collapsed
+# relative: the area of nets that enclose the voxels' volume this nearly is at most 0.7 % off
+VOLUME_NEAR = 0.01
+# times the volume in a net: a ball of radius 3 voxels takes 2.5, nets of specks have collapsed
+MOST_GROWN = 3.0
 NET_RELAXATION = 0.5  # fraction of the way to the neighbours' mean that a point moves in each
 
 
@@ -53,13 +64,15 @@ class LabelInterface(NamedTuple):
     label : int
         The label's number.
     area : float
-        Area of its closed surface in the mesh, with its faces on the image's box or a mask's surface, mm^(n-1).
+        Area of its closed surface in the mesh, with its faces on the image's box or a mask's
+        surface, mm^(n-1).
     smooth_area : float
         Area of the closed smooth surface of its voxels, mm^(n-1).
     area_ratio : float
         Ratio of the two; nan without cells, or with fewer voxels than `NET_VOXELS`.
     folded : float
-        Fraction of the surface's edges at which it turns by more than 60 degrees; nan without cells.
+        Fraction of the surface's edges at which it turns by more than 60 degrees; nan without
+        cells.
     n_facets : int
         Number of facets of its surface.
     nonmanifold_edges : int
@@ -71,7 +84,8 @@ class LabelInterface(NamedTuple):
     nonmanifold_nodes_two_labels : int
         Number of these nodes around which it meets only one other label, or only the outside.
     euler : int
-        Euler number of its voxels' closed surface: 2 (components - holes + cavities); the same formula in 2-D.
+        Euler number of its voxels' closed surface: 2 (components - holes + cavities); the same
+        formula in 2-D.
     mesh_euler : int
         Euler number of its cells' closed surface.
     cavities : int
@@ -105,15 +119,19 @@ class LabelInterface(NamedTuple):
     mesh_cavities: int
 
 
-def label_interfaces(labels: Image, mesh: Mesh, of_cell: ArrayLike, mask: Image | None = None) -> list[LabelInterface]:
-    """Measure the smoothness, connectivity and manifoldness of the surface of each label of an image.
+def label_interfaces(
+    labels: Image, mesh: Mesh, of_cell: ArrayLike, mask: Image | None = None
+) -> list[LabelInterface]:
+    """Measure the smoothness, connectivity and manifoldness of the surface of each label of an
+    image.
 
     Parameters
     ----------
     labels : Image
         Whole numbers from 0 to `tetopt.contents.labels.LARGEST_LABEL`.
     mesh : Mesh
-        A conforming mesh; areas and folds of curved cells are those of their `Mesh.straight_pieces`.
+        A conforming mesh; areas and folds of curved cells are those of their
+        `Mesh.straight_pieces`.
     of_cell : (M,) array of whole numbers
         Label of each cell, such as from `tetopt.measure.fidelity.cell_labels`.
     mask : Image, optional
@@ -140,7 +158,9 @@ def label_interfaces(labels: Image, mesh: Mesh, of_cell: ArrayLike, mask: Image 
     (0, 0, 2)
     """
     labels = checked_labels("labels", labels)
-    values, voxels, of_cell = by_row(labels_in_mask(labels, mask), checked_cell_labels(of_cell, mesh))
+    values, voxels, of_cell = by_row(
+        labels_in_mask(labels, mask), checked_cell_labels(of_cell, mesh)
+    )
     boxes = scipy.ndimage.find_objects(voxels + 1)
     present = np.array([row for row, box in enumerate(boxes) if box is not None])
     shared = facets(mesh.cells)
@@ -151,7 +171,9 @@ def label_interfaces(labels: Image, mesh: Mesh, of_cell: ArrayLike, mask: Image 
 
     def counts(which: NDArray[np.int64], weights: NDArray | None = None) -> NDArray:
         """Counts by label, without the outside."""
-        return np.bincount(which[which >= 0], None if weights is None else weights[which >= 0], n_labels)
+        return np.bincount(
+            which[which >= 0], None if weights is None else weights[which >= 0], n_labels
+        )
 
     edges, nodes = ridges.n_facets > 2, fans.n_fans > 1
     of_label = {
@@ -160,7 +182,9 @@ def label_interfaces(labels: Image, mesh: Mesh, of_cell: ArrayLike, mask: Image 
         "nonmanifold_edges_two_labels": counts(ridges.label[edges & (ridges.n_labels == 2)]),
         "nonmanifold_nodes": counts(fans.label[nodes]),
         "nonmanifold_nodes_two_labels": counts(fans.label[nodes & (fans.n_labels == 2)]),
-        "mesh_euler": _cell_eulers(shared, mesh.cells, of_cell, counts(ridges.label), counts(fans.label)),
+        "mesh_euler": _cell_eulers(
+            shared, mesh.cells, of_cell, counts(ridges.label), counts(fans.label)
+        ),
         "mesh_cavities": _cell_cavities(shared, mesh.cells, of_cell, n_labels),
     }
     pieces, n_pieces = mesh.straight_pieces()
@@ -170,7 +194,10 @@ def label_interfaces(labels: Image, mesh: Mesh, of_cell: ArrayLike, mask: Image 
     turns = _turns(pieces.points, surfaces, ridges)
     turns[ridges.nodes.min(axis=1) >= len(mesh.points)] = np.nan  # within a curved facet
     area = counts(surfaces.label, surface_areas(FacetSurface(pieces.points, surfaces.nodes)))
-    n_folded, n_paired = counts(ridges.label[turns > FOLD_DEGREES]), counts(ridges.label[np.isfinite(turns)])
+    n_folded, n_paired = (
+        counts(ridges.label[turns > FOLD_DEGREES]),
+        counts(ridges.label[np.isfinite(turns)]),
+    )
     rows = []
     for row in present.tolist():
         is_label = np.pad(voxels[boxes[row]] == row, 1)
@@ -183,7 +210,9 @@ def label_interfaces(labels: Image, mesh: Mesh, of_cell: ArrayLike, mask: Image 
                 label=int(values[row]),
                 area=float(area[row]),
                 smooth_area=smooth_area,
-                area_ratio=float(area[row]) / smooth_area if area[row] > 0.0 and is_large else np.nan,
+                area_ratio=float(area[row]) / smooth_area
+                if area[row] > 0.0 and is_large
+                else np.nan,
                 folded=float(n_folded[row] / n_paired[row]) if n_paired[row] else np.nan,
                 euler=voxel_euler(is_label),
                 cavities=voxel_cavities(is_label),
@@ -196,8 +225,9 @@ def label_interfaces(labels: Image, mesh: Mesh, of_cell: ArrayLike, mask: Image 
 def smooth_surface(is_label: NDArray[np.bool_], affine: NDArray[np.float64]) -> FacetSurface:
     """Surface nets of a label's voxels, in mm, without the translation to their place in the world.
 
-    Points of the nets move repeatedly halfway to their neighbours' mean, within a voxel's diagonal of their origin,
-    with the same numbers as `pyvista.ImageDataFilters.contour_labels`; the same is done in the plane.
+    Points of the nets move repeatedly halfway to their neighbours' mean, within a voxel's diagonal
+    of their origin, with the same numbers as `pyvista.ImageDataFilters.contour_labels`; the same is
+    done in the plane.
 
     Parameters
     ----------
@@ -230,29 +260,37 @@ def smooth_surface(is_label: NDArray[np.bool_], affine: NDArray[np.float64]) -> 
     with pyvista.vtk_verbosity("off"):
         nets.Update()
     surface = nets.GetOutput()
-    nodes = vtk_to_numpy((surface.GetPolys() if n == 3 else surface.GetLines()).GetConnectivityArray())
+    nodes = vtk_to_numpy(
+        (surface.GetPolys() if n == 3 else surface.GetLines()).GetConnectivityArray()
+    )
     points = np.asarray(pyvista.wrap(surface).points, dtype=np.float64)[:, :n]
     return FacetSurface(transformed(points, affine[:n, :n]), nodes.reshape(-1, n).astype(np.int64))
 
 
 def area_at_volume(surface: FacetSurface, volume: float) -> float:
-    """Area of a closed, consistently oriented surface that is grown to enclose a volume; in 2-D of the surface itself.
+    """Area of a closed, consistently oriented surface that is grown to enclose a volume; in 2-D of
+    the surface itself.
 
-    Area is a power of volume: 2/3 for a ball, 1/2 for a tube, 0 for a sheet. The power is that of a small shift along
-    the nodes' normals.
+    Area is a power of volume: 2/3 for a ball, 1/2 for a tube, 0 for a sheet. The power is that of a
+    small shift along the nodes' normals.
     """
     points, nodes = surface
     if points.shape[1] == 2:
         return float(surface_areas(surface).sum())
     vectors = facet_vectors(points, nodes)
-    area, enclosed = float(surface_areas(surface).sum()), float((vectors * points[nodes[:, 0]]).sum()) / 6.0
+    area, enclosed = (
+        float(surface_areas(surface).sum()),
+        float((vectors * points[nodes[:, 0]]).sum()) / 6.0,
+    )
     grown = min(volume / max(abs(enclosed), SHIFTED_VOLUME * volume), MOST_GROWN)
     if abs(grown - 1.0) < VOLUME_NEAR or not area > 0.0:
         return area
     sums = _node_sums(vectors, nodes, len(points))
     normals = sums / np.maximum(np.linalg.norm(sums, axis=1), np.finfo(np.float64).tiny)[:, None]
     shifted = FacetSurface(points + SHIFTED_VOLUME * enclosed / area * normals, nodes)
-    return float(area * grown ** (np.log(surface_areas(shifted).sum() / area) / np.log1p(SHIFTED_VOLUME)))
+    return float(
+        area * grown ** (np.log(surface_areas(shifted).sum() / area) / np.log1p(SHIFTED_VOLUME))
+    )
 
 
 @njit(cache=True, nogil=True)
@@ -269,9 +307,9 @@ def _node_sums(vectors: NDArray, nodes: NDArray, n_nodes: int) -> NDArray:
 def voxel_euler(is_label: NDArray[np.bool_]) -> int:
     """Euler number of the closed surface of voxels that are connected by faces.
 
-    It is twice the Euler number of the enclosed solid: voxels, minus pairs that share a face, plus groups of four
-    around an edge, minus groups of eight around a corner, for 6 neighbours inside and 26 outside (Kong and Rosenfeld
-    1989). In 2-D: pixels, minus pairs, plus groups of four.
+    It is twice the Euler number of the enclosed solid: voxels, minus pairs that share a face, plus
+    groups of four around an edge, minus groups of eight around a corner, for 6 neighbours inside
+    and 26 outside (Kong and Rosenfeld 1989). In 2-D: pixels, minus pairs, plus groups of four.
     """
     n, total = is_label.ndim, 0
     for is_joined in product((False, True), repeat=n):
@@ -292,8 +330,12 @@ def voxel_cavities(is_label: NDArray[np.bool_]) -> int:
     return component_runs(outside, outside, has_corners=True)[0] - 1
 
 
-def _turns(points: NDArray[np.float64], surfaces: LabelSurfaces, ridges: Ridges) -> NDArray[np.float64]:
-    """Angle between the normals of the two facets at each ridge, (R,), degrees; nan with more facets."""
+def _turns(
+    points: NDArray[np.float64], surfaces: LabelSurfaces, ridges: Ridges
+) -> NDArray[np.float64]:
+    """Angle between the normals of the two facets at each ridge, (R,), degrees; nan with more
+    facets.
+    """
     corners = points[surfaces.nodes]
     along = corners[:, 1:] - corners[:, :1]
     if points.shape[1] == 2:
@@ -306,7 +348,8 @@ def _turns(points: NDArray[np.float64], surfaces: LabelSurfaces, ridges: Ridges)
     paired = np.flatnonzero(ridges.n_facets == 2)
     cosine = (normals[of_ridge[first[paired]]] * normals[of_ridge[first[paired] + 1]]).sum(axis=1)
     turns = np.full(len(ridges.n_facets), np.nan)
-    turns[paired] = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).round(6)  # 60 on lattices must not exceed 60
+    # 60 on lattices must not exceed 60
+    turns[paired] = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).round(6)
     return turns
 
 
@@ -317,14 +360,17 @@ def _cell_eulers(
     n_ridges: NDArray[np.int64],
     n_nodes: NDArray[np.int64],
 ) -> NDArray[np.int64]:
-    """`voxel_euler` of each label's cells: cells, minus facets between them, plus inner edges, minus inner nodes.
+    """`voxel_euler` of each label's cells: cells, minus facets between them, plus inner edges,
+    minus inner nodes.
 
     `n_ridges` and `n_nodes` are those of each label's surface, which are not inner ones.
     """
     n, n_labels, base = cells.shape[1] - 1, len(n_nodes), int(cells.max()) + 1
     near, far = of_cell[shared.cells].T
     is_inner = (shared.n_cells == 2) & (near == far)
-    total = np.bincount(of_cell, minlength=n_labels) - np.bincount(near[is_inner], minlength=n_labels)
+    total = np.bincount(of_cell, minlength=n_labels) - np.bincount(
+        near[is_inner], minlength=n_labels
+    )
     nodes = _distinct(of_cell[:, None] * base + cells) // base
     total -= (-1) ** (n + 1) * (np.bincount(nodes, minlength=n_labels) - n_nodes)
     if n == 3:
@@ -345,8 +391,9 @@ def _cell_cavities(
 ) -> NDArray[np.int64]:
     """`voxel_cavities` of each label's cells, where nodes connect the space around them.
 
-    Cells connected by facets have one closed surface for each part of the space around them (Alexander's duality): all
-    but one of these enclose a cavity. Facets of one such surface are linked by nodes.
+    Cells connected by facets have one closed surface for each part of the space around them
+    (Alexander's duality): all but one of these enclose a cavity. Facets of one such surface are
+    linked by nodes.
     """
     if cells.shape[1] == 3:
         return np.zeros(n_labels, dtype=np.int64)
@@ -357,7 +404,9 @@ def _cell_cavities(
     cell = shared.cells[row, side]
     corners = piece[cell][:, None] + n_pieces * shared.nodes[row]
     corner = np.unique(corners, return_inverse=True)[1].reshape(corners.shape)
-    n_surfaces, surface = linked(corner[:, [0, 0]].ravel(), corner[:, 1:].ravel(), int(corner.max()) + 1)
+    n_surfaces, surface = linked(
+        corner[:, [0, 0]].ravel(), corner[:, 1:].ravel(), int(corner.max()) + 1
+    )
     of_piece, of_surface = np.empty(n_pieces, dtype=np.int64), np.empty(n_surfaces, dtype=np.int64)
     of_piece[piece], of_surface[surface[corner[:, 0]]] = of_cell, of_cell[cell]
     return np.bincount(of_surface, minlength=n_labels) - np.bincount(of_piece, minlength=n_labels)

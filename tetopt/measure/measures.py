@@ -22,20 +22,26 @@ from tetopt.measure.interfaces import label_interfaces
 from tetopt.measure.thin import contact_totals, label_contacts, label_layers
 from tetopt.mesh import Mesh
 
-AROUND_VOXELS = 2  # around mask and mesh: their surfaces end at no side of this box but the image's own
+# around mask and mesh: their surfaces end at no side of this box but the image's own
+AROUND_VOXELS = 2
 
 
 def fidelity(
-    labels: Image | None, mask: Image | None, mesh: Mesh, of_cell: NDArray | None, failed: dict[str, str] | None = None,
+    labels: Image | None,
+    mask: Image | None,
+    mesh: Mesh,
+    of_cell: NDArray | None,
+    failed: dict[str, str] | None = None,
     what: Content | None = None,
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """Measure how well a mesh represents a mask and labels.
 
-    Returns a `MaskFidelity` as `mask`; for each label a `LabelFidelity` in `labels` and a `LabelInterface` in
-    `interfaces`; for each pair of labels a `LabelContact` in `contacts`, and their sums in `contact_totals`.
-    Entries of missing images are omitted. With a mask, labels count only inside it. `of_cell` (M,) is the label of each
-    cell, by default that of most of its voxels; for `failed` see `measured_each`; `what` is the content with the levels
-    of these labels, if known.
+    Returns a `MaskFidelity` as `mask`; for each label a `LabelFidelity` in `labels` and a
+    `LabelInterface` in `interfaces`; for each pair of labels a `LabelContact` in `contacts`, and
+    their sums in `contact_totals`. Entries of missing images are omitted. With a mask, labels count
+    only inside it. `of_cell` (M,) is the label of each cell, by default that of most of its voxels;
+    for `failed` see `measured_each`; `what` is the content with the levels of these labels, if
+    known.
     """
     measures: dict[str, Callable[[], Any]] = {}
     whole = partial(_with_levels, what, labels, mask)
@@ -45,7 +51,11 @@ def fidelity(
     if mask is not None:
         measures["mask"] = lambda: mask_fidelity(mask, mesh, owner())
     if labels is not None:
-        own = _once(lambda: cell_labels(continued(labels, mask), mesh)) if of_cell is None else lambda: of_cell
+        own = (
+            _once(lambda: cell_labels(continued(labels, mask), mesh))
+            if of_cell is None
+            else lambda: of_cell
+        )
         measures["labels"] = lambda: label_fidelity(labels, mesh, own(), mask, owner())
         if len(np.unique(labels.data if mask is None else labels.data[mask.data >= 0.5])) > 1:
             measures["thickness"] = lambda: label_layers(whole(), mesh, own())
@@ -67,7 +77,9 @@ def fidelity(
 
 
 def _once(make: Callable[[], NDArray]) -> Callable[[], NDArray]:
-    """Return a function that computes an array at its first call alone, on any thread, and then returns the same."""
+    """Return a function that computes an array at its first call alone, on any thread, and then
+    returns the same.
+    """
     lock, made = Lock(), cache(make)
 
     def get() -> NDArray:
@@ -78,7 +90,8 @@ def _once(make: Callable[[], NDArray]) -> Callable[[], NDArray]:
 
 
 def _around(labels: Image | None, mask: Image, mesh: Mesh) -> tuple[Image | None, Image]:
-    """Return the part of labels and a mask around the mask and the mesh: no measure counts what is beyond.
+    """Return the part of labels and a mask around the mask and the mesh: no measure counts what is
+    beyond.
 
     For a brain in its head this is half of the voxels, of the time and of the memory.
     """
@@ -87,27 +100,36 @@ def _around(labels: Image | None, mask: Image, mesh: Mesh) -> tuple[Image | None
     inside, index = mask.data >= INSIDE_FRACTION, mask.to_index(mesh.straight_pieces()[0].points)
     others = [tuple(d for d in range(mask.ndim) if d != axis) for axis in range(mask.ndim)]
     within = [
-        np.append(np.flatnonzero(inside.any(axis=rest)), along) for rest, along in zip(others, index.T, strict=True)
+        np.append(np.flatnonzero(inside.any(axis=rest)), along)
+        for rest, along in zip(others, index.T, strict=True)
     ]
     if not inside.any():
         return labels, mask
     start = [max(int(each.min()) - AROUND_VOXELS, 0) for each in within]
-    stop = [min(int(each.max()) + AROUND_VOXELS + 2, size) for each, size in zip(within, mask.shape, strict=True)]
+    stop = [
+        min(int(each.max()) + AROUND_VOXELS + 2, size)
+        for each, size in zip(within, mask.shape, strict=True)
+    ]
     return None if labels is None else labels.box(start, stop), mask.box(start, stop)
 
 
 def _with_levels(what: Content | None, labels: Image | None, mask: Image | None) -> Content:
-    """Return the content if it has levels of labels, or else create one of the labels alone with levels."""
+    """Return the content if it has levels of labels, or else create one of the labels alone with
+    levels.
+    """
     if what is not None and what.memberships is not None:
         return what
     assert labels is not None
     return content(labels, labels, mask)
 
 
-def measured_each(measures: Mapping[str, Callable[[], Any]], failed: dict[str, str] | None) -> dict[str, Any]:
+def measured_each(
+    measures: Mapping[str, Callable[[], Any]], failed: dict[str, str] | None
+) -> dict[str, Any]:
     """Compute measures in parallel; return their results by name.
 
-    With `failed`, a measure that raises an error is omitted and its reason is noted there, so that the others complete.
+    With `failed`, a measure that raises an error is omitted and its reason is noted there, so that
+    the others complete.
     """
     measured, n_threads = {}, numba.get_num_threads()
 
@@ -117,14 +139,21 @@ def measured_each(measures: Mapping[str, Callable[[], Any]], failed: dict[str, s
 
     threads = ThreadPoolExecutor(n_threads)
     try:
-        taken = {name: threads.submit(copy_context().run, limited, measure) for name, measure in measures.items()}
+        taken = {
+            name: threads.submit(copy_context().run, limited, measure)
+            for name, measure in measures.items()
+        }
         for name, each in taken.items():
             try:
                 measured[name] = each.result()
             except Exception as error:
                 if failed is None:
                     raise
-                words = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+                words = (
+                    str(error)
+                    if isinstance(error, InputError)
+                    else f"{type(error).__name__}: {error}"
+                )
                 failed[name] = words.removesuffix(": ")
     finally:  # an interrupted run, or one that failed, does not begin the rest
         threads.shutdown(wait=False, cancel_futures=True)

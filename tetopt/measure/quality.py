@@ -48,9 +48,10 @@ class QualityErrors(NamedTuple):
 def quality_errors(points: Points, cells: Cells) -> QualityErrors:
     """The paper's four errors of the radius ratio rho.
 
-    The paper prints (ii) as 1 / sum(1 / err), but its Table 1 fits M / sum(1 / err), the harmonic mean, which is used
-    here: in the table's third row, 196 congruent triangles, (ii) equals (i). (iii) is the plain sum of squares. An
-    error that rounding makes negative is 0, and (ii) is 0 if any error is 0.
+    The paper prints (ii) as 1 / sum(1 / err), but its Table 1 fits M / sum(1 / err), the harmonic
+    mean, which is used here: in the table's third row, 196 congruent triangles, (ii) equals (i).
+    (iii) is the plain sum of squares. An error that rounding makes negative is 0, and (ii) is 0 if
+    any error is 0.
     """
     return _errors_of(rho(points, cells), points.shape[1])
 
@@ -61,25 +62,33 @@ def _errors_of(shape: NDArray[np.float64], n: int) -> QualityErrors:
     return QualityErrors(float(error.mean()), harmonic, float((error**2).sum()), float(error.max()))
 
 
-def rho_histogram(points: Points, cells: Cells, bins: int = 40) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Normalised histogram of rho over [0, 1/n] as in Fig. 1(d): fraction of cells, (bins,), and edges, (bins + 1,)."""
+def rho_histogram(
+    points: Points, cells: Cells, bins: int = 40
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Normalised histogram of rho over [0, 1/n] as in Fig. 1(d): fraction of cells, (bins,), and
+    edges, (bins + 1,).
+    """
     n = points.shape[1]
-    counts, edges = np.histogram(np.minimum(rho(points, cells), 1.0 / n), bins=bins, range=(0.0, 1.0 / n))
+    counts, edges = np.histogram(
+        np.minimum(rho(points, cells), 1.0 / n), bins=bins, range=(0.0, 1.0 / n)
+    )
     return counts / len(cells), edges
 
 
 def bad_kinds(points: Points, cells: Cells) -> NDArray[np.str_]:
     """The kind of each cell, (M,) str: "good" if n rho >= 0.3, else the kind of bad shape.
 
-    Bad tetrahedra (after Cheng, Dey, Edelsbrunner, Facello and Teng 2000) are thin or flat, depending on the spread of
-    the four nodes along its principal axes: thin if the middle spread is nearer to the smallest than to the largest
-    (geometric mean), flat otherwise. The projection onto their plane distinguishes flat ones:
+    Bad tetrahedra (after Cheng, Dey, Edelsbrunner, Facello and Teng 2000) are thin or flat,
+    depending on the spread of the four nodes along its principal axes: thin if the middle spread is
+    nearer to the smallest than to the largest (geometric mean), flat otherwise. The projection onto
+    their plane distinguishes flat ones:
 
     - ``needle``: thin; all nodes near a line, angles may be good.
     - ``wedge``: flat with two nodes close together (an edge below 1/4 of the longest).
     - ``cap``: flat, one node projected inside the triangle of the others.
     - ``spade``: flat, one node projected (nearly) onto an edge of that triangle.
-    - ``sliver``: flat, the projections form a convex quadrilateral; no short edge, two angles near 180 degrees.
+    - ``sliver``: flat, the projections form a convex quadrilateral; no short edge, two angles near
+      180 degrees.
 
     Triangles: ``needle`` has an edge below 1/4 of the longest, ``cap`` an angle near 180 degrees.
     """
@@ -105,14 +114,17 @@ def _tet_kinds(corners: NDArray[np.float64]) -> NDArray[np.str_]:
     is_thin = spread[:, 1] ** 2 <= spread[:, 0] * spread[:, 2]
     edges = squared_edges(corners.reshape(-1, 3), np.arange(4 * len(corners)).reshape(-1, 4))
     is_wedge = edges.min(axis=1) < SHORT_EDGE**2 * edges.max(axis=1)
-    # The affine dependence of four points in a plane, sum c_k = 0 and sum c_k x_k = 0: its signs are 3 + 1 if one
-    # point lies inside the triangle of the others, 2 + 2 for a convex quadrilateral; a 0 is a point on an edge.
+    # The affine dependence of four points in a plane, sum c_k = 0 and sum c_k x_k = 0: its signs
+    # are 3 + 1 if one point lies inside the triangle of the others, 2 + 2 for a convex
+    # quadrilateral; a 0 is a point on an edge.
     flat = axes[:, :2] @ centred.swapaxes(1, 2)
     dependence = np.linalg.svd(np.concatenate([flat, np.ones((len(flat), 1, 4))], axis=1))[2][:, -1]
     size = np.abs(dependence)
     is_spade = size.min(axis=1) < NEAR_EDGE * size.max(axis=1)
     is_sliver = (dependence > 0).sum(axis=1) == 2
-    return np.select([is_thin, is_wedge, is_spade, is_sliver], ["needle", "wedge", "spade", "sliver"], "cap")
+    return np.select(
+        [is_thin, is_wedge, is_spade, is_sliver], ["needle", "wedge", "spade", "sliver"], "cap"
+    )
 
 
 class Quality(NamedTuple):
@@ -172,17 +184,27 @@ class Quality(NamedTuple):
             ("nodes", f"{self.n_nodes:,}"),
             ("cells", f"{self.n_cells:,}"),
             ("volume", f"{self.volume:.6g} mm^{self.ndim}"),
-            ("rho", f"mean {self.mean_rho:.3f}, 1st percentile {self.p1_rho:.3f}, smallest {self.min_rho:.3f}"),
+            (
+                "rho",
+                f"mean {self.mean_rho:.3f}, 1st percentile {self.p1_rho:.3f}, smallest "
+                f"{self.min_rho:.3f}",
+            ),
             ("angles", f"{self.min_dihedral:.1f} to {self.max_dihedral:.1f} degrees"),
             ("below 10 degrees", f"{self.n_under_10_degrees:,} cells"),
-            ("badly shaped", ", ".join(f"{count:,} {kind}s" for kind, count in self.kinds.items() if count) or "none"),
+            (
+                "badly shaped",
+                ", ".join(f"{count:,} {kind}s" for kind, count in self.kinds.items() if count)
+                or "none",
+            ),
             ("edges", f"{self.min_edge:.4g} to {self.max_edge:.4g} mm"),
         ]
         return notebook.card_html("Quality", rows)
 
 
 def _of_cells(points: Points, cells: Cells) -> tuple[NDArray[np.float64], ...]:
-    """Rho, volume, smallest and largest angle, and squares of the shortest and longest edge of cells, (M,) each."""
+    """Rho, volume, smallest and largest angle, and squares of the shortest and longest edge of
+    cells, (M,) each.
+    """
     angles, squares = dihedral_angles(points, cells), squared_edges(points, cells)
     extremes = angles.min(axis=1), angles.max(axis=1), squares.min(axis=1), squares.max(axis=1)
     return rho(points, cells), volumes(points, cells), *extremes
@@ -191,8 +213,9 @@ def _of_cells(points: Points, cells: Cells) -> tuple[NDArray[np.float64], ...]:
 def quality(points: Points, cells: Cells, midpoints: Points | None = None) -> Quality:
     """Measure the shape of a mesh's cells.
 
-    For rho and the four errors see Section 2.1 of the paper (`tetopt.measure.quality.quality_errors`), for the kinds of
-    bad cells `tetopt.measure.quality.bad_kinds`, for angles `tetopt.geometry.simplex.dihedral_angles`.
+    For rho and the four errors see Section 2.1 of the paper
+    (`tetopt.measure.quality.quality_errors`), for the kinds of bad cells
+    `tetopt.measure.quality.bad_kinds`, for angles `tetopt.geometry.simplex.dihedral_angles`.
 
     Parameters
     ----------
@@ -201,7 +224,8 @@ def quality(points: Points, cells: Cells, midpoints: Points | None = None) -> Qu
     cells : (M, n+1) array of int64
         Node indices of each cell.
     midpoints : (E, n) array of float64, optional
-        Those of the mesh, if its edges are curved. Volumes are of these cells; all else is of the corners.
+        Those of the mesh, if its edges are curved. Volumes are of these cells; all else is of the
+        corners.
 
     Returns
     -------
@@ -211,7 +235,8 @@ def quality(points: Points, cells: Cells, midpoints: Points | None = None) -> Qu
     Raises
     ------
     InputError
-        Points or cells that are not 2-D arrays of numbers, points that are not finite, or cells that do not index them.
+        Points or cells that are not 2-D arrays of numbers, points that are not finite, or cells
+        that do not index them.
 
     See Also
     --------
@@ -227,9 +252,17 @@ def quality(points: Points, cells: Cells, midpoints: Points | None = None) -> Qu
     """
     n = points.shape[1]
     # Block by block, as the temporaries take 600 bytes per cell.
-    blocks = [_of_cells(points, cells[at : at + BLOCK_CELLS]) for at in range(0, len(cells), BLOCK_CELLS)]
-    shape, v, smallest, largest, shortest, longest = (np.concatenate(each) for each in zip(*blocks, strict=True))
-    v = v if midpoints is None else curved_volumes(*quadratic(points, np.asarray(cells, dtype=np.int64), midpoints))
+    blocks = [
+        _of_cells(points, cells[at : at + BLOCK_CELLS]) for at in range(0, len(cells), BLOCK_CELLS)
+    ]
+    shape, v, smallest, largest, shortest, longest = (
+        np.concatenate(each) for each in zip(*blocks, strict=True)
+    )
+    v = (
+        v
+        if midpoints is None
+        else curved_volumes(*quadratic(points, np.asarray(cells, dtype=np.int64), midpoints))
+    )
     names = ("needle", "wedge", "cap", "spade", "sliver") if n == 3 else ("needle", "cap")
     kinds = _kinds_of(points, cells, shape)
     return Quality(

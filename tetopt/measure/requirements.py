@@ -27,7 +27,8 @@ def judged(
     dice: float | None = None,
     is_initial: bool = False,
 ) -> MeshingResult:
-    """Treat a mesh as the result of a run, with the `violated` and `fraction` that the run would have.
+    """Treat a mesh as the result of a run, with the `violated` and `fraction` that the run would
+    have.
 
     Parameters
     ----------
@@ -43,7 +44,8 @@ def judged(
     is_filled : bool
         True if the mesh should fill the image's box.
     dice : float, optional
-        Dice of the mesh with the mask, over the whole mesh; by default over the content's voxels, around the mask.
+        Dice of the mesh with the mask, over the whole mesh; by default over the content's voxels,
+        around the mask.
     is_initial : bool
         True if the run made no iteration, which the remedies then name.
 
@@ -58,7 +60,9 @@ def judged(
         As for `tetopt.energy.sampling.cell_moments`.
     """
     E_D, n_voxels = content_E_D(content, mesh)
-    row = IterationRecord(int(not is_initial), np.nan, np.nan, E_D, 0.0, False, len(mesh.cells), n_voxels, 0.0)
+    row = IterationRecord(
+        int(not is_initial), np.nan, np.nan, E_D, 0.0, False, len(mesh.cells), n_voxels, 0.0
+    )
     result = MeshingResult(mesh, [row], "iterations", mesh, labels=labels)
     result = checked(result, content, min_dihedral, mesh, dice)
     result = requested(result, content, target_error, is_filled)
@@ -67,7 +71,9 @@ def judged(
 
 
 def warn_of_other_mask(mesh: Mesh, mask: Image | None) -> None:
-    """Warn if a mesh hardly overlaps with a mask: cells elsewhere take the values of its nearest voxels."""
+    """Warn if a mesh hardly overlaps with a mask: cells elsewhere take the values of its nearest
+    voxels.
+    """
     if mask is None:
         return
     inside = mask.data >= INSIDE_FRACTION
@@ -76,6 +82,7 @@ def warn_of_other_mask(mesh: Mesh, mask: Image | None) -> None:
     dice = 2.0 * n_both / (n_covered + int(inside.sum()))
     if dice < MASK_DICE:
         warn(
-            f"mesh and mask overlap with a Dice of only {dice:.2g}, and cells elsewhere take values of the mask's "
+            f"mesh and mask overlap with a Dice of only {dice:.2g}, and cells elsewhere take "
+            "values of the mask's "
             "nearest voxels; was the mesh built within another mask, or within none?"
         )

@@ -1,7 +1,9 @@
-"""Approximate segmentation by an optimised mesh: cells are classified by their means, and voxels by their cells.
+"""Approximate segmentation by an optimised mesh: cells are classified by their means, and voxels by
+their cells.
 
-Section 5 of the paper: "such an optimized discretization can further be used for a fast approximate segmentation since
-optimized elements represent an image using far fewer degrees-of-freedom than the underlying pixels".
+Section 5 of the paper: "such an optimized discretization can further be used for a fast approximate
+segmentation since optimized elements represent an image using far fewer degrees-of-freedom than the
+underlying pixels".
 """
 
 from __future__ import annotations
@@ -20,12 +22,14 @@ from tetopt.mesh import Mesh
 
 
 def segment(image: Image | Content, mesh: Mesh, classes: int) -> Image:
-    """Segment an image into classes 0 to classes - 1 of increasing mean, from the classes of its cells.
+    """Segment an image into classes 0 to classes - 1 of increasing mean, from the classes of its
+    cells.
 
     Parameters
     ----------
     image : Image or Content
-        The intensities h. For a mesh of a content, pass the content: voxels outside its mask do not count.
+        The intensities h. For a mesh of a content, pass the content: voxels outside its mask do not
+        count.
     mesh : Mesh
         Mesh of the image's box or a part of it; curved edges count as straight.
     classes : int
@@ -39,7 +43,8 @@ def segment(image: Image | Content, mesh: Mesh, classes: int) -> Image:
     Raises
     ------
     InputError
-        As for `class_thresholds` and `tetopt.energy.sampling.cell_moments`, or a mesh without voxel centres.
+        As for `class_thresholds` and `tetopt.energy.sampling.cell_moments`, or a mesh without voxel
+        centres.
 
     Examples
     --------
@@ -53,7 +58,10 @@ def segment(image: Image | Content, mesh: Mesh, classes: int) -> Image:
         warn_of_other_mask(mesh, image.own_mask)
     moments = cell_moments(own_image(image), mesh)
     if not moments.n_voxels.any():
-        raise InputError("mesh and image: no voxel centre is inside the mesh; do both use the same world coordinates?")
+        raise InputError(
+            "mesh and image: no voxel centre is inside the mesh; do both use the same world "
+            "coordinates?"
+        )
     thresholds = class_thresholds(moments.mean, classes, moments.n_voxels)
     class_of_cell = np.digitize(moments.mean, thresholds)
     whole = image if isinstance(image, Image) else image.given
@@ -62,7 +70,9 @@ def segment(image: Image | Content, mesh: Mesh, classes: int) -> Image:
 
 
 def thresholded(image: Image, classes: int, inside: NDArray[np.bool_] | None = None) -> Image:
-    """Segment an image's voxels, by default all, into the same classes without a mesh; those not `inside` get 0."""
+    """Segment an image's voxels, by default all, into the same classes without a mesh; those not
+    `inside` get 0.
+    """
     inside = np.ones(image.shape, dtype=bool) if inside is None else inside
     thresholds = class_thresholds(image.data[inside], classes)
     return Image(np.where(inside, np.digitize(image.data, thresholds), 0), image.affine)
@@ -77,8 +87,9 @@ def stands_for(labels: Image, truth: Image) -> dict[int, int]:
 def dice(labels: Image, truth: Image) -> dict[int, float]:
     """Dice overlap of each true label with the classes that represent it, 0 to 1.
 
-    A class represents the most frequent true label of its voxels (`stands_for`); a true label without any class has 0.
-    As the truth determines this assignment, more classes tend to overlap better.
+    A class represents the most frequent true label of its voxels (`stands_for`); a true label
+    without any class has 0. As the truth determines this assignment, more classes tend to overlap
+    better.
 
     Raises
     ------
@@ -94,13 +105,24 @@ def dice(labels: Image, truth: Image) -> dict[int, float]:
     return overlaps
 
 
-def _table(labels: Image, truth: Image) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """The classes, the true labels, and the number of voxels of each class (rows) and true label (columns)."""
+def _table(
+    labels: Image, truth: Image
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """The classes, the true labels, and the number of voxels of each class (rows) and true label
+    (columns).
+    """
     if labels.shape != truth.shape:
-        raise InputError(f"dice: expected images of the same shape, got {labels.shape} and {truth.shape}")
+        raise InputError(
+            f"dice: expected images of the same shape, got {labels.shape} and {truth.shape}"
+        )
     named = {"labels": labels, "truth": truth}
-    of_each = [np.unique(checked_labels(name, image).data, return_inverse=True) for name, image in named.items()]
+    of_each = [
+        np.unique(checked_labels(name, image).data, return_inverse=True)
+        for name, image in named.items()
+    ]
     (classes, row), (true, column) = of_each
     shape = (len(classes), len(true))
-    counts = np.bincount(row.ravel() * shape[1] + column.ravel(), minlength=shape[0] * shape[1]).reshape(shape)
+    counts = np.bincount(
+        row.ravel() * shape[1] + column.ravel(), minlength=shape[0] * shape[1]
+    ).reshape(shape)
     return classes.astype(np.int64), true.astype(np.int64), counts

@@ -1,8 +1,8 @@
 """Thin labels: local thickness and contacts between labels, in voxels and mesh.
 
-Both thicknesses are measured in the same way at the same voxel centres, between the labels' smooth surfaces and between
-the facets of the mesh: the median for shells is within 3 % from voxels and 0.5 % from facets. A sheet that contains no
-voxel centre is missed.
+Both thicknesses are measured in the same way at the same voxel centres, between the labels' smooth
+surfaces and between the facets of the mesh: the median for shells is within 3 % from voxels and 0.5
+% from facets. A sheet that contains no voxel centre is missed.
 """
 
 from __future__ import annotations
@@ -16,7 +16,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from tetopt.contents.content import Content
 from tetopt.contents.labels import LARGEST_LABEL, checked_labels
-from tetopt.contents.thickness import BEYOND_REGION, THICKNESS_PERCENTILES, local_thickness, thickness_between
+from tetopt.contents.thickness import (
+    BEYOND_REGION,
+    THICKNESS_PERCENTILES,
+    local_thickness,
+    thickness_between,
+)
 from tetopt.errors import InputError
 from tetopt.geometry.manifold import OUTSIDE_LABEL
 from tetopt.geometry.simplex import squared_edges
@@ -34,7 +39,8 @@ from tetopt.measure.fidelity import (
 from tetopt.mesh import Mesh
 
 THICK_VOXELS = 10.0  # times a voxel's shortest edge, at which thickness is clipped
-STAIRS = {2: np.pi / 4.0, 3: 2.0 / 3.0}  # mean ratio, over all directions, of a smooth surface to its voxels' faces
+# mean ratio, over all directions, of a smooth surface to its voxels' faces
+STAIRS = {2: np.pi / 4.0, 3: 2.0 / 3.0}
 TOLERATED_CONTACT = 1.2  # times the voxels' contact: more in a mesh is excess
 LABEL_BASE = LARGEST_LABEL + 1  # base of the number of a pair of labels
 
@@ -49,7 +55,8 @@ class LabelContact(NamedTuple):
     mesh_mm2 : float
         Area of the facets between their cells.
     voxels_mm2 : float
-        Area of the faces between their voxels times 2/3 (pi/4 in 2-D), which estimates the smooth surface's area.
+        Area of the faces between their voxels times 2/3 (pi/4 in 2-D), which estimates the smooth
+        surface's area.
     ratio : float
         Ratio of the mesh's area to the voxels'; nan if their voxels do not touch.
 
@@ -69,10 +76,13 @@ class LabelContact(NamedTuple):
     ratio: float
 
 
-def label_contacts(labels: Image, mesh: Mesh, of_cell: ArrayLike, mask: Image | None = None) -> list[LabelContact]:
+def label_contacts(
+    labels: Image, mesh: Mesh, of_cell: ArrayLike, mask: Image | None = None
+) -> list[LabelContact]:
     """Measure the contact area of each pair of labels, in the mesh and in the voxels.
 
-    Facets on the mesh's boundary, and faces of voxels on the box or the mask's border, do not count.
+    Facets on the mesh's boundary, and faces of voxels on the box or the mask's border, do not
+    count.
 
     Parameters
     ----------
@@ -115,18 +125,24 @@ def label_contacts(labels: Image, mesh: Mesh, of_cell: ArrayLike, mask: Image | 
     in_voxels = _voxel_contacts(labels, mask)
     return [
         LabelContact(
-            (pair // LABEL_BASE, pair % LABEL_BASE), in_mesh.get(pair, 0.0), in_voxels.get(pair, 0.0),
+            (pair // LABEL_BASE, pair % LABEL_BASE),
+            in_mesh.get(pair, 0.0),
+            in_voxels.get(pair, 0.0),
             in_mesh.get(pair, 0.0) / in_voxels[pair] if pair in in_voxels else np.nan,
         )
         for pair in sorted(in_mesh | in_voxels)
-    ]  # fmt: skip
+    ]
 
 
 def contact_totals(contacts: Sequence[LabelContact]) -> dict[str, float]:
-    """Contact area, mm^(n-1), of pairs that do not touch in the voxels, and in excess of 1.2 times the voxels'."""
+    """Contact area, mm^(n-1), of pairs that do not touch in the voxels, and in excess of 1.2
+    times the voxels'.
+    """
     return {
         "false_mm2": float(sum(each.mesh_mm2 for each in contacts if each.voxels_mm2 == 0.0)),
-        "excess_mm2": float(sum(max(each.mesh_mm2 - TOLERATED_CONTACT * each.voxels_mm2, 0.0) for each in contacts)),
+        "excess_mm2": float(
+            sum(max(each.mesh_mm2 - TOLERATED_CONTACT * each.voxels_mm2, 0.0) for each in contacts)
+        ),
     }
 
 
@@ -136,7 +152,9 @@ def _voxel_contacts(labels: Image, mask: Image | None) -> dict[int, float]:
     total: dict[int, float] = {}
     for axis, edge in enumerate(labels.spacing):
         along = np.moveaxis(data, axis, 0)
-        is_contact = (along[:-1] != along[1:]) & (np.minimum(along[:-1], along[1:]) != OUTSIDE_LABEL)
+        is_contact = (along[:-1] != along[1:]) & (
+            np.minimum(along[:-1], along[1:]) != OUTSIDE_LABEL
+        )
         face = STAIRS[labels.ndim] * float(np.prod(labels.spacing)) / float(edge)
         of_axis = _by_pair(along[:-1][is_contact], along[1:][is_contact])
         for pair, count in of_axis.items():
@@ -144,23 +162,32 @@ def _voxel_contacts(labels: Image, mask: Image | None) -> dict[int, float]:
     return total
 
 
-def _by_pair(one: NDArray, other: NDArray, weights: NDArray[np.float64] | None = None) -> dict[int, float]:
+def _by_pair(
+    one: NDArray, other: NDArray, weights: NDArray[np.float64] | None = None
+) -> dict[int, float]:
     """Sums over pairs of labels, by the number of the pair."""
     pairs = np.minimum(one, other).astype(np.int64) * LABEL_BASE + np.maximum(one, other)
     numbers, place = np.unique(pairs, return_inverse=True)
-    return dict(zip(numbers.tolist(), np.bincount(place, weights, len(numbers)).astype(float).tolist(), strict=True))
+    return dict(
+        zip(
+            numbers.tolist(),
+            np.bincount(place, weights, len(numbers)).astype(float).tolist(),
+            strict=True,
+        )
+    )
 
 
 def label_thickness(
     what: Content, mesh: Mesh, of_cell: ArrayLike
 ) -> dict[int, tuple[Thickness | None, Thickness | None]]:
-    """Measure the local thickness of each label, between its voxels' smooth surfaces and between its cells' facets.
+    """Measure the local thickness of each label, between its voxels' smooth surfaces and between
+    its cells' facets.
 
     Parameters
     ----------
     what : Content
-        A content with smooth labels: their levels give the smooth surfaces, and both are measured at its voxels (finer
-        ones if slices are thick).
+        A content with smooth labels: their levels give the smooth surfaces, and both are measured
+        at its voxels (finer ones if slices are thick).
     mesh : Mesh
         Points in world coordinates, mm; curved cells as their `Mesh.straight_pieces`.
     of_cell : (M,) array of whole numbers
@@ -169,8 +196,9 @@ def label_thickness(
     Returns
     -------
     dict
-        For each label, the thickness of its voxels and of its cells, each None if they contain no voxel centre. Values
-        are clipped at ten times a voxel's shortest edge. At a mask both end half a voxel beyond the last centre inside.
+        For each label, the thickness of its voxels and of its cells, each None if they contain no
+        voxel centre. Values are clipped at ten times a voxel's shortest edge. At a mask both end
+        half a voxel beyond the last centre inside.
 
     Raises
     ------
@@ -186,7 +214,9 @@ def label_thickness(
     >>> f"{voxels.p50:.0f} mm of voxels, {cells.p50:.0f} mm of cells"
     '37 mm of voxels, 38 mm of cells'
     """
-    return {label: (row.voxels, row.cells) for label, row in label_layers(what, mesh, of_cell).items()}
+    return {
+        label: (row.voxels, row.cells) for label, row in label_layers(what, mesh, of_cell).items()
+    }
 
 
 class Layers(NamedTuple):
@@ -199,15 +229,21 @@ class Layers(NamedTuple):
 
 
 def label_layers(what: Content, mesh: Mesh, of_cell: ArrayLike) -> dict[int, Layers]:
-    """Measure the local thickness of each label as `label_thickness` does, in mm and in edges of the cells there."""
+    """Measure the local thickness of each label as `label_thickness` does, in mm and in edges of
+    the cells there.
+    """
     of_cell = checked_cell_labels(of_cell, mesh)
     members, grid = what.memberships, what.image
     if members is None:
-        raise InputError("content: expected labels with smooth interfaces, got none; use content(image, labels)")
+        raise InputError(
+            "content: expected labels with smooth interfaces, got none; use content(image, labels)"
+        )
     inside = None if what.region is None else what.region.inside
     most = THICK_VOXELS * float(min(grid.spacing))
     spacing = np.asarray(grid.spacing, dtype=np.float64)
-    rows = members.partition if inside is None else np.where(inside, members.partition, BEYOND_REGION)
+    rows = (
+        members.partition if inside is None else np.where(inside, members.partition, BEYOND_REGION)
+    )
     thick = local_thickness(members, spacing, most, inside)
     of_voxels = _percentiles(thick, rows, members.labels, most)
     values, row = np.unique(of_cell, return_inverse=True)
@@ -225,17 +261,26 @@ def label_layers(what: Content, mesh: Mesh, of_cell: ArrayLike) -> dict[int, Lay
                 medians[int(values[label])] = float(np.median(edges)), across
     del owner, thick, rows
     shared = facets(pieces.cells)
-    is_between = (shared.n_cells == 2) & np.diff(np.repeat(of_cell, n_pieces)[shared.cells])[:, 0].astype(bool)
+    is_between = (shared.n_cells == 2) & np.diff(np.repeat(of_cell, n_pieces)[shared.cells])[
+        :, 0
+    ].astype(bool)
     corners = (grid.to_index(pieces.points) * spacing)[shared.nodes[is_between]]
-    of_cells = _percentiles(thickness_between(corners, painted, spacing, most), painted, values, most)
+    of_cells = _percentiles(
+        thickness_between(corners, painted, spacing, most), painted, values, most
+    )
     return {
-        label: Layers(of_voxels.get(label), of_cells.get(label), *medians.get(label, (np.nan, np.nan)))
+        label: Layers(
+            of_voxels.get(label), of_cells.get(label), *medians.get(label, (np.nan, np.nan))
+        )
         for label in sorted(of_voxels | of_cells)
     }
 
 
 def _percentiles(
-    thickness: NDArray[np.float32], rows: NDArray[np.integer], values: NDArray[np.int64], most: float
+    thickness: NDArray[np.float32],
+    rows: NDArray[np.integer],
+    values: NDArray[np.int64],
+    most: float,
 ) -> dict[int, Thickness]:
     """Percentiles of the thickness at the voxels of each row, by label."""
     percentiles = {}
@@ -243,5 +288,7 @@ def _percentiles(
         if box is not None:
             own = thickness[box][rows[box] == row]
             three = np.percentile(own, THICKNESS_PERCENTILES).astype(float).tolist()
-            percentiles[int(values[row])] = Thickness(*three)._replace(limit=float(np.float32(most)))
+            percentiles[int(values[row])] = Thickness(*three)._replace(
+                limit=float(np.float32(most))
+            )
     return percentiles

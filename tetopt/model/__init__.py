@@ -1,1 +1,3 @@
-"""Solver input in addition to the mesh: named sets, modulus mappings and materials, loads, units."""
+"""Solver input in addition to the mesh: named sets, modulus mappings and materials, loads,
+units.
+"""

@@ -1,13 +1,14 @@
 """Moduli of cells, averaged over their voxels.
 
-Eq. (2) uses the *mean of the modulus field* over each cell. A mapping from intensity to modulus is therefore applied
-to the voxels first, and then averaged; the mapping of the mean intensity differs from this wherever the mapping is
-nonlinear and the cell is not uniform.
+Eq. (2) uses the *mean of the modulus field* over each cell. A mapping from intensity to modulus is
+therefore applied to the voxels first, and then averaged; the mapping of the mean intensity differs
+from this wherever the mapping is nonlinear and the cell is not uniform.
 
-The arithmetic mean is the modulus of a mixture under uniform strain (Voigt, Annalen der Physik 274, 1889, 573-587), an
-upper bound; the harmonic mean is the modulus under uniform stress (Reuss, ZAMM 9, 1929, 49-58), a lower bound (Hill,
-Proc. Phys. Soc. A 65, 1952, 349-354, who averages the two). Power means lie between them; power 0 is the geometric
-mean (Lichtenecker, Physikalische Zeitschrift 27, 1926, 115-158).
+The arithmetic mean is the modulus of a mixture under uniform strain (Voigt, Annalen der Physik 274,
+1889, 573-587), an upper bound; the harmonic mean is the modulus under uniform stress (Reuss, ZAMM
+9, 1929, 49-58), a lower bound (Hill, Proc. Phys. Soc. A 65, 1952, 349-354, who averages the two).
+Power means lie between them; power 0 is the geometric mean (Lichtenecker, Physikalische Zeitschrift
+27, 1926, 115-158).
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ from tetopt.model.mappings import ModulusMapping, mapped_values, young_from
 
 DEFAULT_AVERAGE = "gauss"  # of moduli (docs/understand/moduli.md); `tetopt paper` keeps Eq. (2)
 POWER_WORDS = {"mean": 1.0, "geometric": 0.0, "harmonic": -1.0}
-LARGEST_POWER = 10.0  # in absolute value; beyond it a power mean is almost the largest or the smallest value
+# in absolute value; beyond it a power mean is almost the largest or the smallest value
+LARGEST_POWER = 10.0
 VOXELS_PER_CHUNK = 2**20  # whose positions in their cells are computed at once, 100 MB
 
 
@@ -36,8 +38,10 @@ class Average(NamedTuple):
     """A way to average several moduli; returned by `parse_average`."""
 
     words: str  # as a user writes it
-    power: float | None  # of the power mean; None: Hill's average, halfway between the powers 1 and -1
-    place: Literal["cells", "nodes", "gauss"] = "cells"  # one average per cell, per node, or per Gauss point of a cell
+    # of the power mean; None: Hill's average, halfway between the powers 1 and -1
+    power: float | None
+    # one average per cell, per node, or per Gauss point of a cell
+    place: Literal["cells", "nodes", "gauss"] = "cells"
 
 
 def parse_average(text: str) -> Average:
@@ -46,9 +50,10 @@ def parse_average(text: str) -> Average:
     Parameters
     ----------
     text : str
-        "mean" (Eq. (2), Voigt; power 1), "geometric" (power 0), "harmonic" (Reuss; power -1), "power:P" with P from
-        -10 to 10, "hill" (halfway between mean and harmonic), "gauss" (geometric around each Gauss point of a cell) or
-        "nodes" (geometric around each node, and linear between nodes).
+        "mean" (Eq. (2), Voigt; power 1), "geometric" (power 0), "harmonic" (Reuss; power -1),
+        "power:P" with P from -10 to 10, "hill" (halfway between mean and harmonic), "gauss"
+        (geometric around each Gauss point of a cell) or "nodes" (geometric around each node, and
+        linear between nodes).
 
     Raises
     ------
@@ -73,7 +78,8 @@ def parse_average(text: str) -> Average:
         power = np.nan
     if not abs(power) <= LARGEST_POWER:
         raise InputError(
-            f"average: expected {', '.join(POWER_WORDS)}, hill, gauss, nodes, or power:P with P from "
+            f"average: expected {', '.join(POWER_WORDS)}, hill, gauss, nodes, or power:P with P "
+            "from "
             f'{-LARGEST_POWER:g} to {LARGEST_POWER:g}, such as power:0.5, got "{text}"'
         )
     return Average(f"power:{power:g}", power)
@@ -92,7 +98,9 @@ def young_image(image: Image, mapping: ModulusMapping) -> Image:
     return Image(young_from(mapping, image.data), image.affine)
 
 
-def cell_young(image: Image, mesh: Mesh, mapping: ModulusMapping = None, average: str = "mean") -> NDArray[np.float64]:
+def cell_young(
+    image: Image, mesh: Mesh, mapping: ModulusMapping = None, average: str = "mean"
+) -> NDArray[np.float64]:
     """Return the modulus of each cell, (M,) float64, kPa: an average of the modulus field over it.
 
     Parameters
@@ -102,17 +110,18 @@ def cell_young(image: Image, mesh: Mesh, mapping: ModulusMapping = None, average
     mapping : callable, (K, 2) table or None
         From intensity to kPa, see `tetopt.model.mappings.mapped_values`.
     average : str
-        See `parse_average`. "mean" is Eq. (2). "nodes" gives the mean of `node_young` over the cell's corners, and thus
-        over the cell; "gauss" gives the geometric mean.
+        See `parse_average`. "mean" is Eq. (2). "nodes" gives the mean of `node_young` over the
+        cell's corners, and thus over the cell; "gauss" gives the geometric mean.
 
-    A cell without a voxel centre gets the modulus at its centroid, see `tetopt.energy.sampling.cell_moments`. Every
-    average lies within the range of the cell's voxels; if their moduli are equal, it is exactly that modulus.
+    A cell without a voxel centre gets the modulus at its centroid, see
+    `tetopt.energy.sampling.cell_moments`. Every average lies within the range of the cell's voxels;
+    if their moduli are equal, it is exactly that modulus.
 
     Raises
     ------
     InputError
-        For the reasons of `parse_average`, `young_from` and `tetopt.energy.sampling.cell_of_voxel`; a modulus of 0 in
-        the mesh, except for power means with a power above 0.
+        For the reasons of `parse_average`, `young_from` and `tetopt.energy.sampling.cell_of_voxel`;
+        a modulus of 0 in the mesh, except for power means with a power above 0.
     """
     parsed = parse_average(average)
     if parsed.place == "nodes":
@@ -124,19 +133,22 @@ def cell_young(image: Image, mesh: Mesh, mapping: ModulusMapping = None, average
 
 
 def cell_values(image: Image, mesh: Mesh, mapping: ModulusMapping) -> NDArray[np.float64]:
-    """Return the mean over each cell of another quantity, such as Poisson's ratio or density; it may be negative.
+    """Return the mean over each cell of another quantity, such as Poisson's ratio or density; it
+    may be negative.
 
     Raises
     ------
     InputError
-        For the reasons of `mapped_values` and `tetopt.energy.sampling.cell_of_voxel`; values that are not finite.
+        For the reasons of `mapped_values` and `tetopt.energy.sampling.cell_of_voxel`; values that
+        are not finite.
     """
     seen, owner = _seen(image, mesh)
     values = mapped_values(mapping, seen.data)
     if not np.isfinite(values).all():
         at = seen.data[~np.isfinite(values)].ravel()[0]
         raise InputError(
-            f"mapping: no value at intensity {at:g}; give a mapping (`nu`, `density`) defined for all intensities "
+            f"mapping: no value at intensity {at:g}; give a mapping (`nu`, `density`) defined "
+            "for all intensities "
             "in the mesh"
         )
     return _of_cells(Image(values, image.affine), mesh, owner, 1.0)
@@ -145,13 +157,15 @@ def cell_values(image: Image, mesh: Mesh, mapping: ModulusMapping) -> NDArray[np
 def node_young(image: Image, mesh: Mesh, mapping: ModulusMapping = None) -> NDArray[np.float64]:
     """Return the modulus of each node, (N,) float64, kPa, for moduli that are linear within cells.
 
-    This is the geometric mean of the voxels in the cells around the node, each weighted by the node's hat function at
-    its centre; if no voxel has its centre there, it is the modulus of the voxel nearest to the node.
+    This is the geometric mean of the voxels in the cells around the node, each weighted by the
+    node's hat function at its centre; if no voxel has its centre there, it is the modulus of the
+    voxel nearest to the node.
 
     Raises
     ------
     InputError
-        For the reasons of `young_from` and `tetopt.energy.sampling.cell_of_voxel`; a modulus of 0 in the mesh.
+        For the reasons of `young_from` and `tetopt.energy.sampling.cell_of_voxel`; a modulus of 0
+        in the mesh.
     """
     seen, owner = _seen(image, mesh)
     field = young_image(seen, mapping)
@@ -178,12 +192,14 @@ def node_young(image: Image, mesh: Mesh, mapping: ModulusMapping = None) -> NDAr
 def element_young(
     image: Image, mesh: Mesh, mapping: ModulusMapping = None, average: str = "mean", order: int = 1
 ) -> NDArray[np.float64]:
-    """Return moduli for `tetopt.fem.elasticity.stiffness`: `cell_young` (M,), or at Gauss points (M, Q), kPa.
+    """Return moduli for `tetopt.fem.elasticity.stiffness`: `cell_young` (M,), or at Gauss points
+    (M, Q), kPa.
 
-    Moduli at Gauss points are returned for "nodes", see `gauss_young`, and for "gauss" with order 2. There each Gauss
-    point lies near one corner and has the geometric mean of the cell's voxels nearest to that corner in barycentric
-    coordinates, or without any, that of the whole cell. A quadratic cell thus has one modulus per corner, independent
-    of its neighbours, as it must be at an interface.
+    Moduli at Gauss points are returned for "nodes", see `gauss_young`, and for "gauss" with order
+    2. There each Gauss point lies near one corner and has the geometric mean of the cell's voxels
+    nearest to that corner in barycentric coordinates, or without any, that of the whole cell. A
+    quadratic cell thus has one modulus per corner, independent of its neighbours, as it must be at
+    an interface.
 
     Raises
     ------
@@ -204,7 +220,9 @@ def element_young(
         part[voxels] = len(places) * owner[voxels] + np.argmax(hats, axis=1)
     young, is_empty = _averages(field, part, 0.0, len(mesh.cells) * len(places))
     shape = len(mesh.cells), len(places)
-    return np.where(is_empty.reshape(shape), _of_cells(field, mesh, owner, 0.0)[:, None], young.reshape(shape))
+    return np.where(
+        is_empty.reshape(shape), _of_cells(field, mesh, owner, 0.0)[:, None], young.reshape(shape)
+    )
 
 
 def gauss_young(node_young: NDArray[np.float64], mesh: Mesh, order: int) -> NDArray[np.float64]:
@@ -222,8 +240,9 @@ def gauss_young(node_young: NDArray[np.float64], mesh: Mesh, order: int) -> NDAr
 def _seen(image: Image, mesh: Mesh) -> tuple[Image, NDArray[np.int64]]:
     """Return the image with unused values replaced, and the cell of each voxel, (V,), -1 outside.
 
-    Averages use voxels in cells, and those nearest to nodes and centroids, which stand in for cells without voxels. All
-    other voxels get the value of a used one, because a mapping need not be defined for the air around an organ.
+    Averages use voxels in cells, and those nearest to nodes and centroids, which stand in for cells
+    without voxels. All other voxels get the value of a used one, because a mapping need not be
+    defined for the air around an organ.
     """
     owner = cell_of_voxel(image, mesh).ravel()
     is_seen = owner >= 0
@@ -232,39 +251,55 @@ def _seen(image: Image, mesh: Mesh) -> tuple[Image, NDArray[np.int64]]:
     for points in (mesh.points, centroids(mesh.points, mesh.cells)):
         is_seen[np.ravel_multi_index(tuple(nearest_voxels(image, points).T), image.shape)] = True
     data = image.data.ravel()
-    return Image(np.where(is_seen, data, data[np.argmax(is_seen)]).reshape(image.shape), image.affine), owner
+    return Image(
+        np.where(is_seen, data, data[np.argmax(is_seen)]).reshape(image.shape), image.affine
+    ), owner
 
 
 def _places(
     image: Image, mesh: Mesh, owner: NDArray[np.int64]
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64]]]:
-    """Yield the numbers (K,) of voxels in the mesh and their cells' hat functions there, (K, n+1), in chunks."""
+    """Yield the numbers (K,) of voxels in the mesh and their cells' hat functions there, (K,
+    n+1), in chunks.
+    """
     inside = np.flatnonzero(owner >= 0)
-    slopes = volume_gradients(mesh.points, mesh.cells) / volumes(mesh.points, mesh.cells)[:, None, None]
+    slopes = (
+        volume_gradients(mesh.points, mesh.cells) / volumes(mesh.points, mesh.cells)[:, None, None]
+    )
     middle = centroids(mesh.points, mesh.cells)
     for start in range(0, len(inside), VOXELS_PER_CHUNK):
         voxels = inside[start : start + VOXELS_PER_CHUNK]
         cell = owner[voxels]
-        centres = image.to_world(np.stack(np.unravel_index(voxels, image.shape), axis=1).astype(np.float64))
+        centres = image.to_world(
+            np.stack(np.unravel_index(voxels, image.shape), axis=1).astype(np.float64)
+        )
         hats = np.einsum("kai,ki->ka", slopes[cell], centres - middle[cell]) + 1.0 / (mesh.ndim + 1)
         yield voxels, np.maximum(hats, 0.0)  # rounding could give values below 0
 
 
-def _check_above_zero(average: Average, image: Image, field: Image, owner: NDArray[np.int64]) -> None:
+def _check_above_zero(
+    average: Average, image: Image, field: Image, owner: NDArray[np.int64]
+) -> None:
     """Raise InputError if an average would be 0 because of a single modulus of 0."""
     if average.power is not None and average.power > 0.0:
         return
     empty = np.flatnonzero((owner >= 0) & (field.data.ravel() == 0.0))
     if len(empty):
         raise InputError(
-            f"average: expected moduli above 0 kPa for {average.words}, got 0 in {len(empty)} voxels of the mesh, e.g. "
-            f"at intensity {image.data.ravel()[empty[0]]:g}; give empty space a small modulus, as in "
+            f"average: expected moduli above 0 kPa for {average.words}, got 0 in {len(empty)} "
+            "voxels of the mesh, e.g. "
+            f"at intensity {image.data.ravel()[empty[0]]:g}; give empty space a small modulus, "
+            "as in "
             '`young` "0:0.1,255:6", or use `average` mean'
         )
 
 
-def _of_cells(field: Image, mesh: Mesh, owner: NDArray[np.int64], power: float | None) -> NDArray[np.float64]:
-    """Return the average over each cell; a cell without a voxel centre gets the value of the voxel at its centroid."""
+def _of_cells(
+    field: Image, mesh: Mesh, owner: NDArray[np.int64], power: float | None
+) -> NDArray[np.float64]:
+    """Return the average over each cell; a cell without a voxel centre gets the value of the
+    voxel at its centroid.
+    """
     averages, is_empty = _averages(field, owner, power, len(mesh.cells))
     averages[is_empty] = nearest_values(field, centroids(mesh.points, mesh.cells[is_empty]))
     return averages
@@ -273,7 +308,8 @@ def _of_cells(field: Image, mesh: Mesh, owner: NDArray[np.int64], power: float |
 def _averages(
     field: Image, owner: NDArray[np.int64], power: float | None, n_parts: int
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return the power mean, or Hill's average, of the voxels of each part, and whether the part has none.
+    """Return the power mean, or Hill's average, of the voxels of each part, and whether the part
+    has none.
 
     `owner` holds the number of a part, or -1, for each voxel.
     """
@@ -285,7 +321,8 @@ def _averages(
         averages = 0.5 * sum(_powers(part, values, n_voxels, ranges, each) for each in (1.0, -1.0))
     else:
         averages = _powers(part, values, n_voxels, ranges, power)
-    # Clipped to their range, so that a cell of equal values has exactly that value: constants stay one material.
+    # Clipped to their range, so that a cell of equal values has exactly that value: constants stay
+    # one material.
     return np.clip(averages, *ranges), n_voxels == 0
 
 
@@ -296,14 +333,16 @@ def _powers(
     ranges: tuple[NDArray[np.float64], NDArray[np.float64]],
     power: float,
 ) -> NDArray[np.float64]:
-    """Return the power mean of the values of each part, (K,); arbitrary for a part without values."""
+    """Return the power mean of the values of each part, (K,); arbitrary for a part without
+    values.
+    """
     count = np.maximum(n_voxels, 1)
     if power == 1.0:
-        # Summed voxel by voxel. `cell_moments` subtracts sums over rows, and their rounding errors would swamp the
-        # soft cells of a field that spans ten orders of magnitude.
+        # Summed voxel by voxel. `cell_moments` subtracts sums over rows, and their rounding errors
+        # would swamp the soft cells of a field that spans ten orders of magnitude.
         return np.bincount(part, weights=values, minlength=len(count)) / count
-    # Ratios to the dominant value, so that powers lie between 0 and 1; minus 1, so that powers near 0 keep their digits
-    # in the logarithm.
+    # Ratios to the dominant value, so that powers lie between 0 and 1; minus 1, so that powers near
+    # 0 keep their digits in the logarithm.
     largest = ranges[1] if power > 0.0 else ranges[0]
     largest = np.where((n_voxels > 0) & (largest > 0.0), largest, 1.0)
     with np.errstate(divide="ignore"):  # a modulus of 0, allowed for powers above 0

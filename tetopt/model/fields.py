@@ -16,12 +16,22 @@ from tetopt.image import Image
 from tetopt.measure.requirements import warn_of_other_mask
 from tetopt.mesh import Mesh
 
-# Fields that depend on the world's axes or on the unit of stress, by name; a suffix such as _step2 may follow.
+# Fields that depend on the world's axes or on the unit of stress, by name; a suffix such as _step2
+# may follow.
 VECTOR_FIELDS = ("displacement",)
 TENSOR_FIELDS = ("strain", "stress", "strain_nodes", "stress_nodes")
 NODE_MODULI = "young_nodes"  # point data in tetopt's files: moduli that are linear within cells
-GAUSS_MODULI = "young_gauss"  # cell data in tetopt's files: moduli at Gauss points of quadratic cells, one per column
-STRESS_FIELDS = ("young", NODE_MODULI, GAUSS_MODULI, "stress", "von_mises", "stress_nodes", "von_mises_nodes")
+# cell data in tetopt's files: moduli at Gauss points of quadratic cells, one per column
+GAUSS_MODULI = "young_gauss"
+STRESS_FIELDS = (
+    "young",
+    NODE_MODULI,
+    GAUSS_MODULI,
+    "stress",
+    "von_mises",
+    "stress_nodes",
+    "von_mises_nodes",
+)
 HALF_TURN = np.array([-1.0, -1.0, 1.0])  # about z, from RAS+ to LPS+ or back
 
 
@@ -31,16 +41,17 @@ def cell_fields(mesh: Mesh, image: Image | Content | None = None) -> dict[str, N
     Parameters
     ----------
     mesh : Mesh
-        Points in world coordinates, mm. Of curved cells only the volume is theirs, all else is of straight ones.
+        Points in world coordinates, mm. Of curved cells only the volume is theirs, all else is of
+        straight ones.
     image : Image or Content, optional
-        Without it, the fields of the image are omitted. For a mesh of a content, pass the content: voxels outside its
-        mask take the value of the nearest voxel inside.
+        Without it, the fields of the image are omitted. For a mesh of a content, pass the content:
+        voxels outside its mask take the value of the nearest voxel inside.
 
     Returns
     -------
     dict of (M,) arrays
-        "volume", mm^n; "rho", the radius ratio; "min_dihedral", the smallest angle, degrees; with an image, in its
-        unit, "mean", "variance" (unit squared), "n_voxels", "min" and "max".
+        "volume", mm^n; "rho", the radius ratio; "min_dihedral", the smallest angle, degrees; with
+        an image, in its unit, "mean", "variance" (unit squared), "n_voxels", "min" and "max".
 
     Raises
     ------
@@ -75,10 +86,11 @@ def cell_fields(mesh: Mesh, image: Image | Content | None = None) -> dict[str, N
 
 
 def node_field(values: NDArray, mesh: Mesh, order: int) -> NDArray:
-    """Return a field with one row per node of the order (1: the mesh's nodes; 2: those of `quadratic`).
+    """Return a field with one row per node of the order (1: the mesh's nodes; 2: those of
+    `quadratic`).
 
-    If there are rows only for the mesh's nodes, the middle of an edge gets the mean of its ends; rows beyond the nodes
-    of the order are dropped.
+    If there are rows only for the mesh's nodes, the middle of an edge gets the mean of its ends;
+    rows beyond the nodes of the order are dropped.
 
     Raises
     ------
@@ -92,7 +104,8 @@ def node_field(values: NDArray, mesh: Mesh, order: int) -> NDArray:
     n_nodes = int(cells.max()) + 1
     if len(values) not in (n_corners, n_nodes):
         raise InputError(
-            f"point data: expected one row per corner node ({n_corners}) or per node ({n_nodes}), got {len(values)}"
+            f"point data: expected one row per corner node ({n_corners}) or per node "
+            f"({n_nodes}), got {len(values)}"
         )
     if order == 1 or len(values) == n_nodes:
         return values[: n_corners if order == 1 else n_nodes]
@@ -128,12 +141,22 @@ def is_stress(name: str) -> bool:
     return _base_name(name) in STRESS_FIELDS
 
 
-def scaled_fields(fields: dict[str, NDArray], stress: float, length: float, ndim: int) -> dict[str, NDArray]:
-    """Convert moduli, stresses, displacements and volumes among named fields to other units, given as the number of
-    new units per present unit."""
-    factors = dict.fromkeys(STRESS_FIELDS, stress) | dict.fromkeys(VECTOR_FIELDS, length) | {"volume": length**ndim}
+def scaled_fields(
+    fields: dict[str, NDArray], stress: float, length: float, ndim: int
+) -> dict[str, NDArray]:
+    """Convert moduli, stresses, displacements and volumes among named fields to other units,
+    given as the number of new units per present unit.
+    """
+    factors = (
+        dict.fromkeys(STRESS_FIELDS, stress)
+        | dict.fromkeys(VECTOR_FIELDS, length)
+        | {"volume": length**ndim}
+    )
     scales = {name: factors.get(_base_name(name), 1.0) for name in fields}
-    return {name: values if scales[name] == 1.0 else values * scales[name] for name, values in fields.items()}
+    return {
+        name: values if scales[name] == 1.0 else values * scales[name]
+        for name, values in fields.items()
+    }
 
 
 def _base_name(name: str) -> str:

@@ -36,10 +36,14 @@ from tetopt.model.sets import (
 )
 from tetopt.system.incoming import json_of
 
-MATERIAL_FIELDS = ("young", "nu", "density", "material", GAUSS_MODULI)  # cell data in tetopt's files
-MODULUS_ROUNDING = 1e-9  # relative, between a cell's modulus and those at its Gauss points, in files of other units
-MASK_TEXT = "mask"  # text of a mesh's file: `tetopt.contents.domain.mask_text` of what the mesh was built within
-TEXTS_KEPT = ("image", "image_sha256", "inputs", "options", "violated", MASK_TEXT)  # those that are kept in a new file
+# cell data in tetopt's files
+MATERIAL_FIELDS = ("young", "nu", "density", "material", GAUSS_MODULI)
+# relative, between a cell's modulus and those at its Gauss points, in files of other units
+MODULUS_ROUNDING = 1e-9
+# text of a mesh's file: `tetopt.contents.domain.mask_text` of what the mesh was built within
+MASK_TEXT = "mask"
+# those that are kept in a new file
+TEXTS_KEPT = ("image", "image_sha256", "inputs", "options", "violated", MASK_TEXT)
 
 
 class MeshFile(NamedTuple):
@@ -143,16 +147,24 @@ class MeshFile(NamedTuple):
         return table if isinstance(table, dict) else {}
 
     def _repr_html_(self) -> str:
-        """Show the contents of the file in a notebook, with the middle section shaded by cell means."""
+        """Show the contents of the file in a notebook, with the middle section shaded by cell
+        means.
+        """
         mesh = self.mesh
         rows = notebook.mesh_rows(mesh.points, mesh.cells)
         rows += [("data of cells", ", ".join(self.cell_data) or "none")]
         rows += [("data of nodes", ", ".join(self.point_data) or "none")]
         rows += [("sets", ", ".join([*self.sets.facets, *self.sets.cells]) or "none")]
-        rows += [("labels", ", ".join(self.label_table.names.values()))] if self.label_table.names else []
+        rows += (
+            [("labels", ", ".join(self.label_table.names.values()))]
+            if self.label_table.names
+            else []
+        )
         rows += [("note", note) for note in self.notes]
         return notebook.card_html(
-            "MeshFile", rows, notebook.section_html(mesh.points, mesh.cells, self.cell_data.get("mean"))
+            "MeshFile",
+            rows,
+            notebook.section_html(mesh.points, mesh.cells, self.cell_data.get("mean")),
         )
 
     @property
@@ -174,24 +186,33 @@ def words_of_other_box(loaded: MeshFile, image: Image, tolerance: float = SAME_B
 
 
 def count_of_other_voxels(loaded: MeshFile, mask: Image) -> int:
-    """Return the number of voxels in which a mask differs from the one in a mesh's file; 0 if it contains none."""
+    """Return the number of voxels in which a mask differs from the one in a mesh's file; 0 if it
+    contains none.
+    """
     own = own_mask(loaded, mask) if MASK_TEXT in loaded.field_data else None
-    return 0 if own is None else int(((own.data >= INSIDE_FRACTION) != (mask.data >= INSIDE_FRACTION)).sum())
+    return (
+        0
+        if own is None
+        else int(((own.data >= INSIDE_FRACTION) != (mask.data >= INSIDE_FRACTION)).sum())
+    )
 
 
 def own_mask(loaded: MeshFile, image: Image) -> Image | None:
-    """Return the mask that a mesh's file was built within, on an image's voxels; None for a whole box.
+    """Return the mask that a mesh's file was built within, on an image's voxels; None for a whole
+    box.
 
     A region without its background counts as a mask.
 
     Raises
     ------
     InputError
-        The image's dimension differs from the mesh's; the file names a mask but does not contain it; the mask lies
-        outside the image.
+        The image's dimension differs from the mesh's; the file names a mask but does not contain
+        it; the mask lies outside the image.
     """
     if image.ndim != loaded.mesh.ndim:
-        raise InputError(f"image: expected a {loaded.mesh.ndim}-D image like the mesh, got a {image.ndim}-D one")
+        raise InputError(
+            f"image: expected a {loaded.mesh.ndim}-D image like the mesh, got a {image.ndim}-D one"
+        )
     if MASK_TEXT in loaded.field_data:
         mask = None
         with suppress(ValueError, TypeError, KeyError, OverflowError):  # another program's "mask"
@@ -204,13 +225,16 @@ def own_mask(loaded: MeshFile, image: Image) -> Image | None:
         return None
     name = f"the foreground above {level}" if name is None else f"the mask {name}"
     raise InputError(
-        f"the mesh was built within {name}, which its file does not contain: pass `mask`, or in Python tetopt.content "
+        f"the mesh was built within {name}, which its file does not contain: pass `mask`, or in "
+        "Python tetopt.content "
         "with the mask instead of the image"
     )
 
 
 def table_in(text: str | None) -> LabelTable:
-    """Parse a label table written by `tetopt.model.labels.table_words`; empty for any other text."""
+    """Parse a label table written by `tetopt.model.labels.table_words`; empty for any other
+    text.
+    """
     try:
         return table_of_words(json_of(text or "{}"))
     except ValueError:  # written by another program
@@ -226,42 +250,53 @@ def sets_beside(
     former: Mapping[int, str] | None = None,
     kept: Iterable[str] = (),
 ) -> tuple[Sets, dict[str, str]]:
-    """Return the standard sets together with the mesh's own, and the new names of own sets, by old name.
+    """Return the standard sets together with the mesh's own, and the new names of own sets, by old
+    name.
 
-    `names` gives the names of labels. Own sets of labels and interfaces under their numbers or `former` names are
-    dropped as duplicates, except those that loads refer to (`kept`).
+    `names` gives the names of labels. Own sets of labels and interfaces under their numbers or
+    `former` names are dropped as duplicates, except those that loads refer to (`kept`).
     """
     labels = labels_of(fields, len(mesh.cells))
     if labels is not None and names and (own.facets or own.cells):
         for others in {id(each): each for each in ({}, former or {}) if each != names}.values():
             of_labels = label_sets(mesh, labels, others)
-            own = Sets(*(
-                {
-                    name: rows for name, rows in mine.items()
-                    if name in kept or not np.array_equal(rows, anew.get(name, np.empty(0)))
-                }
-                for mine, anew in zip(own, of_labels, strict=True)
-            ))  # fmt: skip
+            own = Sets(
+                *(
+                    {
+                        name: rows
+                        for name, rows in mine.items()
+                        if name in kept or not np.array_equal(rows, anew.get(name, np.empty(0)))
+                    }
+                    for mine, anew in zip(own, of_labels, strict=True)
+                )
+            )
     return merged_sets(standard_sets(mesh, box, labels, names, own.facets), own)
 
 
 def loads_in(loaded: MeshFile) -> tuple[list[str], str]:
-    """Return the loads in a file of tetopt's as text, in RAS+ and kPa, if their sets still exist; and otherwise why
-    they were dropped."""
+    """Return the loads in a file of tetopt's as text, in RAS+ and kPa, if their sets still
+    exist; and otherwise why they were dropped.
+    """
     try:
         words = json_of(loaded.text("loads") or "[]")
         loads = [parse_load(text, loaded.mesh.ndim) for text in words]
     except (ValueError, TypeError, AttributeError):  # written by another program
         return [], ""
-    if lost := [load.set_name for load in loads if load.set_name and load.set_name not in loaded.sets.facets]:
+    if lost := [
+        load.set_name for load in loads if load.set_name and load.set_name not in loaded.sets.facets
+    ]:
         return [], f"dropped the file's loads: it no longer has the sets {', '.join(lost)}"
     units = STRESS_UNITS.get(loaded.text("units") or "", STRESS_UNITS["kPa"])
     turned = [half_turned(load) if loaded.space == "lps" else load for load in loads]
     return [load_words(scaled(load, units.kPa, units.mm)) for load in turned], ""
 
 
-def moduli_in(cell_data: Mapping[str, NDArray], young: Any, nu: Any, density: Any) -> tuple[Any, Any, Any]:
-    """Return mappings of modulus, ratio and density; without a modulus, missing ones are taken from the cells."""
+def moduli_in(
+    cell_data: Mapping[str, NDArray], young: Any, nu: Any, density: Any
+) -> tuple[Any, Any, Any]:
+    """Return mappings of modulus, ratio and density; without a modulus, missing ones are taken
+    from the cells.
+    """
     if young is not None or "young" not in cell_data:
         return young, nu, density
     stated = {"nu": nu, "density": density}
@@ -272,9 +307,13 @@ def moduli_in(cell_data: Mapping[str, NDArray], young: Any, nu: Any, density: An
 
 
 def completed(model: Model, loaded: MeshFile, *, is_of_file: bool) -> tuple[Model, str]:
-    """Add the data that only the mesh's file has: data of nodes and, if the moduli are the file's, moduli that vary
-    within cells and the binning error. Also return a note on data that do not fit."""
-    model = model._replace(point_data={name: rows for name, rows in loaded.point_data.items() if name != NODE_MODULI})
+    """Add the data that only the mesh's file has: data of nodes and, if the moduli are the
+    file's, moduli that vary within cells and the binning error. Also return a note on data that
+    do not fit.
+    """
+    model = model._replace(
+        point_data={name: rows for name, rows in loaded.point_data.items() if name != NODE_MODULI}
+    )
     if (table := model.materials) is None or not is_of_file:
         return model, ""
     if (moduli := loaded.point_data.get(NODE_MODULI)) is not None:
@@ -282,7 +321,9 @@ def completed(model: Model, loaded: MeshFile, *, is_of_file: bool) -> tuple[Mode
     table = table._replace(binning=_binning_error(loaded))
     at_gauss = _gauss_moduli(model, loaded)
     lost = at_gauss is None and model.order == 2 and GAUSS_MODULI in loaded.cell_data
-    words = f"dropped {GAUSS_MODULI} from the mesh's file: it does not match the cells and their moduli"
+    words = (
+        f"dropped {GAUSS_MODULI} from the mesh's file: it does not match the cells and their moduli"
+    )
     return model._replace(materials=table, gauss_young=at_gauss), words if lost else ""
 
 
@@ -291,20 +332,29 @@ def _binning_error(loaded: MeshFile) -> BinningError | None:
     try:
         words = json_of(loaded.text("binning") or "{}")
         return BinningError(float(words["mean"]), float(words["largest"]))
-    except (ValueError, TypeError, KeyError, RecursionError):  # missing, or written by another program
+    # missing, or written by another program
+    except (ValueError, TypeError, KeyError, RecursionError):
         return None
 
 
 def _gauss_moduli(model: Model, loaded: MeshFile) -> NDArray[np.float64] | None:
-    """Return the moduli at Gauss points (M, Q) in a file of tetopt's, if they still match its cells."""
+    """Return the moduli at Gauss points (M, Q) in a file of tetopt's, if they still match its
+    cells.
+    """
     moduli = loaded.cell_data.get(GAUSS_MODULI)
     if moduli is None or model.order == 1 or model.materials is None:
         return None
-    of_cell, shape = model.materials.young[model.materials.of_cell], (len(model.mesh.cells), model.mesh.ndim + 1)
-    # A cell's own modulus is a mean of these; columns follow a cell's nodes, which reorienting swaps.
+    of_cell, shape = (
+        model.materials.young[model.materials.of_cell],
+        (len(model.mesh.cells), model.mesh.ndim + 1),
+    )
+    # A cell's own modulus is a mean of these; columns follow a cell's nodes, which reorienting
+    # swaps.
     if moduli.shape == shape and not loaded.n_turned:
         low, high = moduli.min(axis=1), moduli.max(axis=1)
-        if ((1.0 - MODULUS_ROUNDING) * low <= of_cell).all() and (of_cell <= (1.0 + MODULUS_ROUNDING) * high).all():
+        if ((1.0 - MODULUS_ROUNDING) * low <= of_cell).all() and (
+            of_cell <= (1.0 + MODULUS_ROUNDING) * high
+        ).all():
             checked_young(low)
             return np.asarray(moduli, dtype=np.float64)
     return None
@@ -313,13 +363,15 @@ def _gauss_moduli(model: Model, loaded: MeshFile) -> NDArray[np.float64] | None:
 def with_cells(loaded: MeshFile, labels: NDArray[np.int64], is_kept: NDArray[np.bool_]) -> MeshFile:
     """Return the mesh's file with a part of its cells, (M,), which have `labels`, (M,).
 
-    Each interface of a label that stays with one that goes remains as a set of facets, with its name, as do parts of
-    other sets.
+    Each interface of a label that stays with one that goes remains as a set of facets, with its
+    name, as do parts of other sets.
     """
     mesh = loaded.mesh
     of_labels = label_sets(mesh, labels, loaded.label_table.names)
     named = {name for kind in of_labels for name in kind} | standard_names(mesh.ndim)
-    facet_sets = {name: rows for name, rows in loaded.sets.facets.items() if name not in named} | of_labels.facets
+    facet_sets = {
+        name: rows for name, rows in loaded.sets.facets.items() if name not in named
+    } | of_labels.facets
     used, cells = compact(mesh.cells[is_kept], len(mesh.points))
     now, number = np.cumsum(is_kept) - 1, numbered_edges(mesh.cells)[1]
     edges = np.unique(number[is_kept])  # in the order of the new mesh, as that of the nodes stays
@@ -328,12 +380,17 @@ def with_cells(loaded: MeshFile, labels: NDArray[np.int64], is_kept: NDArray[np.
     outer = {tuple(row) for row in boundary_rows(part).tolist()}
     for name, rows in facet_sets.items():
         gone = rows[~is_kept[rows[:, 0]]]
-        turned = rows_of(mesh, facet_triples(mesh.cells, gone)[:, ::-1])  # as seen from the other cell
+        # as seen from the other cell
+        turned = rows_of(mesh, facet_triples(mesh.cells, gone)[:, ::-1])
         both = np.concatenate([rows[is_kept[rows[:, 0]]], turned[is_kept[turned[:, 0]]]])
         both = np.unique(np.column_stack([now[both[:, 0]], both[:, 1]]), axis=0)
         if len(both) and (name not in of_labels.facets or tuple(both[0].tolist()) in outer):
             facets[name] = both
-    own = {name: now[rows[is_kept[rows]]] for name, rows in loaded.sets.cells.items() if name not in named}
+    own = {
+        name: now[rows[is_kept[rows]]]
+        for name, rows in loaded.sets.cells.items()
+        if name not in named
+    }
     nodes = np.concatenate([used, len(mesh.points) + edges]) if loaded.order == 2 else used
     return loaded._replace(
         mesh=part,

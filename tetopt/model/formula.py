@@ -13,24 +13,37 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 
-MOST_FORMULA_LETTERS = 10_000  # far more than any real formula; Python's parser takes half a minute for a million
+# far more than any real formula; Python's parser takes half a minute for a million
+MOST_FORMULA_LETTERS = 10_000
 MOST_NESTED_OPERATIONS = 100  # more than any real formula, and well within Python's recursion limit
 FORMULA_FUNCTIONS: dict[str, tuple[Callable[..., Any], int]] = {
-    "abs": (np.abs, 1), "sqrt": (np.sqrt, 1), "exp": (np.exp, 1), "log": (np.log, 1),
-    "min": (np.minimum, 2), "max": (np.maximum, 2),
-}  # fmt: skip
+    "abs": (np.abs, 1),
+    "sqrt": (np.sqrt, 1),
+    "exp": (np.exp, 1),
+    "log": (np.log, 1),
+    "min": (np.minimum, 2),
+    "max": (np.maximum, 2),
+}
 BINARY_OPERATORS: dict[type[ast.operator], Callable[..., Any]] = {
-    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: np.divide, ast.Pow: np.power,
-}  # fmt: skip
-UNARY_OPERATORS: dict[type[ast.unaryop], Callable[..., Any]] = {ast.UAdd: operator.pos, ast.USub: operator.neg}
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: np.divide,
+    ast.Pow: np.power,
+}
+UNARY_OPERATORS: dict[type[ast.unaryop], Callable[..., Any]] = {
+    ast.UAdd: operator.pos,
+    ast.USub: operator.neg,
+}
 FORMULA_PARTS = f"numbers, h, + - * / **, brackets and {', '.join(FORMULA_FUNCTIONS)}"
 
 
 def parse_formula(text: str) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
     """Convert a formula of h to a function of intensities; operators and precedence are Python's.
 
-    Formulas contain numbers, ``h``, ``+ - * / **``, brackets, ``abs``, ``sqrt``, ``exp`` and ``log`` of one argument,
-    and ``min`` and ``max`` of two. Where a formula is undefined (1/0, log of 0) the function returns inf or NaN.
+    Formulas contain numbers, ``h``, ``+ - * / **``, brackets, ``abs``, ``sqrt``, ``exp`` and
+    ``log`` of one argument, and ``min`` and ``max`` of two. Where a formula is undefined (1/0, log
+    of 0) the function returns inf or NaN.
 
     Raises
     ------
@@ -43,13 +56,23 @@ def parse_formula(text: str) -> Callable[[NDArray[np.float64]], NDArray[np.float
     array([  50.,  100., 1000.])
     """
     if len(text) > MOST_FORMULA_LETTERS:
-        raise InputError(f'formula: expected at most {MOST_FORMULA_LETTERS} characters, got "{_shown(text[:1000])}"')
+        raise InputError(
+            f"formula: expected at most {MOST_FORMULA_LETTERS} characters, got "
+            f'"{_shown(text[:1000])}"'
+        )
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # for "1if h" Python only issues a warning
             tree = ast.parse(text.strip(), mode="eval").body
         value = _compiled(tree, text, 0)
-    except (SyntaxError, SyntaxWarning, ValueError, OverflowError, RecursionError, MemoryError) as error:
+    except (
+        SyntaxError,
+        SyntaxWarning,
+        ValueError,
+        OverflowError,
+        RecursionError,
+        MemoryError,
+    ) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f'formula: expected {FORMULA_PARTS}, got "{_shown(text)}"') from error
@@ -70,10 +93,14 @@ def _shown(text: str) -> str:
 def _compiled(node: ast.expr, text: str, depth: int) -> Callable[[NDArray[np.float64]], Any]:
     """Convert a syntax tree to a function of h.
 
-    InputError if the tree contains anything not allowed, or is deeper than `MOST_NESTED_OPERATIONS`.
+    InputError if the tree contains anything not allowed, or is deeper than
+    `MOST_NESTED_OPERATIONS`.
     """
     if depth > MOST_NESTED_OPERATIONS:
-        raise InputError(f'formula: expected at most {MOST_NESTED_OPERATIONS} nested operations, got "{_shown(text)}"')
+        raise InputError(
+            f"formula: expected at most {MOST_NESTED_OPERATIONS} nested operations, got "
+            f'"{_shown(text)}"'
+        )
     match node:
         case ast.Constant(value=float() | int() as value) if not isinstance(value, bool):
             number = np.float64(value)  # OverflowError for integers beyond 1e308
@@ -84,10 +111,15 @@ def _compiled(node: ast.expr, text: str, depth: int) -> Callable[[NDArray[np.flo
             function, operands = BINARY_OPERATORS[type(op)], [left, right]
         case ast.UnaryOp(op=op, operand=operand) if type(op) in UNARY_OPERATORS:
             function, operands = UNARY_OPERATORS[type(op)], [operand]
-        case ast.Call(func=ast.Name(id=name), args=operands, keywords=[]) if name in FORMULA_FUNCTIONS:
+        case ast.Call(func=ast.Name(id=name), args=operands, keywords=[]) if (
+            name in FORMULA_FUNCTIONS
+        ):
             function, count = FORMULA_FUNCTIONS[name]
             if len(operands) != count:
-                raise InputError(f'formula: {name} takes {count} arguments, got {len(operands)} in "{_shown(text)}"')
+                raise InputError(
+                    f"formula: {name} takes {count} arguments, got {len(operands)} in "
+                    f'"{_shown(text)}"'
+                )
         case _:
             part = ast.get_source_segment(text.strip(), node) or text
             raise InputError(f'formula: expected {FORMULA_PARTS}; cannot use "{_shown(part)}"')

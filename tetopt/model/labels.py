@@ -14,7 +14,8 @@ from tetopt.contents.labels import BACKGROUND_LABEL, colours_by_number, hex_colo
 from tetopt.errors import InputError
 from tetopt.model.sets import label_set_names
 
-TABLE_TEXT = "label_table"  # key in a mesh's file and in a model's `about` for the result of `table_words`
+# key in a mesh's file and in a model's `about` for the result of `table_words`
+TABLE_TEXT = "label_table"
 
 LABEL_DIGITS = 18  # of a number that fits into 64 bits; a longer one counts as a name
 
@@ -50,7 +51,9 @@ def count_of_labels(labels: Collection[int], noun: str = "") -> str:
     >>> count_of_labels([0, 3, 7], " labels")
     '2 labels and label 0'
     """
-    return f"{len(labels) - (BACKGROUND_LABEL in labels)}{noun}" + " and label 0" * (BACKGROUND_LABEL in labels)
+    return f"{len(labels) - (BACKGROUND_LABEL in labels)}{noun}" + " and label 0" * (
+        BACKGROUND_LABEL in labels
+    )
 
 
 def label_words(label: int, names: Mapping[int, str]) -> str:
@@ -59,9 +62,11 @@ def label_words(label: int, names: Mapping[int, str]) -> str:
 
 
 def labels_named(text: str, names: Mapping[int, str]) -> list[int]:
-    """Return the labels, ascending, that a text refers to: those with this name, or the one whose set has this name.
+    """Return the labels, ascending, that a text refers to: those with this name, or the one whose
+    set has this name.
 
-    Case is ignored if no label has exactly this name. A whole number refers to the label with this number.
+    Case is ignored if no label has exactly this name. A whole number refers to the label with this
+    number.
 
     Raises
     ------
@@ -81,10 +86,14 @@ def labels_named(text: str, names: Mapping[int, str]) -> list[int]:
     of_sets = label_set_names(names, names)
     for known in (names, of_sets):
         for same in (str, str.lower):
-            if labels := sorted(label for label, name in known.items() if same(name.strip()) == same(text)):
+            if labels := sorted(
+                label for label, name in known.items() if same(name.strip()) == same(text)
+            ):
                 return labels
     if not names:
-        raise InputError(f'label "{text}": labels have no names; give a table of names (`label_names`)')
+        raise InputError(
+            f'label "{text}": labels have no names; give a table of names (`label_names`)'
+        )
     lower = {name.lower(): name for name in (*of_sets.values(), *names.values())}
     near = [lower[each] for each in difflib.get_close_matches(text.lower(), lower, 3)]
     first = ", ".join(list(names.values())[:8]) + (", ..." if len(names) > 8 else "")
@@ -92,13 +101,17 @@ def labels_named(text: str, names: Mapping[int, str]) -> list[int]:
     raise InputError(f'label "{text}": no label has this name; {hint}')
 
 
-def kept_labels(keep: str | None, drop: str | None, present: Sequence[int], names: Mapping[int, str]) -> list[int]:
-    """Return the labels, of those present, that stay: those of a text "2,liver", and none of a second one.
+def kept_labels(
+    keep: str | None, drop: str | None, present: Sequence[int], names: Mapping[int, str]
+) -> list[int]:
+    """Return the labels, of those present, that stay: those of a text "2,liver", and none of a
+    second one.
 
     Raises
     ------
     InputError
-        Not exactly one text; a label that is not present, or has no such name; none or all labels would stay.
+        Not exactly one text; a label that is not present, or has no such name; none or all labels
+        would stay.
     """
     option, text = ("keep_labels", keep) if keep is not None else ("drop_labels", drop)
     if text is None or (keep is not None and drop is not None):
@@ -110,17 +123,23 @@ def kept_labels(keep: str | None, drop: str | None, present: Sequence[int], name
         except InputError as error:
             raise InputError(f"`{option}`: {error}") from error
         if not chosen.union(labels) & set(present).intersection(labels):
-            listed = ", ".join(label_words(label, names) for label in present[:8]) + ", ..." * (len(present) > 8)
+            listed = ", ".join(label_words(label, names) for label in present[:8]) + ", ..." * (
+                len(present) > 8
+            )
             raise InputError(f'`{option}`: there is no label "{word.strip()}"; there are {listed}')
         chosen |= set(labels)
     kept = [label for label in present if (label in chosen) == (keep is not None)]
     if not kept:
-        raise InputError(f"`{option}`: no label would be left of {', '.join(map(str, present[:8]))}")
+        raise InputError(
+            f"`{option}`: no label would be left of {', '.join(map(str, present[:8]))}"
+        )
     return kept
 
 
 def labels_of(cell_data: Mapping[str, NDArray], n_cells: int) -> NDArray[np.int64] | None:
-    """Return the field "label", (M,) int64, if it exists and holds whole numbers from 0; other programs' may not."""
+    """Return the field "label", (M,) int64, if it exists and holds whole numbers from 0; other
+    programs' may not.
+    """
     labels = cell_data.get("label")
     if labels is None or labels.shape != (n_cells,) or not np.isfinite(labels).all():
         return None
@@ -129,8 +148,12 @@ def labels_of(cell_data: Mapping[str, NDArray], n_cells: int) -> NDArray[np.int6
 
 
 def table_words(table: LabelTable) -> dict[str, dict[str, str]]:
-    """Convert a table to JSON's types: by label, its "name" and "colour" ("#rrggbb") if it has them."""
-    words: dict[str, dict[str, str]] = {str(label): {} for label in sorted({*table.names, *table.colours})}
+    """Convert a table to JSON's types: by label, its "name" and "colour" ("#rrggbb") if it has
+    them.
+    """
+    words: dict[str, dict[str, str]] = {
+        str(label): {} for label in sorted({*table.names, *table.colours})
+    }
     for label, name in table.names.items():
         words[str(label)]["name"] = name
     for label, colour in table.colours.items():
@@ -139,7 +162,9 @@ def table_words(table: LabelTable) -> dict[str, dict[str, str]]:
 
 
 def table_of_words(words: Any) -> LabelTable:
-    """Convert the result of `table_words` back to a table, with colours to 1/255; invalid entries are ignored."""
+    """Convert the result of `table_words` back to a table, with colours to 1/255; invalid
+    entries are ignored.
+    """
     names, colours = {}, {}
     for label, entry in words.items() if isinstance(words, dict) else ():
         if re.fullmatch(r"\d{1,10}", str(label)) is None or not isinstance(entry, dict):
@@ -152,10 +177,16 @@ def table_of_words(words: Any) -> LabelTable:
 
 
 def coloured(table: LabelTable, labels: NDArray[np.int64]) -> LabelTable:
-    """Add the colours that labels have in pictures to the table; 0, the background, is light grey."""
+    """Add the colours that labels have in pictures to the table; 0, the background, is light
+    grey.
+    """
     those = np.unique(labels)
-    by_number = dict(zip(those.tolist(), map(tuple, colours_by_number(those).tolist()), strict=True))
-    return LabelTable(table.names, by_number | {label: own for label, own in table.colours.items() if label != 0})
+    by_number = dict(
+        zip(those.tolist(), map(tuple, colours_by_number(those).tolist()), strict=True)
+    )
+    return LabelTable(
+        table.names, by_number | {label: own for label, own in table.colours.items() if label != 0}
+    )
 
 
 def table_of_labels(table: LabelTable, labels: Iterable[int]) -> LabelTable:

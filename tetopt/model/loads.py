@@ -1,7 +1,9 @@
-"""Loads as written on a command line: supports, displacements, pressures, tractions, springs and gravity, in steps.
+"""Loads as written on a command line: supports, displacements, pressures, tractions, springs and
+gravity, in steps.
 
-Each step is a separate load case from the undeformed state; a load without a step belongs to all steps. Loads on facets
-act on their nodes by `facet_weights`, which solvers and writers share, so that all of them solve the same equations.
+Each step is a separate load case from the undeformed state; a load without a step belongs to all
+steps. Loads on facets act on their nodes by `facet_weights`, which solvers and writers share, so
+that all of them solve the same equations.
 """
 
 from __future__ import annotations
@@ -15,7 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError, Remark, warn
-from tetopt.geometry.quadratic import curved_rule, quadratic, quadratic_facet_nodes, shape_slopes, shape_values
+from tetopt.geometry.quadratic import (
+    curved_rule,
+    quadratic,
+    quadratic_facet_nodes,
+    shape_slopes,
+    shape_values,
+)
 from tetopt.geometry.topology import facets
 from tetopt.mesh import Mesh
 from tetopt.model.sets import (
@@ -30,7 +38,8 @@ from tetopt.model.sets import (
     place_of,
 )
 
-PLANE_FRACTION = 1.0 - 1e-6  # the sum of area vectors of a flat set is at least this fraction of its area
+# the sum of area vectors of a flat set is at least this fraction of its area
+PLANE_FRACTION = 1.0 - 1e-6
 SMALL_SIDE = 0.05  # of the area that a mesh shows to a side: a loaded side with less is reported
 MOST_COMPRESSION_PERCENT = 50.0  # more is beyond a linear step
 FREE_WORD = "free"  # a component of move:SET:X,Y,Z that is not prescribed
@@ -42,17 +51,20 @@ LOAD_FORMS = {
     "spring": ("SET:K", "1", "kPa/mm"),
     "gravity": ("X,Y,Z", "n", "mm/s2"),
 }
-SHOWN_LOAD_DIGITS = 10  # of a load's numbers in print, which hides rounding such as in 9.450000000000001
+# of a load's numbers in print, which hides rounding such as in 9.450000000000001
+SHOWN_LOAD_DIGITS = 10
 FACET_FORCES = ("pressure", "traction", "spring")  # kinds that act on facets from outside
 
 
 class Load(NamedTuple):
     """One load, of one kind.
 
-    - "displacement": the nodes of the set move by `numbers` (n,), mm; 0 fixes them, NaN leaves a component free.
+    - "displacement": the nodes of the set move by `numbers` (n,), mm; 0 fixes them, NaN leaves a
+      component free.
     - "pressure": (1,) kPa, acts inwards on the facets, along their undeformed normals.
     - "traction": (n,) kPa, force per undeformed area along the world's axes.
-    - "spring": (1,) kPa/mm, stiffness per area of the set's surroundings, the same in all directions.
+    - "spring": (1,) kPa/mm, stiffness per area of the set's surroundings, the same in all
+      directions.
     - "gravity": (n,) mm/s2, acts on all cells; their materials need a density.
 
     Parameters
@@ -91,24 +103,26 @@ def parse_loads(texts: Iterable[str], mesh: Mesh, sets: Sets) -> tuple[Load, ...
     Parameters
     ----------
     texts : iterable of str
-        "hold:SET"; "move:SET:X,Y,Z", mm, where a component may be "free"; "compress:5%", which fixes the side
-        with the largest z and moves the opposite one towards it by 5 % of the distance between the two, as `tetopt
-        fem` does; "pressure:SET:P", kPa, inwards; "traction:SET:X,Y,Z", kPa; "spring:SET:K", kPa/mm;
-        "gravity:X,Y,Z", mm/s2. The prefix "2/" puts a load into step 2 only; without a prefix it is in all steps.
-        Forces on the same facets add up.
+        "hold:SET"; "move:SET:X,Y,Z", mm, where a component may be "free"; "compress:5%", which
+        fixes the side with the largest z and moves the opposite one towards it by 5 % of the
+        distance between the two, as `tetopt fem` does; "pressure:SET:P", kPa, inwards;
+        "traction:SET:X,Y,Z", kPa; "spring:SET:K", kPa/mm; "gravity:X,Y,Z", mm/s2. The prefix "2/"
+        puts a load into step 2 only; without a prefix it is in all steps. Forces on the same facets
+        add up.
     mesh : Mesh
     sets : Sets
 
     Raises
     ------
     InputError
-        Invalid words or numbers; an unknown set; missing step numbers; a component of a node's displacement that is
-        prescribed twice in a step; forces on facets between two cells.
+        Invalid words or numbers; an unknown set; missing step numbers; a component of a node's
+        displacement that is prescribed twice in a step; forces on facets between two cells.
 
     Warns
     -----
     UserWarning
-        A loaded side is far smaller than the mesh, as where the image's box cuts off a brain's stem.
+        A loaded side is far smaller than the mesh, as where the image's box cuts off a brain's
+        stem.
     """
     loads = tuple(load for text in texts for load in _loads(text, mesh, sets))
     check_steps(loads)
@@ -116,7 +130,9 @@ def parse_loads(texts: Iterable[str], mesh: Mesh, sets: Sets) -> tuple[Load, ...
         if load.kind in FACET_FORCES:
             _check_outer(load, mesh, sets)
     for step in range(1, count_of_steps(loads) + 1):
-        _check_apart([load for load in in_step(loads, step) if load.kind == "displacement"], mesh, sets)
+        _check_apart(
+            [load for load in in_step(loads, step) if load.kind == "displacement"], mesh, sets
+        )
     sides = {name for pair in FACE_NAMES[mesh.ndim] for name in pair}
     for name in dict.fromkeys(load.set_name for load in loads if load.set_name in sides):
         _warn_of_small(name, mesh, sets)
@@ -140,12 +156,14 @@ def check_steps(loads: Iterable[Load]) -> None:
     for expected, number in enumerate(numbers, start=1):
         if number != expected:
             raise InputError(
-                f"load: some loads are in step {numbers[-1]}, but none in step {expected}; number steps from 1"
+                f"load: some loads are in step {numbers[-1]}, but none in step {expected}; "
+                "number steps from 1"
             )
 
 
 def parse_load(text: str, ndim: int) -> Load:
-    """Parse a load, see `parse_loads`, without looking up sets; "compress" is kept as a kind, in percent.
+    """Parse a load, see `parse_loads`, without looking up sets; "compress" is kept as a kind, in
+    percent.
 
     Raises
     ------
@@ -158,7 +176,11 @@ def parse_load(text: str, ndim: int) -> Load:
         return Load("displacement", rest, np.zeros(ndim), step)
     if kind == "compress":
         percent = finite_numbers(rest.removesuffix("%"))
-        if not rest.endswith("%") or len(percent) != 1 or not 0.0 < percent[0] <= MOST_COMPRESSION_PERCENT:
+        if (
+            not rest.endswith("%")
+            or len(percent) != 1
+            or not 0.0 < percent[0] <= MOST_COMPRESSION_PERCENT
+        ):
             limits = f"above 0 and up to {MOST_COMPRESSION_PERCENT:g}"
             raise InputError(f'load: expected compress:P% with P {limits}, got "{text}"')
         return Load(kind, "", percent, step)
@@ -178,7 +200,8 @@ def parse_load(text: str, ndim: int) -> Load:
 
 
 def load_words(load: Load, digits: int = 17) -> str:
-    """Format a load for `parse_loads`, exactly by default, or with fewer significant digits for display.
+    """Format a load for `parse_loads`, exactly by default, or with fewer significant digits for
+    display.
 
     Examples
     --------
@@ -193,7 +216,8 @@ def load_words(load: Load, digits: int = 17) -> str:
     kind = "move" if load.kind == "displacement" else load.kind
     name = "" if load.kind == "gravity" else f"{load.set_name}:"
     numbers = [
-        FREE_WORD if np.isnan(number) else repr(float(f"{number:.{digits}g}")) for number in load.numbers.tolist()
+        FREE_WORD if np.isnan(number) else repr(float(f"{number:.{digits}g}"))
+        for number in load.numbers.tolist()
     ]
     return f"{prefix}{kind}:{name}{','.join(numbers)}"
 
@@ -204,7 +228,9 @@ def _step_of(text: str) -> tuple[int, str]:
     if not slash or ":" in prefix:
         return 0, text
     if not re.fullmatch("[1-9][0-9]{0,3}", prefix):
-        raise InputError(f'load: expected a step of 1 or more before the slash, as in 2/{words}, got "{text}"')
+        raise InputError(
+            f'load: expected a step of 1 or more before the slash, as in 2/{words}, got "{text}"'
+        )
     return int(prefix), words
 
 
@@ -212,7 +238,9 @@ def _moved(text: str) -> NDArray[np.float64]:
     """Parse comma-separated numbers, NaN for the word free; empty for any other text."""
     parts = [part.strip() for part in text.split(",")]
     is_free = np.array([part == FREE_WORD for part in parts])
-    numbers = finite_numbers(",".join("0" if free else part for part, free in zip(parts, is_free, strict=True)))
+    numbers = finite_numbers(
+        ",".join("0" if free else part for part, free in zip(parts, is_free, strict=True))
+    )
     return np.where(is_free, np.nan, numbers) if len(numbers) else numbers
 
 
@@ -220,11 +248,14 @@ def _loads(text: str, mesh: Mesh, sets: Sets) -> list[Load]:
     load = parse_load(text, mesh.ndim)
     if load.kind == "compress":
         return _compression(load, mesh, sets)
-    return [load if load.kind == "gravity" else load._replace(set_name=known_set(load.set_name, sets))]
+    return [
+        load if load.kind == "gravity" else load._replace(set_name=known_set(load.set_name, sets))
+    ]
 
 
 def known_set(name: str, sets: Sets) -> str:
-    """Return the name of the facet set that a load names, in any case, or from an interface's other side.
+    """Return the name of the facet set that a load names, in any case, or from an interface's other
+    side.
 
     Raises
     ------
@@ -245,7 +276,8 @@ def _compression(load: Load, mesh: Mesh, sets: Sets) -> list[Load]:
     low, high = FACE_NAMES[mesh.ndim][-1]
     if missing := [name for name in (low, high) if name not in sets.facets]:
         raise InputError(
-            f"load: compress moves {low} towards {high}, but the mesh has no facets {' or '.join(missing)}; use "
+            f"load: compress moves {low} towards {high}, but the mesh has no facets "
+            f"{' or '.join(missing)}; use "
             f"hold:SET and move:SET:X,Y,Z with sets of {', '.join(sets.facets)}"
         )
     push = 0.01 * float(load.numbers[0]) * _across(mesh, sets, low, high)
@@ -256,14 +288,21 @@ def _compression(load: Load, mesh: Mesh, sets: Sets) -> list[Load]:
 
 
 def _across(mesh: Mesh, sets: Sets, low: str, high: str) -> NDArray[np.float64]:
-    """Return the vector from the outermost node of one side to that of the opposite, along `_upwards`, (n,) mm."""
+    """Return the vector from the outermost node of one side to that of the opposite, along
+    `_upwards`, (n,) mm.
+    """
     upwards = _upwards(mesh, sets, low, high)
-    bottom, top = ((mesh.points[nodes_of(mesh, sets.facets[name])] * upwards).sum(axis=1) for name in (low, high))
+    bottom, top = (
+        (mesh.points[nodes_of(mesh, sets.facets[name])] * upwards).sum(axis=1)
+        for name in (low, high)
+    )
     return upwards * float(top.max() - bottom.min()) + 0.0  # + 0.0: no -0
 
 
 def _upwards(mesh: Mesh, sets: Sets, low: str, high: str) -> NDArray[np.float64]:
-    """Return the direction from one side to the opposite, (n,): the normal of a flat side, else the world's axis."""
+    """Return the direction from one side to the opposite, (n,): the normal of a flat side, else
+    the world's axis.
+    """
     for name, sign in ((low, -1.0), (high, 1.0)):
         areas = area_vectors(mesh, sets.facets[name])
         total = sign * areas.sum(axis=0)
@@ -280,14 +319,20 @@ def _warn_of_small(name: str, mesh: Mesh, sets: Sets) -> None:
     if size == 0.0 or BOUNDARY_SET not in sets.facets:
         return
     normal = total / size
-    share = size / float(np.maximum((area_vectors(mesh, sets.facets[BOUNDARY_SET]) * normal).sum(axis=1), 0.0).sum())
+    share = size / float(
+        np.maximum((area_vectors(mesh, sets.facets[BOUNDARY_SET]) * normal).sum(axis=1), 0.0).sum()
+    )
     if share < SMALL_SIDE:
         count, along = len(sets.facets[name]), (mesh.points * normal).sum(axis=1)
         vectors = (mesh.points[along.argmax()], normal, [SIDE_DEPTH * np.ptp(along)])
         plane = ":".join(",".join(f"{number + 0.0:.4g}" for number in each) for each in vectors)
-        what = f"{count} facet{'s' * (count > 1)}, {100.0 * share:.2g} % of the area that the mesh shows to that side"
+        what = (
+            f"{count} facet{'s' * (count > 1)}, {100.0 * share:.2g} % of the area that the "
+            "mesh shows to that side"
+        )
         warn(
-            f'load: set "{name}" is only {what}; hold or move a larger set instead, such as that of `sets` '
+            f'load: set "{name}" is only {what}; hold or move a larger set instead, such as that '
+            "of `sets` "
             f'"base=plane:{plane}"',
             Remark,
         )
@@ -297,7 +342,8 @@ def _check_outer(load: Load, mesh: Mesh, sets: Sets) -> None:
     rows, shared = sets.facets[load.set_name], facets(mesh.cells)
     if inner := int((shared.n_cells[shared.of_cell[rows[:, 0], rows[:, 1]]] > 1).sum()):
         raise InputError(
-            f'load: {inner} of the {len(rows)} facets of "{load.set_name}" lie between two cells, where no external '
+            f'load: {inner} of the {len(rows)} facets of "{load.set_name}" lie between two '
+            "cells, where no external "
             f"{load.kind} can act; use a boundary set, mesh only one side (`mask`), or move the set"
         )
 
@@ -310,7 +356,8 @@ def _check_apart(loads: list[Load], mesh: Mesh, sets: Sets) -> None:
         twice = (is_prescribed[nodes] & components).any(axis=1)
         if twice.any():
             raise InputError(
-                f'load: {int(twice.sum())} nodes of set "{load.set_name}" already have a prescribed displacement from '
+                f'load: {int(twice.sum())} nodes of set "{load.set_name}" already have a '
+                "prescribed displacement from "
                 "another set; use disjoint sets, such as `sets` NAME=plane:X,Y,Z:NX,NY,NZ:D"
             )
         is_prescribed[nodes] |= components
@@ -319,11 +366,14 @@ def _check_apart(loads: list[Load], mesh: Mesh, sets: Sets) -> None:
 # Forces on facets
 
 
-def facet_weights(mesh: Mesh, rows: NDArray[np.int64], order: int = 1) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the nodes of facets and the integrals of their shape functions over the facets, (K, w) each.
+def facet_weights(
+    mesh: Mesh, rows: NDArray[np.int64], order: int = 1
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the nodes of facets and the integrals of their shape functions over the facets, (K, w)
+    each.
 
-    These are the nodal weights of a constant traction, mm2 (in 2-D mm, per mm of thickness); see Zienkiewicz and
-    Taylor, The Finite Element Method, volume 1, on consistent nodal forces.
+    These are the nodal weights of a constant traction, mm2 (in 2-D mm, per mm of thickness); see
+    Zienkiewicz and Taylor, The Finite Element Method, volume 1, on consistent nodal forces.
 
     Parameters
     ----------
@@ -331,9 +381,10 @@ def facet_weights(mesh: Mesh, rows: NDArray[np.int64], order: int = 1) -> tuple[
     rows : (K, 2) int64
         Facets, see `tetopt.model.sets`.
     order : {1, 2}
-        Nodes of order 2 are rows of `tetopt.geometry.quadratic.quadratic`. In 3-D the midpoints of a facet's edges get
-        a third of its area each, and the corners nothing; in 2-D the length L of an edge is divided by Simpson's rule,
-        L/6, L/6 and 4 L/6 in the middle. For order 1 all corners get the same part. Curved facets are integrated with
+        Nodes of order 2 are rows of `tetopt.geometry.quadratic.quadratic`. In 3-D the midpoints of
+        a facet's edges get a third of its area each, and the corners nothing; in 2-D the length L
+        of an edge is divided by Simpson's rule, L/6, L/6 and 4 L/6 in the middle. For order 1 all
+        corners get the same part. Curved facets are integrated with
         `tetopt.geometry.quadratic.curved_rule`.
     """
     if order == 2 and mesh.midpoints is not None:
@@ -345,34 +396,46 @@ def facet_weights(mesh: Mesh, rows: NDArray[np.int64], order: int = 1) -> tuple[
         fractions = np.full(mesh.ndim, 1.0 / mesh.ndim)
     else:
         nodes = quadratic_facet_nodes(quadratic(mesh.points, mesh.cells)[1], rows)
-        fractions = np.array([0.0] * 3 + [1.0 / 3.0] * 3 if mesh.ndim == 3 else [1.0 / 6.0, 1.0 / 6.0, 4.0 / 6.0])
+        fractions = np.array(
+            [0.0] * 3 + [1.0 / 3.0] * 3 if mesh.ndim == 3 else [1.0 / 6.0, 1.0 / 6.0, 4.0 / 6.0]
+        )
     return nodes, areas[:, None] * fractions
 
 
 def _curved_facets(
     mesh: Mesh, rows: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the nodes (K, w) of curved facets of order 2, shape functions (Q, w) at quadrature points, and outward
-    normals (Q, K, n) there, scaled to the area (in 2-D the length) that each point represents."""
+    """Return the nodes (K, w) of curved facets of order 2, shape functions (Q, w) at quadrature
+    points, and outward normals (Q, K, n) there, scaled to the area (in 2-D the length) that each
+    point represents.
+    """
     points, cells = quadratic(mesh.points, mesh.cells, mesh.midpoints)
     nodes = quadratic_facet_nodes(cells, rows)
     places, weights = curved_rule(mesh.ndim - 1)
     normals = np.empty((len(places), len(rows), mesh.ndim))
     for q, (slopes, weight) in enumerate(zip(shape_slopes(places, 2), weights, strict=True)):
         arms = np.einsum("ab,kai->bki", slopes[:, 1:] - slopes[:, :1], points[nodes])
-        normals[q] = weight * (0.5 * np.cross(*arms) if mesh.ndim == 3 else arms[0, :, ::-1] * (1.0, -1.0))
+        normals[q] = weight * (
+            0.5 * np.cross(*arms) if mesh.ndim == 3 else arms[0, :, ::-1] * (1.0, -1.0)
+        )
     return nodes, shape_values(places, 2), normals
 
 
-def facet_forces(mesh: Mesh, sets: Sets, load: Load, order: int = 1) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the nodes (P,), ascending, and nodal forces (P, n) of a pressure or traction, mN for a load in kPa.
+def facet_forces(
+    mesh: Mesh, sets: Sets, load: Load, order: int = 1
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the nodes (P,), ascending, and nodal forces (P, n) of a pressure or traction, mN for a
+    load in kPa.
 
     Nodes with zero weight are omitted.
     """
     rows = sets.facets[load.set_name]
     if load.kind == "pressure" and order == 2 and mesh.midpoints is not None:
         nodes, shapes, normals = _curved_facets(mesh, rows)
-        return _summed(nodes.ravel(), -load.numbers * np.einsum("qa,qki->kai", shapes, normals).reshape(-1, mesh.ndim))
+        return _summed(
+            nodes.ravel(),
+            -load.numbers * np.einsum("qa,qki->kai", shapes, normals).reshape(-1, mesh.ndim),
+        )
     nodes, weights = facet_weights(mesh, rows, order)
     if load.kind == "pressure":
         areas = area_vectors(mesh, rows)
@@ -386,14 +449,20 @@ def facet_forces(mesh: Mesh, sets: Sets, load: Load, order: int = 1) -> tuple[ND
 def spring_constants(
     mesh: Mesh, sets: Sets, load: Load, order: int = 1
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the springs to the ground: nodes (P,), ascending, and stiffness (P,), mN/mm for a load in kPa/mm."""
+    """Return the springs to the ground: nodes (P,), ascending, and stiffness (P,), mN/mm for a
+    load in kPa/mm.
+    """
     nodes, weights = facet_weights(mesh, sets.facets[load.set_name], order)
     which, total = _summed(nodes[weights != 0.0], weights[weights != 0.0][:, None])
     return which, load.numbers[0] * total[:, 0]
 
 
-def _summed(nodes: NDArray[np.int64], values: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _summed(
+    nodes: NDArray[np.int64], values: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the distinct nodes, ascending, and the sum of the rows of each, (P, w)."""
     distinct, which = np.unique(nodes, return_inverse=True)
-    columns = [np.bincount(which.ravel(), weights=column, minlength=len(distinct)) for column in values.T]
+    columns = [
+        np.bincount(which.ravel(), weights=column, minlength=len(distinct)) for column in values.T
+    ]
     return distinct, np.stack(columns, axis=1)

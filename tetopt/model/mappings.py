@@ -1,4 +1,6 @@
-"""Modulus mappings from an intensity or a label to a value such as Young's modulus, as text, files or arrays."""
+"""Modulus mappings from an intensity or a label to a value such as Young's modulus, as text,
+files or arrays.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,12 @@ MAPPED_OPTIONS = ("young", "nu", "density")  # options of commands whose text is
 FILES_IN_TEXTS = (*MAPPED_OPTIONS, "merge", "label_size")  # options whose text may name a file
 NAMED_SUFFIXES = (".toml", ".csv")  # of that file
 
-ModulusMapping = Callable[[NDArray[np.float64]], ArrayLike] | Sequence[Sequence[float]] | NDArray[np.floating] | None
+ModulusMapping = (
+    Callable[[NDArray[np.float64]], ArrayLike]
+    | Sequence[Sequence[float]]
+    | NDArray[np.floating]
+    | None
+)
 
 
 class ByLabel(NamedTuple):
@@ -54,8 +61,9 @@ def mapped_values(mapping: ModulusMapping, intensities: ArrayLike) -> NDArray[np
     Parameters
     ----------
     mapping : callable, (K, 2) table or None
-        A function of a float64 array; or pairs (intensity, value) with strictly increasing intensities, interpolated
-        linearly and constant beyond the ends; or None for the intensity itself.
+        A function of a float64 array; or pairs (intensity, value) with strictly increasing
+        intensities, interpolated linearly and constant beyond the ends; or None for the intensity
+        itself.
     intensities : array of real numbers
 
     Raises
@@ -72,7 +80,8 @@ def mapped_values(mapping: ModulusMapping, intensities: ArrayLike) -> NDArray[np
     values = np.asarray(mapping(intensities), dtype=np.float64)
     if values.shape != intensities.shape:
         raise InputError(
-            f"mapping: expected a function that returns one value for each intensity, got shape {values.shape} "
+            "mapping: expected a function that returns one value for each intensity, got shape "
+            f"{values.shape} "
             f"for shape {intensities.shape}"
         )
     return values
@@ -84,8 +93,9 @@ def young_from(mapping: ModulusMapping, intensities: ArrayLike) -> NDArray[np.fl
     Raises
     ------
     InputError
-        For the reasons of `mapped_values`; a modulus is negative or not finite. A modulus of 0 is accepted, as empty
-        space inside a cell; a cell with only such voxels is rejected when the stiffness matrix is built.
+        For the reasons of `mapped_values`; a modulus is negative or not finite. A modulus of 0 is
+        accepted, as empty space inside a cell; a cell with only such voxels is rejected when the
+        stiffness matrix is built.
 
     Examples
     --------
@@ -100,8 +110,10 @@ def young_from(mapping: ModulusMapping, intensities: ArrayLike) -> NDArray[np.fl
         pairs = zip(young[is_bad][first_of[:3]], at[:3], strict=True)
         first = ", ".join(f"{modulus:g} at intensity {intensity:g}" for modulus, intensity in pairs)
         raise InputError(
-            f"modulus: expected 0 kPa or more, got {int(is_bad.sum())} invalid values, such as {first}; "
-            f"give a modulus mapping (`young`) that is positive from {intensities.min():g} to {intensities.max():g}, "
+            f"modulus: expected 0 kPa or more, got {int(is_bad.sum())} invalid values, such as "
+            f"{first}; "
+            f"give a modulus mapping (`young`) that is positive from {intensities.min():g} to "
+            f"{intensities.max():g}, "
             "or leave out other tissue (`mask`)"
         )
     return young
@@ -125,7 +137,9 @@ def parse_table(text: str) -> list[tuple[float, float]]:
     except ValueError:
         pairs = []
     if not pairs or any(len(pair) != 2 for pair in pairs):
-        raise InputError(f'mapping: expected pairs intensity:value, such as "0:1,100:5.5", got "{text}"')
+        raise InputError(
+            f'mapping: expected pairs intensity:value, such as "0:1,100:5.5", got "{text}"'
+        )
     return [(pair[0], pair[1]) for pair in pairs]
 
 
@@ -150,11 +164,15 @@ def parse_labels(text: str) -> ByLabel:
     except ValueError as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f'values by label: expected pairs such as "1=2.1,2=1.9,*=0.5", got "{text}"') from None
+        raise InputError(
+            f'values by label: expected pairs such as "1=2.1,2=1.9,*=0.5", got "{text}"'
+        ) from None
 
 
 def _by_label(pairs: list[tuple[str, float]]) -> ByLabel:
-    """Convert pairs to values by label; ValueError for an invalid label, InputError for a label named twice."""
+    """Convert pairs to values by label; ValueError for an invalid label, InputError for a label
+    named twice.
+    """
     values: dict[int | str, float] = {}
     rest: float | None = None
     for text, value in pairs:
@@ -170,7 +188,9 @@ def _by_label(pairs: list[tuple[str, float]]) -> ByLabel:
 
 
 def _label_of(text: str) -> int | str:
-    """Parse a label or the name of one; ValueError for an empty text and for a number that is not whole."""
+    """Parse a label or the name of one; ValueError for an empty text and for a number that is
+    not whole.
+    """
     if not text:
         raise ValueError("a label without a name")
     try:
@@ -190,7 +210,9 @@ def parse_mapping(text: str) -> ModulusMapping:
     """
     mapping = parse_any_mapping(text)
     if isinstance(mapping, ByLabel):
-        raise InputError(f'mapping: expected a mapping of the intensity, got values by label, "{text}"')
+        raise InputError(
+            f'mapping: expected a mapping of the intensity, got values by label, "{text}"'
+        )
     return parse_formula(text) if isinstance(mapping, float) else mapping
 
 
@@ -200,8 +222,9 @@ def parse_any_mapping(text: str, quantity: str = "young") -> ModulusMapping | By
     Parameters
     ----------
     text : str
-        A number; a table of intensities, "0:1,100:5.5"; values by label or name, "1=2.1,liver=1.9,*=0.5"; a formula of
-        h (`parse_formula`); or a file named .toml or .csv (`load_mapping`).
+        A number; a table of intensities, "0:1,100:5.5"; values by label or name,
+        "1=2.1,liver=1.9,*=0.5"; a formula of h (`parse_formula`); or a file named .toml or .csv
+        (`load_mapping`).
     quantity : str
         The file's column.
 
@@ -221,23 +244,26 @@ def parse_any_mapping(text: str, quantity: str = "young") -> ModulusMapping | By
 
 
 def named_file(text: str) -> Path | None:
-    """Return the file that the text of an option in `FILES_IN_TEXTS` names; None if it names no file."""
+    """Return the file that the text of an option in `FILES_IN_TEXTS` names; None if it names no
+    file.
+    """
     return Path(text) if text.lower().endswith(NAMED_SUFFIXES) else None
 
 
 def load_mapping(path: Path, quantity: str = "young") -> ModulusMapping | ByLabel:
-    """Load a mapping from a file with two or more columns: lists in TOML, or CSV with names in the first row.
+    """Load a mapping from a file with two or more columns: lists in TOML, or CSV with names in the
+    first row.
 
     Commas, semicolons or tabs separate the columns of CSV.
 
-    One column is "intensity", or "label" (numbers or names, "*" for all others), or "name" instead; another is the
-    quantity, such as "young" (kPa) or "nu".
+    One column is "intensity", or "label" (numbers or names, "*" for all others), or "name" instead;
+    another is the quantity, such as "young" (kPa) or "nu".
 
     Raises
     ------
     InputError
-        The file does not exist or has another format; columns are missing, differ in length or are not numbers;
-        intensities do not increase.
+        The file does not exist or has another format; columns are missing, differ in length or are
+        not numbers; intensities do not increase.
     """
     try:
         columns = _columns(path)
@@ -246,27 +272,40 @@ def load_mapping(path: Path, quantity: str = "young") -> ModulusMapping | ByLabe
             keys = ["name"]
         if len(keys) != 1 or quantity not in columns:
             raise InputError(
-                f'{path}: expected columns "{quantity}" and one of "intensity", "label" and "name", found '
+                f'{path}: expected columns "{quantity}" and one of "intensity", "label" and '
+                '"name", found '
                 f"{', '.join(map(str, columns)) or 'none'}"
             )
         if len(columns[keys[0]]) != len(columns[quantity]):
-            counts = f"{len(columns[keys[0]])} of {keys[0]} and {len(columns[quantity])} of {quantity}"
+            counts = (
+                f"{len(columns[keys[0]])} of {keys[0]} and {len(columns[quantity])} of {quantity}"
+            )
             raise InputError(f"{path}: expected columns of the same length, got {counts}")
         values = [_number(value) for value in columns[quantity]]
         if keys != ["intensity"]:
-            return _by_label([(str(label), value) for label, value in zip(columns[keys[0]], values, strict=True)])
-        return _checked_pairs([(_number(h), value) for h, value in zip(columns["intensity"], values, strict=True)])
+            return _by_label(
+                [(str(label), value) for label, value in zip(columns[keys[0]], values, strict=True)]
+            )
+        return _checked_pairs(
+            [(_number(h), value) for h, value in zip(columns["intensity"], values, strict=True)]
+        )
     except InputError as error:
-        raise error if str(error).startswith(str(path)) else InputError(f"{path}: {error}") from error
+        raise (
+            error if str(error).startswith(str(path)) else InputError(f"{path}: {error}")
+        ) from error
     except (ValueError, TypeError, csv.Error, RecursionError) as error:
-        raise InputError(f"{path}: expected columns of numbers ({' '.join(str(error).split())})") from error
+        raise InputError(
+            f"{path}: expected columns of numbers ({' '.join(str(error).split())})"
+        ) from error
 
 
 def _number(value: Any) -> float:
     """Convert to float; InputError for a decimal comma, which is common in CSV files."""
     if isinstance(value, str) and re.fullmatch(r"\s*[+-]?\d+,\d+\s*", value):
         text = value.strip()
-        raise InputError(f"expected numbers with a decimal point; write {text.replace(',', '.')} for {text}")
+        raise InputError(
+            f"expected numbers with a decimal point; write {text.replace(',', '.')} for {text}"
+        )
     return float(value)
 
 
@@ -293,7 +332,10 @@ def _columns(path: Path) -> dict[str, list[Any]]:
 def _toml_columns(path: Path) -> dict[str, list[Any]]:
     columns = toml_of(path, "table")
     if wrong := [name for name, column in columns.items() if not isinstance(column, list)]:
-        raise InputError(f'{path}: expected lists of numbers, but "{wrong[0]}" is {type(columns[wrong[0]]).__name__}')
+        raise InputError(
+            f'{path}: expected lists of numbers, but "{wrong[0]}" is '
+            f"{type(columns[wrong[0]]).__name__}"
+        )
     return columns
 
 
@@ -321,7 +363,8 @@ def checked_young(young: NDArray[np.float64]) -> NDArray[np.float64]:
     if len(bad):
         first = ", ".join(f"{young[j]:g} in cell {j}" for j in bad[:3])
         raise InputError(
-            f"young: expected moduli above 0 kPa, got {len(bad)} invalid values, the first {first}; "
+            f"young: expected moduli above 0 kPa, got {len(bad)} invalid values, the first "
+            f"{first}; "
             'give empty space a small modulus, as in `young` "0:0.1,255:6"'
         )
     return young
@@ -334,14 +377,17 @@ def _checked_table(mapping: ArrayLike) -> NDArray[np.float64]:
     except (TypeError, ValueError) as error:
         raise InputError(f"mapping: expected pairs (intensity, kPa), got {mapping!r}") from error
     if table.ndim != 2 or table.shape[1] != 2 or len(table) == 0:
-        raise InputError(f"mapping: expected pairs (intensity, kPa), got an array of shape {table.shape}")
+        raise InputError(
+            f"mapping: expected pairs (intensity, kPa), got an array of shape {table.shape}"
+        )
     if not np.isfinite(table).all():
         raise InputError(f"mapping: expected finite intensities and moduli, got {table.tolist()}")
     falls = np.flatnonzero(np.diff(table[:, 0]) <= 0.0)
     if len(falls):
         k = int(falls[0])
         raise InputError(
-            f"mapping: intensities must increase, got {table[k, 0]:g} and then {table[k + 1, 0]:g}; "
+            f"mapping: intensities must increase, got {table[k, 0]:g} and then "
+            f"{table[k + 1, 0]:g}; "
             "sort the pairs and give each intensity once"
         )
     return table

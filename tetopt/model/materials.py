@@ -1,4 +1,5 @@
-"""Materials: Young's modulus and Poisson's ratio of each cell, and their grouping into fewer materials.
+"""Materials: Young's modulus and Poisson's ratio of each cell, and their grouping into fewer
+materials.
 
 Isotropic linear elasticity at the undeformed state, which one modulus per cell, Eq. (2), describes.
 """
@@ -16,7 +17,8 @@ from tetopt.errors import InputError, Remark, warn
 from tetopt.model.labels import label_words, labels_named
 from tetopt.model.mappings import ByLabel, checked_young
 
-DEFAULT_NU = 0.45  # Poisson's ratio of soft tissue that linear cells still represent: they lock closer to 0.5
+# Poisson's ratio of soft tissue that linear cells still represent: they lock closer to 0.5
+DEFAULT_NU = 0.45
 LABELS_LISTED = 8  # of labels without cells, in a message
 Spacing = Literal["equal", "quantile", "log"]
 SPACINGS = get_args(Spacing)
@@ -77,7 +79,9 @@ class Materials(NamedTuple):
     density: NDArray[np.float64] | None = None
 
 
-def materials(young: ArrayLike, nu: ArrayLike, n_cells: int, density: ArrayLike | None = None) -> Materials:
+def materials(
+    young: ArrayLike, nu: ArrayLike, n_cells: int, density: ArrayLike | None = None
+) -> Materials:
     """Group cells of equal modulus, ratio and density into materials.
 
     Parameters
@@ -99,7 +103,8 @@ def materials(young: ArrayLike, nu: ArrayLike, n_cells: int, density: ArrayLike 
     if len(outside):
         raise InputError(
             f"nu: expected -1 < nu < 0.5, got other values in {len(outside)} cells, the first "
-            f"{columns[1][outside[0]]:g} in cell {outside[0]}; for nearly incompressible tissue use 0.45 to 0.49"
+            f"{columns[1][outside[0]]:g} in cell {outside[0]}; for nearly incompressible tissue "
+            "use 0.45 to 0.49"
         )
     if density is not None:
         columns.append(_checked_density(_of_cells("density", density, n_cells)))
@@ -126,9 +131,13 @@ def without_moduli(table: Materials) -> Materials:
 
 
 def density_of(table: Materials | None) -> NDArray[np.float64]:
-    """Return the density of each material, (K,) kg/m3; InputError if there is none, because gravity needs it."""
+    """Return the density of each material, (K,) kg/m3; InputError if there is none, because
+    gravity needs it.
+    """
     if table is None or table.density is None:
-        raise InputError("gravity: the cells have no density; give `density` in kg/m3, such as 1000")
+        raise InputError(
+            "gravity: the cells have no density; give `density` in kg/m3, such as 1000"
+        )
     return table.density
 
 
@@ -137,7 +146,9 @@ def _of_cells(name: str, values: ArrayLike, n_cells: int) -> NDArray[np.float64]
     if array.ndim == 0:
         return np.full(n_cells, float(array))
     if array.shape != (n_cells,):
-        raise InputError(f"{name}: expected one value for each of {n_cells} cells, got shape {array.shape}")
+        raise InputError(
+            f"{name}: expected one value for each of {n_cells} cells, got shape {array.shape}"
+        )
     return array
 
 
@@ -171,27 +182,39 @@ def by_label(
     for key, value in mapping.values.items():
         for label in [key] if isinstance(key, int) else labels_named(key, names):
             if label in values:
-                raise InputError(f"values by label: label {label_words(label, names)} has two values; give only one")
+                raise InputError(
+                    f"values by label: label {label_words(label, names)} has two values; give "
+                    "only one"
+                )
             values[label] = value
     kinds, which = np.unique(labels, return_inverse=True)
     if unused := [label_words(label, names) for label in values if label not in kinds]:
         few, own = (", ".join(map(str, each[:LABELS_LISTED])) for each in (unused, kinds))
-        text = f"values by label: no cell has label {few} ({len(unused)} of {len(values)}); the mesh has {own}"
+        text = (
+            f"values by label: no cell has label {few} ({len(unused)} of {len(values)}); the "
+            f"mesh has {own}"
+        )
         warn(text, Remark)
     missing = [label_words(label, names) for label in kinds.tolist() if label not in values]
     if missing and mapping.rest is None:
         raise InputError(
-            f"values by label: got {', '.join(map(str, mapping.values))}, but the mesh also has {', '.join(missing)} "
+            f"values by label: got {', '.join(map(str, mapping.values))}, but the mesh also has "
+            f"{', '.join(missing)} "
             f"({len(missing)} more); give values for these, or *=VALUE for all others"
         )
-    return np.array([values.get(label, mapping.rest) for label in kinds.tolist()], dtype=np.float64)[which.ravel()]
+    return np.array(
+        [values.get(label, mapping.rest) for label in kinds.tolist()], dtype=np.float64
+    )[which.ravel()]
 
 
-def binned(exact: Materials, volumes: NDArray[np.float64], count: int, spacing: Spacing = "equal") -> Materials:
+def binned(
+    exact: Materials, volumes: NDArray[np.float64], count: int, spacing: Spacing = "equal"
+) -> Materials:
     """Group moduli into at most `count` bins.
 
-    The modulus of a bin is the mean over its cells, weighted by volume. Ratios and densities are unchanged if there are
-    at most `count` of them; otherwise they are binned in the same way. A material is a combination of bins.
+    The modulus of a bin is the mean over its cells, weighted by volume. Ratios and densities are
+    unchanged if there are at most `count` of them; otherwise they are binned in the same way. A
+    material is a combination of bins.
 
     Parameters
     ----------
@@ -215,7 +238,11 @@ def binned(exact: Materials, volumes: NDArray[np.float64], count: int, spacing: 
     fewer = _bin_means(young, volumes, count, spacing)
     linear: Spacing = "quantile" if spacing == "quantile" else "equal"
     ratios = _bin_means(nu, volumes, count, linear)
-    density = None if exact.density is None else _bin_means(exact.density[exact.of_cell], volumes, count, linear)
+    density = (
+        None
+        if exact.density is None
+        else _bin_means(exact.density[exact.of_cell], volumes, count, linear)
+    )
     off = np.abs(fewer - young) / young
     error = BinningError(float((off * volumes).sum() / volumes.sum()), float(off.max()))
     return materials(fewer, ratios, len(young), density)._replace(binning=error)

@@ -13,7 +13,14 @@ from tetopt.geometry.quadratic import of_order, quadratic_facet_nodes
 from tetopt.interop import conversions, notebook
 from tetopt.interop.conversions import MESHIO_KINDS, VTK_KINDS
 from tetopt.mesh import Mesh
-from tetopt.model.fields import GAUSS_MODULI, HALF_TURN, NODE_MODULI, half_turned_fields, node_field, scaled_fields
+from tetopt.model.fields import (
+    GAUSS_MODULI,
+    HALF_TURN,
+    NODE_MODULI,
+    half_turned_fields,
+    node_field,
+    scaled_fields,
+)
 from tetopt.model.loads import FACET_FORCES, SHOWN_LOAD_DIGITS, Load, load_words
 from tetopt.model.materials import Materials
 from tetopt.model.sets import Sets, facet_triples
@@ -43,15 +50,19 @@ STRESS_UNITS = {
     "Pa": Units(1e-3, "m", 1e3, "N", "J", "kg", 1e3),
 }
 WATER_DENSITY = 1000.0  # kg/m3
-# Values a thousand times off from any tissue are most likely in another unit. Soft tissue has 0.1 to a few hundred kPa:
-# in Pa it lies within the first range, where otherwise only cartilage does, and in MPa it lies below the third number.
+# Values a thousand times off from any tissue are most likely in another unit. Soft tissue has 0.1
+# to a few hundred kPa: in Pa it lies within the first range, where otherwise only cartilage does,
+# and in MPa it lies below the third number.
 PASCAL_RANGE = (1e3, 1e5)
 MEGAPASCAL_MOST = 0.05
 GRAM_DENSITY_MOST = 20.0  # kg/m3: gold has about this many g/cm3, and only gases have so few kg/m3
-METRE_GRAVITY = (1.0, 100.0)  # mm/s2: from the moon's to ten times the earth's gravity if taken as m/s2
-LOCKING_NU = 0.45  # above this, linear cells are far worse than quadratic ones, see docs/understand/order.md
+# mm/s2: from the moon's to ten times the earth's gravity if taken as m/s2
+METRE_GRAVITY = (1.0, 100.0)
+# above this, linear cells are far worse than quadratic ones, see docs/understand/order.md
+LOCKING_NU = 0.45
 SPACES = ("ras", "lps")  # conventions of the world's axes
-ON_PREFIX, IN_PREFIX = "on_", "in_"  # prefixes of data that are 1 on the nodes of a facet set, in the cells of a set
+# prefixes of data that are 1 on the nodes of a facet set, in the cells of a set
+ON_PREFIX, IN_PREFIX = "on_", "in_"
 
 
 class Model(NamedTuple):
@@ -70,7 +81,8 @@ class Model(NamedTuple):
     loads : tuple of Load
         Supports, displacements, pressures, tractions, springs, gravity.
     order : {1, 2}
-        2: quadratic cells, with straight edges unless the mesh has midpoints, see `tetopt.geometry.quadratic`.
+        2: quadratic cells, with straight edges unless the mesh has midpoints, see
+        `tetopt.geometry.quadratic`.
     units : {"kPa", "MPa", "Pa"}
         Unit of moduli and pressures, see `STRESS_UNITS`.
     space : {"ras", "lps"}
@@ -114,15 +126,30 @@ class Model(NamedTuple):
         """Show the model in a notebook, with the middle section shaded by mean or modulus."""
         mesh, table = self.mesh, self.materials
         rows = notebook.mesh_rows(mesh.points, mesh.cells)
-        rows += [("order", str(self.order)), ("sets of facets", ", ".join(self.sets.facets) or "none")]
+        rows += [
+            ("order", str(self.order)),
+            ("sets of facets", ", ".join(self.sets.facets) or "none"),
+        ]
         rows += [("sets of cells", ", ".join(self.sets.cells) or "none")]
         if table is not None:
             rows += [("materials", str(len(table.young)))]
-            rows += [("Young's modulus", f"{table.young.min():.4g} to {table.young.max():.4g} {self.units}")]
+            rows += [
+                (
+                    "Young's modulus",
+                    f"{table.young.min():.4g} to {table.young.max():.4g} {self.units}",
+                )
+            ]
             rows += [("Poisson's ratio", f"{table.nu.min():.4g} to {table.nu.max():.4g}")]
-        rows += [("loads", ", ".join(load_words(load, SHOWN_LOAD_DIGITS) for load in self.loads) or "none")]
+        rows += [
+            (
+                "loads",
+                ", ".join(load_words(load, SHOWN_LOAD_DIGITS) for load in self.loads) or "none",
+            )
+        ]
         values = self.cell_data.get("mean") if table is None else table.young[table.of_cell]
-        return notebook.card_html("Model", rows, notebook.section_html(mesh.points, mesh.cells, values))
+        return notebook.card_html(
+            "Model", rows, notebook.section_html(mesh.points, mesh.cells, values)
+        )
 
     def to_skfem(self) -> skfem.Mesh:
         """Convert the mesh and its sets for scikit-fem; see `tetopt.model.skfem.skfem_mesh`.
@@ -135,7 +162,8 @@ class Model(NamedTuple):
         Raises
         ------
         InputError
-            The model is quadratic (choose the order of elements in scikit-fem), or scikit-fem is not installed.
+            The model is quadratic (choose the order of elements in scikit-fem), or scikit-fem is
+            not installed.
 
         Examples
         --------
@@ -149,7 +177,8 @@ class Model(NamedTuple):
         """
         if self.order != 1:
             raise InputError(
-                "to_skfem: expected linear cells, got order 2; omit the order and use P2 elements in scikit-fem"
+                "to_skfem: expected linear cells, got order 2; omit the order and use P2 "
+                "elements in scikit-fem"
             )
         return skfem_mesh(self.mesh, self.sets)
 
@@ -159,9 +188,9 @@ class Model(NamedTuple):
         Returns
         -------
         pyvista.UnstructuredGrid
-            Cells of the model's order with `cell_data` and `point_data`; for materials "young", in `units`, "nu",
-            "material" (from 1) and "density" (kg/m3); and for each set "in_NAME" (1 in its cells) or "on_NAME" (1 on
-            its nodes).
+            Cells of the model's order with `cell_data` and `point_data`; for materials "young", in
+            `units`, "nu", "material" (from 1) and "density" (kg/m3); and for each set "in_NAME" (1
+            in its cells) or "on_NAME" (1 on its nodes).
 
         Examples
         --------
@@ -173,7 +202,9 @@ class Model(NamedTuple):
         on_cells, on_nodes = grid_fields(self)
         for name, members in self.sets.cells.items():
             on_cells[f"{IN_PREFIX}{name}"] = np.isin(np.arange(len(self.mesh.cells)), members)
-        return conversions.to_pyvista(*elements(self), VTK_KINDS[self.mesh.ndim, self.order], on_cells, on_nodes)
+        return conversions.to_pyvista(
+            *elements(self), VTK_KINDS[self.mesh.ndim, self.order], on_cells, on_nodes
+        )
 
     def to_meshio(self) -> meshio.Mesh:
         """Convert the mesh for meshio, with all data of its cells and nodes.
@@ -181,8 +212,8 @@ class Model(NamedTuple):
         Returns
         -------
         meshio.Mesh
-            One block of cells of the model's order, with the same data as `to_pyvista`; sets of cells become
-            `cell_sets`, the nodes of sets of facets `point_sets`.
+            One block of cells of the model's order, with the same data as `to_pyvista`; sets of
+            cells become `cell_sets`, the nodes of sets of facets `point_sets`.
 
         Examples
         --------
@@ -192,15 +223,20 @@ class Model(NamedTuple):
         [0, 2]
         """
         on_cells, on_nodes = grid_fields(self)
-        sets = {name: np.flatnonzero(on_nodes.pop(f"{ON_PREFIX}{name}")) for name in self.sets.facets}
-        other = conversions.to_meshio(*elements(self), MESHIO_KINDS[self.mesh.ndim, self.order], on_cells, on_nodes)
+        sets = {
+            name: np.flatnonzero(on_nodes.pop(f"{ON_PREFIX}{name}")) for name in self.sets.facets
+        }
+        other = conversions.to_meshio(
+            *elements(self), MESHIO_KINDS[self.mesh.ndim, self.order], on_cells, on_nodes
+        )
         other.point_sets = sets
         other.cell_sets = {name: [members.copy()] for name, members in self.sets.cells.items()}
         return other
 
 
 def in_space(model: Model, space: str) -> Model:
-    """Convert the model to the world axes "ras" (NIfTI) or "lps" (DICOM, ITK), by a half turn about z.
+    """Convert the model to the world axes "ras" (NIfTI) or "lps" (DICOM, ITK), by a half turn about
+    z.
 
     Raises
     ------
@@ -216,8 +252,12 @@ def in_space(model: Model, space: str) -> Model:
     loads = tuple(half_turned(load) for load in model.loads)
     middles = None if model.mesh.midpoints is None else half_turn(model.mesh.midpoints)
     mesh = Mesh(half_turn(model.mesh.points), model.mesh.cells, middles)
-    cell_data, point_data = (half_turned_fields(each) for each in (model.cell_data, model.point_data))
-    return model._replace(mesh=mesh, loads=loads, space=space, cell_data=cell_data, point_data=point_data)
+    cell_data, point_data = (
+        half_turned_fields(each) for each in (model.cell_data, model.point_data)
+    )
+    return model._replace(
+        mesh=mesh, loads=loads, space=space, cell_data=cell_data, point_data=point_data
+    )
 
 
 def half_turn(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -242,7 +282,12 @@ def in_units(model: Model, units: str) -> Model:
         raise InputError(f"units: expected one of {', '.join(STRESS_UNITS)}, got {units}")
     if units == model.units:
         return model
-    old, new, mesh, table = STRESS_UNITS[model.units], STRESS_UNITS[units], model.mesh, model.materials
+    old, new, mesh, table = (
+        STRESS_UNITS[model.units],
+        STRESS_UNITS[units],
+        model.mesh,
+        model.materials,
+    )
     stress, length = old.kPa / new.kPa, old.mm / new.mm
     if length != 1.0:
         middles = None if mesh.midpoints is None else mesh.midpoints * length
@@ -260,9 +305,13 @@ def in_units(model: Model, units: str) -> Model:
 
 
 def scaled(load: Load, stress: float, length: float) -> Load:
-    """Convert a load to other units; `stress` and `length` are the numbers of new units per present unit."""
+    """Convert a load to other units; `stress` and `length` are the numbers of new units per
+    present unit.
+    """
     factor = stress if load.kind in FACET_FORCES else length
-    return load._replace(numbers=load.numbers * (factor / length if load.kind == "spring" else factor))
+    return load._replace(
+        numbers=load.numbers * (factor / length if load.kind == "spring" else factor)
+    )
 
 
 def odd_units(model: Model) -> Iterator[str]:
@@ -271,29 +320,43 @@ def odd_units(model: Model) -> Iterator[str]:
         low, high = float(table.young.min()), float(table.young.max())
         if PASCAL_RANGE[0] <= low and high <= PASCAL_RANGE[1]:
             yield (
-                f"young is {low:.4g} to {high:.4g} kPa, stiffer than soft tissue (0.1 to a few hundred kPa): if it "
+                f"young is {low:.4g} to {high:.4g} kPa, stiffer than soft tissue (0.1 to a few "
+                "hundred kPa): if it "
                 "is in Pa, divide it by 1000"
             )
         elif high < MEGAPASCAL_MOST:
             yield (
-                f"young is at most {high:.4g} kPa, softer than any tissue (0.1 kPa or more): if it is in MPa, "
+                f"young is at most {high:.4g} kPa, softer than any tissue (0.1 kPa or more): if "
+                "it is in MPa, "
                 "multiply it by 1000; `units` affects only the output file"
             )
-        if table.density is not None and (densest := float(table.density.max())) < GRAM_DENSITY_MOST:
-            yield f"density is at most {densest:.4g} kg/m3 (water: 1000): if it is in g/cm3, multiply it by 1000"
+        if (
+            table.density is not None
+            and (densest := float(table.density.max())) < GRAM_DENSITY_MOST
+        ):
+            yield (
+                f"density is at most {densest:.4g} kg/m3 (water: 1000): if it is in g/cm3, "
+                "multiply it by 1000"
+            )
     for load in model.loads:
         size = float(np.sqrt((load.numbers**2).sum()))
         if load.kind == "gravity" and METRE_GRAVITY[0] <= size <= METRE_GRAVITY[1]:
-            yield f"gravity is {size:.4g} mm/s2 (the earth's: 9810): if it is in m/s2, multiply it by 1000"
+            yield (
+                f"gravity is {size:.4g} mm/s2 (the earth's: 9810): if it is in m/s2, multiply "
+                "it by 1000"
+            )
 
 
 def locking_words(model: Model) -> str:
-    """Return a warning if linear cells are too stiff for the Poisson's ratios, else an empty text."""
+    """Return a warning if linear cells are too stiff for the Poisson's ratios, else an empty
+    text.
+    """
     largest = 0.0 if model.materials is None else float(model.materials.nu.max())
     if model.order != 1 or largest < LOCKING_NU:
         return ""
     return (
-        f"nu = {largest:g}: linear elements are too stiff near incompressibility; use quadratic elements (order 2), or "
+        f"nu = {largest:g}: linear elements are too stiff near incompressibility; use quadratic "
+        "elements (order 2), or "
         "choose them in the solver"
     )
 
@@ -308,10 +371,13 @@ def described(model: Model) -> list[str]:
         f"units: {units.length}, {model.units}, {units.force}, {units.energy}, {units.mass}, s",
     ]
     if "image" in model.about:
-        lines.append(f"image: {model.about['image']}, sha256 {model.about.get('image_sha256', 'unknown')}")
+        lines.append(
+            f"image: {model.about['image']}, sha256 {model.about.get('image_sha256', 'unknown')}"
+        )
     if model.materials is not None and (error := model.materials.binning) is not None:
         lines.append(
-            f"materials: bins, error of the modulus {error.mean:.3%} (mean by volume), {error.largest:.3%} (largest)"
+            f"materials: bins, error of the modulus {error.mean:.3%} (mean by volume), "
+            f"{error.largest:.3%} (largest)"
         )
     # A line break in a file's name would end the comment.
     return [" ".join(line.split()) for line in lines]
@@ -323,23 +389,38 @@ def elements(model: Model) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
 
 
 def mass_densities(model: Model) -> NDArray[np.float64]:
-    """Return the density of each material, (K,), in the model's units of mass and length; water's if there is none."""
+    """Return the density of each material, (K,), in the model's units of mass and length;
+    water's if there is none.
+    """
     assert model.materials is not None
     density, water = model.materials.density, STRESS_UNITS[model.units].water
-    return np.full(len(model.materials.young), water) if density is None else density / WATER_DENSITY * water
+    return (
+        np.full(len(model.materials.young), water)
+        if density is None
+        else density / WATER_DENSITY * water
+    )
 
 
 def grid_fields(model: Model) -> tuple[dict[str, NDArray], dict[str, NDArray]]:
-    """Return the fields of cells and of nodes of the model's order: data, sets of facets, and materials."""
+    """Return the fields of cells and of nodes of the model's order: data, sets of facets, and
+    materials.
+    """
     on_cells = dict(model.cell_data)
-    on_nodes = {name: node_field(values, model.mesh, model.order) for name, values in model.point_data.items()}
+    on_nodes = {
+        name: node_field(values, model.mesh, model.order)
+        for name, values in model.point_data.items()
+    }
     points, cells = elements(model)
     for name, rows in model.sets.facets.items():
         is_on = np.zeros(len(points), dtype=np.uint8)
         is_on[element_facets(cells, rows)] = 1
         on_nodes[f"{ON_PREFIX}{name}"] = is_on
     if (table := model.materials) is not None:
-        on_cells |= {"young": table.young[table.of_cell], "nu": table.nu[table.of_cell], "material": table.of_cell + 1}
+        on_cells |= {
+            "young": table.young[table.of_cell],
+            "nu": table.nu[table.of_cell],
+            "material": table.of_cell + 1,
+        }
         if table.density is not None:
             on_cells["density"] = table.density[table.of_cell]
     if model.gauss_young is not None:
@@ -350,5 +431,7 @@ def grid_fields(model: Model) -> tuple[dict[str, NDArray], dict[str, NDArray]]:
 
 
 def element_facets(cells: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the nodes of facets (K, 2) for either order: `facet_triples` or `quadratic_facet_nodes`."""
+    """Return the nodes of facets (K, 2) for either order: `facet_triples` or
+    `quadratic_facet_nodes`.
+    """
     return (quadratic_facet_nodes if cells.shape[1] in (6, 10) else facet_triples)(cells, rows)

@@ -17,9 +17,11 @@ from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.system.slabs import over_slabs
 
-EVALUATED_AT_ONCE = 1 << 16  # whose nodes' values are gathered: 30 numbers each for a vector field of order 2
+# whose nodes' values are gathered: 30 numbers each for a vector field of order 2
+EVALUATED_AT_ONCE = 1 << 16
 PLACE_STEPS = 20  # at most, for a voxel's place in a curved cell; 3 to 5 are usual
-PLACE_ROUNDING = 1e-12  # of a curved cell's edge: distance of a place from its voxel's centre at which steps end
+# of a curved cell's edge: distance of a place from its voxel's centre at which steps end
+PLACE_ROUNDING = 1e-12
 FOLDED_MISS = 1e-6  # of an edge: farther off, the cell is folded there
 
 At = Literal["cells", "nodes"]
@@ -28,21 +30,23 @@ At = Literal["cells", "nodes"]
 def field_on_image(
     mesh: Mesh, values: ArrayLike, image: Image, *, at: At | None = None, outside: float = np.nan
 ) -> NDArray[np.float64]:
-    """Evaluate a field of a mesh, such as a solver's displacement, at the voxel centres of an image.
+    """Evaluate a field of a mesh, such as a solver's displacement, at the voxel centres of an
+    image.
 
-    Each voxel belongs to one cell, exactly as in sampling (`cell_of_voxel`). It gets the value of that cell or, for
-    values at nodes, what the shape functions of order 1 or 2 give at its centre.
+    Each voxel belongs to one cell, exactly as in sampling (`cell_of_voxel`). It gets the value of
+    that cell or, for values at nodes, what the shape functions of order 1 or 2 give at its centre.
 
     Parameters
     ----------
     mesh : Mesh
         mm. For values of order 2, cells are curved if the mesh has midpoints.
     values : (M, ...), (N, ...) or (N + E, ...) array of numbers
-        One row per cell, per corner node, or per node of order 2, in the order of `tetopt.geometry.quadratic.quadratic`
-        (as in the `point_data` of a `MeshFile` and in `Solution.u`).
+        One row per cell, per corner node, or per node of order 2, in the order of
+        `tetopt.geometry.quadratic.quadratic` (as in the `point_data` of a `MeshFile` and in
+        `Solution.u`).
     image : Image
-        The voxels: any image in the mesh's world, also finer or coarser than the meshed one. Its intensities are not
-        used.
+        The voxels: any image in the mesh's world, also finer or coarser than the meshed one. Its
+        intensities are not used.
     at : {"cells", "nodes"}, optional
         What the rows belong to; only needed if there are as many cells as nodes.
     outside : float
@@ -56,8 +60,8 @@ def field_on_image(
     Raises
     ------
     InputError
-        Another number of rows, or as many cells as nodes without `at`; values that are not numbers; a curved cell that
-        is folded; or the reasons of `cell_of_voxel`.
+        Another number of rows, or as many cells as nodes without `at`; values that are not numbers;
+        a curved cell that is folded; or the reasons of `cell_of_voxel`.
 
     See Also
     --------
@@ -76,10 +80,13 @@ def field_on_image(
     if at not in (None, "cells", "nodes"):
         raise InputError(f'at: expected "cells" or "nodes", got {at!r}')
     if rows.ndim == 0 or rows.dtype.kind not in "biuf":
-        raise InputError(f"values: expected an array of numbers, got {rows.dtype} of shape {rows.shape}")
+        raise InputError(
+            f"values: expected an array of numbers, got {rows.dtype} of shape {rows.shape}"
+        )
     order = _order_of(mesh, len(rows), at)
     rows = rows.reshape(len(rows), -1).astype(np.float64)
-    # Curved edges matter for order 2 alone: as in sampling, other fields are those of straight cells.
+    # Curved edges matter for order 2 alone: as in sampling, other fields are those of straight
+    # cells.
     is_curved = order == 2 and mesh.midpoints is not None
     pieces, n_pieces = mesh.straight_pieces() if is_curved else (mesh, 1)
     owner = cell_of_voxel(image, pieces).ravel()
@@ -94,7 +101,9 @@ def field_on_image(
             part = inside[first:stop]
             own = owner[part] // n_pieces
             index = np.stack(np.unravel_index(part, image.shape), axis=1)
-            places = _places(mesh, own, image.to_world(index), nodes[cells[own]] if is_curved else None)
+            places = _places(
+                mesh, own, image.to_world(index), nodes[cells[own]] if is_curved else None
+            )
             result[part] = np.einsum("ka,kac->kc", shape_values(places, order), rows[cells[own]])
 
         n_numbers = len(inside) * cells.shape[1] * rows.shape[1]
@@ -110,18 +119,29 @@ def _order_of(mesh: Mesh, n_rows: int, at: At | None) -> int:
     counts = [(0, "cells", n_cells), (1, "nodes", n_nodes), (2, "nodes", n_nodes + n_edges)]
     orders = [order for order, where, count in counts if count == n_rows and at in (None, where)]
     if not orders:
-        kinds = f"{n_cells} cells" if at == "cells" else f"{n_nodes} nodes or {n_nodes + n_edges} of order 2"
+        kinds = (
+            f"{n_cells} cells"
+            if at == "cells"
+            else f"{n_nodes} nodes or {n_nodes + n_edges} of order 2"
+        )
         expected = kinds if at is not None else f"{n_cells} cells, {kinds}"
         raise InputError(f"values: expected a row for each of {expected}, got {n_rows}")
     if len(orders) > 1:
-        raise InputError(f'values: the mesh has {n_rows} cells and as many nodes; pass at="cells" or at="nodes"')
+        raise InputError(
+            f'values: the mesh has {n_rows} cells and as many nodes; pass at="cells" or at="nodes"'
+        )
     return orders[0]
 
 
 def _places(
-    mesh: Mesh, own: NDArray[np.int64], world: NDArray[np.float64], around: NDArray[np.float64] | None
+    mesh: Mesh,
+    own: NDArray[np.int64],
+    world: NDArray[np.float64],
+    around: NDArray[np.float64] | None,
 ) -> NDArray[np.float64]:
-    """Barycentric places (K, n+1) of points (K, n), mm, in their cells (K,), with nodes (K, A, n) if curved."""
+    """Barycentric places (K, n+1) of points (K, n), mm, in their cells (K,), with nodes (K, A,
+    n) if curved.
+    """
     corners, n = mesh.cells[own], mesh.ndim
     slopes = volume_gradients(mesh.points, corners) / volumes(mesh.points, corners)[:, None, None]
     places = np.empty((len(own), n + 1))
@@ -140,18 +160,26 @@ def _places(
         places[:, 1:] += step
         places[:, 0] -= step.sum(axis=1)
     if not miss.max() <= FOLDED_MISS:
-        raise InputError(f"mesh: curved cell {own[np.argmax(miss)]} is folded; straighten it, or mesh with order 1")
+        raise InputError(
+            f"mesh: curved cell {own[np.argmax(miss)]} is folded; straighten it, or mesh with "
+            "order 1"
+        )
     return places
 
 
 def warped_image(
-    mesh: Mesh, displacement: ArrayLike, image: Image, like: Image | None = None, *, is_nearest: bool = False,
+    mesh: Mesh,
+    displacement: ArrayLike,
+    image: Image,
+    like: Image | None = None,
+    *,
+    is_nearest: bool = False,
     outside: float = 0.0,
-) -> Image:  # fmt: skip
+) -> Image:
     """Move an image by a displacement of a mesh's nodes.
 
-    Each voxel centre within the deformed mesh gets the image's value at the place that has moved there, if that lies in
-    the image: linear between voxel centres.
+    Each voxel centre within the deformed mesh gets the image's value at the place that has moved
+    there, if that lies in the image: linear between voxel centres.
 
     Parameters
     ----------
@@ -176,7 +204,8 @@ def warped_image(
     Raises
     ------
     InputError
-        Rows for other nodes or axes; a displacement that turns cells inside out; or the reasons of `field_on_image`.
+        Rows for other nodes or axes; a displacement that turns cells inside out; or the reasons of
+        `field_on_image`.
 
     Examples
     --------
@@ -188,12 +217,21 @@ def warped_image(
     """
     for name, each in (("image", image), ("like", image if like is None else like)):
         if each.ndim != mesh.ndim:
-            raise InputError(f"{name}: expected a {mesh.ndim}-D image like the mesh, got a {each.ndim}-D one")
+            raise InputError(
+                f"{name}: expected a {mesh.ndim}-D image like the mesh, got a {each.ndim}-D one"
+            )
     if not np.isfinite(outside):
         raise InputError(f"outside: expected a finite number in a moved image, got {outside}")
-    u, like, n_nodes = np.asarray(displacement, dtype=np.float64), image if like is None else like, len(mesh.points)
+    u, like, n_nodes = (
+        np.asarray(displacement, dtype=np.float64),
+        image if like is None else like,
+        len(mesh.points),
+    )
     if u.ndim != 2 or u.shape[1] != mesh.ndim:
-        raise InputError(f"displacement: expected {mesh.ndim} numbers for each node, got an array of shape {u.shape}")
+        raise InputError(
+            f"displacement: expected {mesh.ndim} numbers for each node, got an array of shape "
+            f"{u.shape}"
+        )
     order = _order_of(mesh, len(u), "nodes")
     before = of_order(mesh.points, mesh.cells, order, mesh.midpoints)[0]
     after = before + u
@@ -209,10 +247,14 @@ def warped_image(
     is_there = ((index >= -0.5) & (index <= np.array(image.shape) - 0.5)).all(axis=1)
     inside, index = inside[is_there], index[is_there]
     if len(inside) == 0:
-        raise InputError("image: no voxel of it is inside the mesh; do both use the same world coordinates?")
+        raise InputError(
+            "image: no voxel of it is inside the mesh; do both use the same world coordinates?"
+        )
     values = np.full(prod(like.shape), outside)
     if is_nearest:
         values[inside] = image.data[tuple(nearest_voxels(image, places[inside]).T)]
     else:
-        values[inside] = scipy.ndimage.map_coordinates(image.data, index.T, np.float64, order=1, mode="nearest")
+        values[inside] = scipy.ndimage.map_coordinates(
+            image.data, index.T, np.float64, order=1, mode="nearest"
+        )
     return Image(values.reshape(like.shape), like.affine)

@@ -1,7 +1,8 @@
 """Named sets of facets and cells for boundary conditions and materials.
 
-A facet is a row (cell, k): the facet of that cell opposite its local node k. This defines its outer side, and thus the
-side of an interface. There are no sets of nodes: `nodes_of` gives the nodes of a facet set.
+A facet is a row (cell, k): the facet of that cell opposite its local node k. This defines its outer
+side, and thus the side of an interface. There are no sets of nodes: `nodes_of` gives the nodes of a
+facet set.
 """
 
 from __future__ import annotations
@@ -24,22 +25,28 @@ from tetopt.mesh import Mesh
 
 BOUNDARY_SET = "boundary"  # all facets that belong to only one cell
 MASK_SURFACE_SET = "mask_surface"  # boundary facets that are not on the faces of the image's box
-SIDE_DEPTH = 0.1  # fraction of the extent: a side off the box is the outermost tenth (a tenth of a ball's surface)
-# In RAS+: the sides of smaller and of larger world coordinate. The two axes of a slice may be any of the three.
+# fraction of the extent: a side off the box is the outermost tenth (a tenth of a ball's surface)
+SIDE_DEPTH = 0.1
+# In RAS+: the sides of smaller and of larger world coordinate. The two axes of a slice may be any
+# of the three.
 FACE_NAMES: dict[int, tuple[tuple[str, str], ...]] = {
     2: (("x_min", "x_max"), ("y_min", "y_max")),
     3: (("left", "right"), ("posterior", "anterior"), ("inferior", "superior")),
 }
-MOST_LETTERS = 72  # in a name: enough for an interface of two long names; Abaqus and CalculiX allow 80
+# in a name: enough for an interface of two long names; Abaqus and CalculiX allow 80
+MOST_LETTERS = 72
 INTERFACE_PREFIX = "interface_"  # of names of facet sets between two labels
 SIDE_KINDS = ("outer", "inner")  # of a difference of sets
-SET_NAME = re.compile(rf"[A-Za-z][A-Za-z0-9_-]{{0,{MOST_LETTERS - 1}}}")  # names that all formats support
-# Names that labels must not have: those of other labels, interfaces, and names that formats use themselves.
+# names that all formats support
+SET_NAME = re.compile(rf"[A-Za-z][A-Za-z0-9_-]{{0,{MOST_LETTERS - 1}}}")
+# Names that labels must not have: those of other labels, interfaces, and names that formats use
+# themselves.
 RESERVED_NAME = re.compile(r"label_\d+|interface_.*|material_\d+|unnamed|all_cells", re.IGNORECASE)
 
 
 class Sets(NamedTuple):
-    """Sets by name; all names differ by more than case, because some formats have one list of names for everything.
+    """Sets by name; all names differ by more than case, because some formats have one list of names
+    for everything.
 
     Parameters
     ----------
@@ -94,7 +101,8 @@ def standard_names(ndim: int) -> set[str]:
 def facet_triples(cells: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the nodes of facets (K, 2), (K, n) int64, oriented outwards from their cell.
 
-    In 3-D the normal (b - a) x (c - a) of a row (a, b, c) points outwards; in 2-D the right side of a -> b is outside.
+    In 3-D the normal (b - a) x (c - a) of a row (a, b, c) points outwards; in 2-D the right side of
+    a -> b is outside.
     """
     return cells[rows[:, :1], outward_facet_nodes(cells.shape[1] - 1)[rows[:, 1]]]
 
@@ -139,9 +147,9 @@ def standard_sets(
     ----------
     mesh : Mesh
     box : Box, optional
-        The box of the meshed image; each pair of faces is named after the world axis of its index axis
-        (`tetopt.geometry.box.world_axes`): "left" is the side of smaller x in RAS+. By default the axis-aligned
-        bounding box of the mesh.
+        The box of the meshed image; each pair of faces is named after the world axis of its index
+        axis (`tetopt.geometry.box.world_axes`): "left" is the side of smaller x in RAS+. By default
+        the axis-aligned bounding box of the mesh.
     labels : (M,) integers, optional
         Label of each cell.
     names : mapping of label to text, optional
@@ -152,11 +160,12 @@ def standard_sets(
     Returns
     -------
     Sets
-        Facets "boundary", "left", "right", "posterior", "anterior", "inferior", "superior" (in 2-D "x_min", "x_max",
-        "y_min", "y_max"), and, with a box, "mask_surface" for the boundary off its faces; sets without facets are
-        omitted. A side is the boundary on that face of the box; if there is none, as on an organ within the box, it is
-        the set of facets in the outermost tenth of the mesh along the world axis that mainly face in this direction.
-        With labels, the result includes `label_sets`.
+        Facets "boundary", "left", "right", "posterior", "anterior", "inferior", "superior" (in 2-D
+        "x_min", "x_max", "y_min", "y_max"), and, with a box, "mask_surface" for the boundary off
+        its faces; sets without facets are omitted. A side is the boundary on that face of the box;
+        if there is none, as on an organ within the box, it is the set of facets in the outermost
+        tenth of the mesh along the world axis that mainly face in this direction. With labels, the
+        result includes `label_sets`.
 
     Raises
     ------
@@ -170,14 +179,20 @@ def standard_sets(
             faces[name] = (own or {}).get(name, rows)
     named = {BOUNDARY_SET: boundary, **faces}
     of_labels = Sets({}, {}) if labels is None else label_sets(mesh, labels, names)
-    return Sets({name: rows for name, rows in named.items() if len(rows)} | of_labels.facets, of_labels.cells)
+    return Sets(
+        {name: rows for name, rows in named.items() if len(rows)} | of_labels.facets,
+        of_labels.cells,
+    )
 
 
-def label_sets(mesh: Mesh, labels: NDArray[np.integer], names: Mapping[int, str] | None = None) -> Sets:
-    """Return the cells of each label, and the facets between two labels, as rows of cells with the smaller label.
+def label_sets(
+    mesh: Mesh, labels: NDArray[np.integer], names: Mapping[int, str] | None = None
+) -> Sets:
+    """Return the cells of each label, and the facets between two labels, as rows of cells with the
+    smaller label.
 
-    They are named "label_1", ..., "interface_1_2", ..., or after the names of labels: see `label_set_names` and
-    `interface_names`.
+    They are named "label_1", ..., "interface_1_2", ..., or after the names of labels: see
+    `label_set_names` and `interface_names`.
 
     Raises
     ------
@@ -195,10 +210,11 @@ def label_sets(mesh: Mesh, labels: NDArray[np.integer], names: Mapping[int, str]
 
 
 def label_set_names(labels: Iterable[int], names: Mapping[int, str]) -> dict[int, str]:
-    """Return the name of each label's set of cells: the label's name in letters that all formats support, or "label_5".
+    """Return the name of each label's set of cells: the label's name in letters that all formats
+    support, or "label_5".
 
-    All names differ by more than case and do not depend on which labels of `names` are present: if two would be equal,
-    or one is the name of another set, the label's number is appended.
+    All names differ by more than case and do not depend on which labels of `names` are present: if
+    two would be equal, or one is the name of another set, the label's number is appended.
 
     Examples
     --------
@@ -227,27 +243,40 @@ def _plain_name(name: str) -> str:
     return (joined if joined[:1].isalpha() or not joined else f"label_{joined}")[:MOST_LETTERS]
 
 
-def interface_names(pairs: Iterable[tuple[int, int]], of_label: Mapping[int, str]) -> dict[tuple[int, int], str]:
-    """Return the names of interfaces between labels: "interface_liver_spleen", or by number "interface_1_5".
+def interface_names(
+    pairs: Iterable[tuple[int, int]], of_label: Mapping[int, str]
+) -> dict[tuple[int, int], str]:
+    """Return the names of interfaces between labels: "interface_liver_spleen", or by number
+    "interface_1_5".
 
-    `of_label` is the result of `label_set_names`. Numbers are used for a label without a name, and if the names are too
-    long together or the same for two pairs.
+    `of_label` is the result of `label_set_names`. Numbers are used for a label without a name, and
+    if the names are too long together or the same for two pairs.
     """
-    parts = {label: str(label) if name == f"label_{label}" else name for label, name in of_label.items()}
+    parts = {
+        label: str(label) if name == f"label_{label}" else name for label, name in of_label.items()
+    }
     named = {(a, b): f"interface_{parts[a]}_{parts[b]}" for a, b in pairs}
     counts = Counter(name.lower() for name in named.values())
     return {
-        (a, b): name if counts[name.lower()] == 1 and len(name) <= MOST_LETTERS else f"interface_{a}_{b}"
+        (a, b): name
+        if counts[name.lower()] == 1 and len(name) <= MOST_LETTERS
+        else f"interface_{a}_{b}"
         for (a, b), name in named.items()
     }
 
 
-def face_sets(mesh: Mesh, boundary: NDArray[np.int64], box: Box | None) -> dict[str, NDArray[np.int64]]:
+def face_sets(
+    mesh: Mesh, boundary: NDArray[np.int64], box: Box | None
+) -> dict[str, NDArray[np.int64]]:
     """Return the boundary facets on each face of the box, and, with a box, those on no face."""
     n = mesh.ndim
     if box is None:
         low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
-        places, faces, tolerance = mesh.points, np.column_stack([low, high]), ON_SIDE_VOXELS * (high - low).max()
+        places, faces, tolerance = (
+            mesh.points,
+            np.column_stack([low, high]),
+            ON_SIDE_VOXELS * (high - low).max(),
+        )
         axes, directions = tuple(range(n)), np.ones(n)
     else:
         inverse = np.asarray(np.linalg.inv(box.affine[:n, :n]), dtype=np.float64)
@@ -255,17 +284,21 @@ def face_sets(mesh: Mesh, boundary: NDArray[np.int64], box: Box | None) -> dict[
         faces, tolerance = box_sides(box.shape), ON_SIDE_VOXELS
         axes = world_axes(box.affine)
         directions = box.affine[list(axes), range(n)]
-    is_on = facets_on_sides(places, facet_triples(mesh.cells, boundary), faces, tolerance)  # (B, n, 2)
+    # (B, n, 2)
+    is_on = facets_on_sides(places, facet_triples(mesh.cells, boundary), faces, tolerance)
     sets: dict[str, NDArray[np.int64]] = {}
     for name_pair in FACE_NAMES[n]:
         axis = axes.index(FACE_NAMES[n].index(name_pair))
         sides = is_on[:, axis].T if directions[axis] > 0.0 else is_on[:, axis, ::-1].T
         sets |= {name: boundary[side] for name, side in zip(name_pair, sides, strict=True)}
-    return sets if box is None else {**sets, MASK_SURFACE_SET: boundary[~np.any(is_on, axis=(1, 2))]}
+    return (
+        sets if box is None else {**sets, MASK_SURFACE_SET: boundary[~np.any(is_on, axis=(1, 2))]}
+    )
 
 
 def _extent_sets(mesh: Mesh, boundary: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
-    """Return the boundary facets in the outermost tenth of the mesh along each world axis that face this direction.
+    """Return the boundary facets in the outermost tenth of the mesh along each world axis that face
+    this direction.
 
     No facet belongs to two sides: each faces the direction nearest to its normal.
     """
@@ -276,13 +309,19 @@ def _extent_sets(mesh: Mesh, boundary: NDArray[np.int64]) -> dict[str, NDArray[n
     sets = {}
     for axis, (name_low, name_high) in enumerate(FACE_NAMES[mesh.ndim]):
         is_faced = faced == axis
-        sets[name_low] = boundary[is_faced & (areas[:, axis] < 0.0) & (fraction[:, axis] <= SIDE_DEPTH)]
-        sets[name_high] = boundary[is_faced & (areas[:, axis] > 0.0) & (fraction[:, axis] >= 1.0 - SIDE_DEPTH)]
+        sets[name_low] = boundary[
+            is_faced & (areas[:, axis] < 0.0) & (fraction[:, axis] <= SIDE_DEPTH)
+        ]
+        sets[name_high] = boundary[
+            is_faced & (areas[:, axis] > 0.0) & (fraction[:, axis] >= 1.0 - SIDE_DEPTH)
+        ]
     return sets
 
 
 def _interfaces(mesh: Mesh, labels: NDArray[np.int64]) -> dict[tuple[int, int], NDArray[np.int64]]:
-    """Return the facets between each pair of labels, as rows of cells with the smaller one, which comes first."""
+    """Return the facets between each pair of labels, as rows of cells with the smaller one,
+    which comes first.
+    """
     shared = facets(mesh.cells)
     of_cell = shared.cells[shared.of_cell]  # (M, n+1, 2)
     own = np.arange(len(mesh.cells))[:, None]
@@ -291,27 +330,37 @@ def _interfaces(mesh: Mesh, labels: NDArray[np.int64]) -> dict[tuple[int, int], 
     rows = np.argwhere(there > labels[:, None])
     values, rank = np.unique(labels, return_inverse=True)
     other_rank = np.searchsorted(values, there[rows[:, 0], rows[:, 1]])
-    pairs, which = np.unique(rank.ravel()[rows[:, 0]] * len(values) + other_rank, return_inverse=True)
+    pairs, which = np.unique(
+        rank.ravel()[rows[:, 0]] * len(values) + other_rank, return_inverse=True
+    )
     ends = np.cumsum(np.bincount(which.ravel(), minlength=len(pairs)))[:-1]
     parts = np.split(rows[np.argsort(which.ravel(), kind="stable")], ends) if len(pairs) else []
-    kinds = zip(values[pairs // len(values)].tolist(), values[pairs % len(values)].tolist(), strict=True)
+    kinds = zip(
+        values[pairs // len(values)].tolist(), values[pairs % len(values)].tolist(), strict=True
+    )
     return dict(zip(kinds, parts, strict=True))
 
 
 def _checked_labels(labels: ArrayLike, mesh: Mesh) -> NDArray[np.int64]:
     array = np.asarray(labels)
     if array.shape != (len(mesh.cells),):
-        raise InputError(f"labels: expected one for each of {len(mesh.cells)} cells, got shape {array.shape}")
+        raise InputError(
+            f"labels: expected one for each of {len(mesh.cells)} cells, got shape {array.shape}"
+        )
     whole = array.astype(np.int64)
     if (whole != array).any() or whole.min() < 0:
-        raise InputError(f"labels: expected whole numbers from 0, got {array.min():g} to {array.max():g}")
+        raise InputError(
+            f"labels: expected whole numbers from 0, got {array.min():g} to {array.max():g}"
+        )
     return whole
 
 
 # Sets requested by the user
 
 
-def with_requested(mesh: Mesh, sets: Sets, requests: Iterable[str], mean: NDArray[np.float64] | None) -> Sets:
+def with_requested(
+    mesh: Mesh, sets: Sets, requests: Iterable[str], mean: NDArray[np.float64] | None
+) -> Sets:
     """Add requested sets to `sets`.
 
     Parameters
@@ -319,18 +368,20 @@ def with_requested(mesh: Mesh, sets: Sets, requests: Iterable[str], mean: NDArra
     mesh : Mesh
     sets : Sets
     requests : iterable of str
-        "NAME=below:T", the cells of the largest facet-connected set with a mean below T (Fig. 3(f) of the paper), and
-        the facets around them, "NAME_surface"; "NAME=point:X,Y,Z:D" and "NAME=plane:X,Y,Z:NX,NY,NZ:D", boundary facets
-        with all nodes within D mm of a point, or of a plane through a point with a normal; world mm, RAS+.
-        "NAME=A-B-C", the facets of set A that are in no other of these, and "NAME=outer:A-B", "NAME=inner:A-B", its
-        outer or inner connected parts (`_is_inner`). "interface_b_a" is "interface_a_b" seen from b.
+        "NAME=below:T", the cells of the largest facet-connected set with a mean below T (Fig. 3(f)
+        of the paper), and the facets around them, "NAME_surface"; "NAME=point:X,Y,Z:D" and
+        "NAME=plane:X,Y,Z:NX,NY,NZ:D", boundary facets with all nodes within D mm of a point, or of
+        a plane through a point with a normal; world mm, RAS+. "NAME=A-B-C", the facets of set A
+        that are in no other of these, and "NAME=outer:A-B", "NAME=inner:A-B", its outer or inner
+        connected parts (`_is_inner`). "interface_b_a" is "interface_a_b" seen from b.
     mean : (M,) float64, optional
         Mean intensity of each cell.
 
     Raises
     ------
     InputError
-        A request is invalid; its name is in use or not supported by all formats; the mesh has no means; a set is empty.
+        A request is invalid; its name is in use or not supported by all formats; the mesh has no
+        means; a set is empty.
     """
     for text in requests:
         request = parse_set(text, mesh.ndim)
@@ -369,21 +420,29 @@ def parse_set(text: str, ndim: int) -> SetRequest:
     """
     name, equals, what = text.partition("=")
     kind, _, rest = what.partition(":")
-    shapes = {"below": ("T", [1]), "point": ("X,Y,Z:D", [ndim, 1]), "plane": ("X,Y,Z:NX,NY,NZ:D", [ndim, ndim, 1])}
+    shapes = {
+        "below": ("T", [1]),
+        "point": ("X,Y,Z:D", [ndim, 1]),
+        "plane": ("X,Y,Z:NX,NY,NZ:D", [ndim, ndim, 1]),
+    }
     is_difference = kind in SIDE_KINDS or (":" not in what and what.strip("- ") != "")
     if not equals or not (kind in shapes or is_difference):
         raise InputError(
-            "set: expected NAME=below:T, NAME=point:X,Y,Z:D, NAME=plane:X,Y,Z:NX,NY,NZ:D, NAME=A-B, NAME=outer:A-B or "
+            "set: expected NAME=below:T, NAME=point:X,Y,Z:D, NAME=plane:X,Y,Z:NX,NY,NZ:D, "
+            "NAME=A-B, NAME=outer:A-B or "
             f'NAME=inner:A-B of sets A, B, ..., got "{text}"'
         )
     if not SET_NAME.fullmatch(name):
         raise InputError(
-            f'set: expected a name of up to {MOST_LETTERS} letters, digits, _ or -, the first a letter, got "{name}"'
+            f"set: expected a name of up to {MOST_LETTERS} letters, digits, _ or -, the first a "
+            f'letter, got "{name}"'
         )
     if is_difference:
         difference = rest if kind in SIDE_KINDS else what
         if not all(part.strip() for part in difference.split("-")):
-            raise InputError(f'set {name}: expected names of sets, such as boundary-inlet, got "{difference}"')
+            raise InputError(
+                f'set {name}: expected names of sets, such as boundary-inlet, got "{difference}"'
+            )
         return SetRequest(name, kind if kind in SIDE_KINDS else "", [], difference)
     form, counts = shapes[kind]
     parts = rest.split(":")
@@ -408,12 +467,17 @@ def _of_sets(mesh: Mesh, request: SetRequest, sets: Sets) -> NDArray[np.int64]:
     """Return the facets (K, 2) of a difference of sets, or of its outer or inner parts."""
     first, *others = (_facets_named(mesh, name, request, sets) for name in names_in(request, sets))
     n_local = mesh.ndim + 1
-    gone = np.concatenate([rows[:, 0] * n_local + rows[:, 1] for rows in [np.empty((0, 2), dtype=np.int64), *others]])
+    gone = np.concatenate(
+        [rows[:, 0] * n_local + rows[:, 1] for rows in [np.empty((0, 2), dtype=np.int64), *others]]
+    )
     rows = first[~np.isin(first[:, 0] * n_local + first[:, 1], gone)]
     if request.kind and len(rows):
         rows = rows[_is_inner(mesh, rows) == (request.kind == "inner")]
     if len(rows) == 0:
-        raise InputError(f"set {request.name}: {request.kind or 'the difference'} {request.difference} has no facet")
+        raise InputError(
+            f"set {request.name}: {request.kind or 'the difference'} {request.difference} has no "
+            "facet"
+        )
     return rows
 
 
@@ -421,10 +485,15 @@ def names_in(request: SetRequest, sets: Sets) -> list[str]:
     """Return the names in "A-B-C"; as a name may contain "-", the longest known ones."""
     parts, names = request.difference.split("-"), []
     while parts:
-        known = (k for k in range(len(parts), 0, -1) if place_of("-".join(parts[:k]).strip(), sets) is not None)
+        known = (
+            k
+            for k in range(len(parts), 0, -1)
+            if place_of("-".join(parts[:k]).strip(), sets) is not None
+        )
         if (k := next(known, None)) is None:
             raise InputError(
-                f'set {request.name}: no set of facets begins "{"-".join(parts).strip()}"; the mesh has '
+                f'set {request.name}: no set of facets begins "{"-".join(parts).strip()}"; the '
+                "mesh has "
                 f"{', '.join(sets.facets)}"
             )
         names.append("-".join(parts[:k]).strip())
@@ -433,19 +502,25 @@ def names_in(request: SetRequest, sets: Sets) -> list[str]:
 
 
 def place_of(name: str, sets: Sets) -> tuple[str, bool] | None:
-    """Return the set of facets of this name, in any case, and whether it names its labels in the other order."""
+    """Return the set of facets of this name, in any case, and whether it names its labels in the
+    other order.
+    """
     for known in sets.facets:
         if known.lower() == name.lower():
             return known, False
     interfaces = [each for each in sets.facets if each.startswith(INTERFACE_PREFIX)]
     turned = [each for each in interfaces if name.lower() in map(str.lower, _turned_names(each))]
     if len(turned) > 1:
-        raise InputError(f'set: "{name}" may be the other side of {" or ".join(turned)}; rename the labels')
+        raise InputError(
+            f'set: "{name}" may be the other side of {" or ".join(turned)}; rename the labels'
+        )
     return (turned[0], True) if turned else None
 
 
 def _turned_names(name: str) -> list[str]:
-    """Return the names "interface_b_a" of an interface "interface_a_b", whose labels' names may contain "_"."""
+    """Return the names "interface_b_a" of an interface "interface_a_b", whose labels' names may
+    contain "_".
+    """
     parts = name.removeprefix(INTERFACE_PREFIX).split("_")
     return [f"{INTERFACE_PREFIX}{'_'.join([*parts[k:], *parts[:k]])}" for k in range(1, len(parts))]
 
@@ -458,7 +533,8 @@ def _facets_named(mesh: Mesh, name: str, request: SetRequest, sets: Sets) -> NDA
 
 
 def _is_inner(mesh: Mesh, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return which facets (K, 2) belong to an inner part: parts are linked by edges (in 2-D by nodes).
+    """Return which facets (K, 2) belong to an inner part: parts are linked by edges (in 2-D by
+    nodes).
 
     The facets of an inner part, such as a lumen or a cavity, closed or open, face its own middle.
     """
@@ -471,7 +547,13 @@ def _is_inner(mesh: Mesh, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
     n_parts, part = linked(facet[:-1][is_same], facet[1:][is_same], len(rows))
     centres, vectors = mesh.points[nodes].mean(axis=1), area_vectors(mesh, rows)
     areas = np.linalg.norm(vectors, axis=1)
-    middle = np.stack([np.bincount(part, areas * x, n_parts) / np.bincount(part, areas, n_parts) for x in centres.T], 1)
+    middle = np.stack(
+        [
+            np.bincount(part, areas * x, n_parts) / np.bincount(part, areas, n_parts)
+            for x in centres.T
+        ],
+        1,
+    )
     outward = ((centres - middle[part]) * vectors).sum(axis=1)
     return np.asarray(np.bincount(part, outward, n_parts)[part] < 0.0)
 
@@ -481,16 +563,23 @@ def check_free_names(request: SetRequest, sets: Sets) -> None:
     taken = {other.lower(): other for other in (*sets.facets, *sets.cells)}
     for name in request.names():
         if name.lower() in taken:
-            raise InputError(f'set: a set "{taken[name.lower()]}" already exists; choose a name other than "{name}"')
+            raise InputError(
+                f'set: a set "{taken[name.lower()]}" already exists; choose a name other than '
+                f'"{name}"'
+            )
 
 
-def _cells_below(mesh: Mesh, request: SetRequest, mean: NDArray[np.float64] | None) -> NDArray[np.int64]:
+def _cells_below(
+    mesh: Mesh, request: SetRequest, mean: NDArray[np.float64] | None
+) -> NDArray[np.int64]:
     name, threshold = request.name, float(request.vectors[0][0])
     if mean is None:
         raise InputError(f"set {name}: the mesh has no cell means; give the image (`image`)")
     chosen = largest_component(mesh.cells, mean < threshold)
     if len(chosen) == 0:
-        raise InputError(f"set {name}: no cell has a mean below {threshold:g}; the lowest is {mean.min():g}")
+        raise InputError(
+            f"set {name}: no cell has a mean below {threshold:g}; the lowest is {mean.min():g}"
+        )
     return chosen
 
 
@@ -500,14 +589,16 @@ def _facets_within(mesh: Mesh, request: SetRequest) -> NDArray[np.int64]:
     if request.kind == "point":
         distance = np.sqrt((offset**2).sum(axis=1))
     else:
-        normal = request.vectors[1] / np.abs(request.vectors[1]).max()  # its square neither overflows nor vanishes
+        # its square neither overflows nor vanishes
+        normal = request.vectors[1] / np.abs(request.vectors[1]).max()
         distance = np.abs((offset * (normal / np.linalg.norm(normal))).sum(axis=1))
     reach = float(request.vectors[-1][0])
     rows = boundary_rows(mesh)
     farthest = distance[facet_triples(mesh.cells, rows)].max(axis=1)
     if not (farthest <= reach).any():
         raise InputError(
-            f"set {request.name}: no boundary facet lies within {reach:g} mm; the nearest one lies within "
+            f"set {request.name}: no boundary facet lies within {reach:g} mm; the nearest one "
+            "lies within "
             f"{farthest.min():.4g} mm"
         )
     return rows[farthest <= reach]
@@ -533,12 +624,16 @@ def finite_numbers(text: str) -> NDArray[np.float64]:
 
 
 def rows_of(mesh: Mesh, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the rows (cell, k), ascending, of facets given by their nodes (K, n); others are ignored.
+    """Return the rows (cell, k), ascending, of facets given by their nodes (K, n); others are
+    ignored.
 
-    A facet between two cells belongs to the one from which its nodes, oriented as in `facet_triples`, point outwards.
+    A facet between two cells belongs to the one from which its nodes, oriented as in
+    `facet_triples`, point outwards.
     """
     shared = facets(mesh.cells)
-    distinct, which = np.unique(np.concatenate([shared.nodes, np.sort(nodes, axis=1)]), axis=0, return_inverse=True)
+    distinct, which = np.unique(
+        np.concatenate([shared.nodes, np.sort(nodes, axis=1)]), axis=0, return_inverse=True
+    )
     place = np.full(len(distinct), -1)
     place[which.ravel()[: len(shared.nodes)]] = np.arange(len(shared.nodes))
     number, listed = np.unique(place[which.ravel()[len(shared.nodes) :]], return_index=True)
@@ -549,26 +644,38 @@ def rows_of(mesh: Mesh, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
 
     first, second = shared.cells[number].T
     rows = held_by(first)
-    rolled = [np.roll(listed, k, axis=1) for k in range(1 if mesh.ndim == 2 else 3)]  # the same orientation
-    faces_out = np.any([(facet_triples(mesh.cells, rows) == each).all(axis=1) for each in rolled], axis=0)
+    # the same orientation
+    rolled = [np.roll(listed, k, axis=1) for k in range(1 if mesh.ndim == 2 else 3)]
+    faces_out = np.any(
+        [(facet_triples(mesh.cells, rows) == each).all(axis=1) for each in rolled], axis=0
+    )
     rows = np.where((faces_out | (second < 0))[:, None], rows, held_by(second))
     return rows[np.lexsort(rows.T[::-1])]
 
 
 def surviving_sets(before: Mesh, sets: Sets, mesh: Mesh) -> Sets:
-    """Return the facet sets of the mesh `before` whose facets all exist in `mesh`, as rows of `mesh`.
+    """Return the facet sets of the mesh `before` whose facets all exist in `mesh`, as rows of
+    `mesh`.
 
-    Facets are the same if their nodes have the same positions. If an optimisation kept the boundary, these are the sets
-    on the boundary. Cell sets do not survive, because the cells change.
+    Facets are the same if their nodes have the same positions. If an optimisation kept the
+    boundary, these are the sets on the boundary. Cell sets do not survive, because the cells
+    change.
     """
     place = {point.tobytes(): number for number, point in enumerate(mesh.points)}
     now = np.array([place.get(point.tobytes(), -1) for point in before.points])
-    survivors = {name: rows_of(mesh, now[facet_triples(before.cells, rows)]) for name, rows in sets.facets.items()}
-    return Sets({name: rows for name, rows in survivors.items() if len(rows) == len(sets.facets[name])}, {})
+    survivors = {
+        name: rows_of(mesh, now[facet_triples(before.cells, rows)])
+        for name, rows in sets.facets.items()
+    }
+    return Sets(
+        {name: rows for name, rows in survivors.items() if len(rows) == len(sets.facets[name])}, {}
+    )
 
 
 def free_name(label: str, taken: set[str]) -> str:
-    """Return a name like `label` that all formats support and that differs from those taken by more than case."""
+    """Return a name like `label` that all formats support and that differs from those taken by
+    more than case.
+    """
     name = re.sub(r"[^A-Za-z0-9_-]", "_", label)
     stem = (name if name[0].isalpha() else f"set_{name}")[:MOST_LETTERS]
     name, number = stem, 1
@@ -579,7 +686,8 @@ def free_name(label: str, taken: set[str]) -> str:
 
 
 def merged_sets(standard: Sets, own: Sets) -> tuple[Sets, dict[str, str]]:
-    """Merge the standard sets with a mesh's own; return also the new names of own sets whose names were in use.
+    """Merge the standard sets with a mesh's own; return also the new names of own sets whose names
+    were in use.
 
     An own set that equals the standard set of the same name is merged with it.
     """

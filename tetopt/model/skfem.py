@@ -17,10 +17,11 @@ if TYPE_CHECKING:
 def skfem_mesh(mesh: Mesh, sets: Sets) -> skfem.Mesh:
     """Convert a mesh with its sets to scikit-fem.
 
-    Nodes and cells keep their order, so that cell data, such as `young[of_cell]` of the materials, remain valid;
-    scikit-fem sorts the three nodes of a triangle, though. Facet sets become `boundaries`; those with facets between
-    two cells become an `OrientedBoundary`, whose normals point out of the cells in the set. Cell sets become
-    `subdomains`. A 2-D mesh becomes a `MeshTri`, a 3-D one a `MeshTet`.
+    Nodes and cells keep their order, so that cell data, such as `young[of_cell]` of the materials,
+    remain valid; scikit-fem sorts the three nodes of a triangle, though. Facet sets become
+    `boundaries`; those with facets between two cells become an `OrientedBoundary`, whose normals
+    point out of the cells in the set. Cell sets become `subdomains`. A 2-D mesh becomes a
+    `MeshTri`, a 3-D one a `MeshTet`.
 
     Raises
     ------
@@ -45,7 +46,9 @@ def skfem_mesh(mesh: Mesh, sets: Sets) -> skfem.Mesh:
     return bare.with_boundaries(boundaries).with_subdomains(subdomains)
 
 
-def _boundary(mesh: skfem.Mesh, cells: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.integer]:
+def _boundary(
+    mesh: skfem.Mesh, cells: NDArray[np.int64], rows: NDArray[np.int64]
+) -> NDArray[np.integer]:
     """Return scikit-fem's numbers of the facets (K, 2)."""
     from skfem.generic_utils import OrientedBoundary
 

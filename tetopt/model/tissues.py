@@ -1,4 +1,6 @@
-"""Merging of labels into tissues: by groups in text, in a file or of a known program, or by shared names."""
+"""Merging of labels into tissues: by groups in text, in a file or of a known program, or by
+shared names.
+"""
 
 from __future__ import annotations
 
@@ -64,10 +66,11 @@ def merge_labels(labels: Image, merge: str, names: Mapping[int, str] | None = No
     labels : Image
         Whole numbers from 0 to `tetopt.contents.labels.LARGEST_LABEL`.
     merge : str
-        Groups as NAME=LABELS, separated by semicolons, which become labels 1, 2 and so on, or N for N:NAME=LABELS.
-        LABELS are numbers, ranges (500-530) and names, separated by commas, or ``*`` for all labels in no other group;
-        0 stays 0 unless a group has it. Alternatively the name of a preset: "aseg" (FreeSurfer), "synthseg",
-        "simnibs"; or a file: .toml, with a line NAME = LABELS for each group, or .csv, with rows NAME,LABELS.
+        Groups as NAME=LABELS, separated by semicolons, which become labels 1, 2 and so on, or N for
+        N:NAME=LABELS. LABELS are numbers, ranges (500-530) and names, separated by commas, or ``*``
+        for all labels in no other group; 0 stays 0 unless a group has it. Alternatively the name of
+        a preset: "aseg" (FreeSurfer), "synthseg", "simnibs"; or a file: .toml, with a line NAME =
+        LABELS for each group, or .csv, with rows NAME,LABELS.
     names : dict of int to str, optional
         Names of the image's labels, for groups that list names.
 
@@ -98,19 +101,26 @@ def merge_labels(labels: Image, merge: str, names: Mapping[int, str] | None = No
     owner.setdefault(0, 0)
     lost = [label for label in present.tolist() if label not in owner]
     if lost and rest is None:
-        listed = ", ".join(map(str, lost[:UNGROUPED_LISTED])) + (", ..." if len(lost) > UNGROUPED_LISTED else "")
+        listed = ", ".join(map(str, lost[:UNGROUPED_LISTED])) + (
+            ", ..." if len(lost) > UNGROUPED_LISTED else ""
+        )
         raise InputError(
-            f"`merge`: expected each label of the image in a group, got no group for {listed}; add them to a group, or "
+            f"`merge`: expected each label of the image in a group, got no group for {listed}; "
+            "add them to a group, or "
             f"give NAME={REST} for all others"
         )
     numbers = {label: owner.get(label, rest or 0) for label in present.tolist()}
-    return Merged(renumbered(labels, numbers), {group.label: group.name for group in groups}, numbers)
+    return Merged(
+        renumbered(labels, numbers), {group.label: group.name for group in groups}, numbers
+    )
 
 
 def renumbered(labels: Image, numbers: Mapping[int, int]) -> Image:
     """Renumber labels; labels without a new number are unchanged."""
     present = np.unique(labels.data)
-    new = np.array([numbers.get(label, label) for label in present.astype(np.int64).tolist()], dtype=np.float64)
+    new = np.array(
+        [numbers.get(label, label) for label in present.astype(np.int64).tolist()], dtype=np.float64
+    )
     return Image(new[np.searchsorted(present, labels.data)], labels.affine)
 
 
@@ -139,7 +149,9 @@ def groups_of(merge: str) -> list[LabelGroup]:
         try:
             return _of_rows(rows_of(file, "table of groups of labels", ("label", "labels")))
         except InputError as error:
-            raise error if str(error).startswith(str(file)) else InputError(f"{file}: {error}") from error
+            raise (
+                error if str(error).startswith(str(file)) else InputError(f"{file}: {error}")
+            ) from error
     if is_preset(merge):
         return _of_rows([(name, [labels]) for name, labels in _presets()[merge.strip()].items()])
     return _checked([_of_words(words) for words in merge.split(";") if words.strip()])
@@ -150,7 +162,9 @@ def _of_rows(rows: Sequence[tuple[str, Sequence[object]]]) -> list[LabelGroup]:
     groups: dict[str, list[object]] = {}
     for name, labels in rows:
         groups.setdefault(name, []).extend(labels)
-    return _checked([_of_words(f"{name}={','.join(map(str, labels))}") for name, labels in groups.items()])
+    return _checked(
+        [_of_words(f"{name}={','.join(map(str, labels))}") for name, labels in groups.items()]
+    )
 
 
 def _of_words(words: str) -> tuple[str | None, str, tuple[str, ...]]:
@@ -159,7 +173,8 @@ def _of_words(words: str) -> tuple[str | None, str, tuple[str, ...]]:
     members = tuple(part.strip() for part in match[3].split(",")) if match else ()
     if match is None or not all(members):
         raise InputError(
-            f'`merge`: expected NAME=LABELS, separated by semicolons, such as "white=2,41; grey=3,42; soft=500-530", a '
+            '`merge`: expected NAME=LABELS, separated by semicolons, such as "white=2,41; '
+            'grey=3,42; soft=500-530", a '
             f'.toml or .csv file, or {", ".join(_presets())}, got "{words.strip()[:80]}"'
         )
     return match[1], " ".join(match[2].split()), members
@@ -168,11 +183,15 @@ def _of_words(words: str) -> tuple[str | None, str, tuple[str, ...]]:
 def _checked(rows: list[tuple[str | None, str, tuple[str, ...]]]) -> list[LabelGroup]:
     """Return the groups with their numbers; numbers and names must be unique."""
     rows = rows or [_of_words("")]  # raises InputError
-    groups = [LabelGroup(k if row[0] is None else int(row[0]), *row[1:]) for k, row in enumerate(rows, 1)]
+    groups = [
+        LabelGroup(k if row[0] is None else int(row[0]), *row[1:]) for k, row in enumerate(rows, 1)
+    ]
     for what in ("name", "label"):
         taken = [getattr(group, what) for group in groups]
         if twice := [each for each in taken if taken.count(each) > 1]:
-            raise InputError(f"`merge`: expected a different {what} for each group, got {twice[0]} twice")
+            raise InputError(
+                f"`merge`: expected a different {what} for each group, got {twice[0]} twice"
+            )
     if max(group.label for group in groups) > LARGEST_LABEL:
         raise InputError(f"`merge`: expected group numbers up to {LARGEST_LABEL}")
     if sum(REST in group.members for group in groups) > 1:
@@ -183,7 +202,9 @@ def _checked(rows: list[tuple[str | None, str, tuple[str, ...]]]) -> list[LabelG
 def _members(
     groups: list[LabelGroup], names: Mapping[int, str], present: NDArray[np.int64]
 ) -> tuple[dict[int, int], int | None]:
-    """Return the number of the group of each label, in ranges of those present, and that of all other labels."""
+    """Return the number of the group of each label, in ranges of those present, and that of all
+    other labels.
+    """
     owner: dict[int, int] = {}
     rest = None
     for group in groups:
@@ -194,7 +215,10 @@ def _members(
             for label in _labels_of(word, names, present):
                 if owner.setdefault(label, group.label) != group.label:
                     other = next(each.name for each in groups if each.label == owner[label])
-                    raise InputError(f"`merge`: label {label} is in two groups, {other} and {group.name}; list it once")
+                    raise InputError(
+                        f"`merge`: label {label} is in two groups, {other} and {group.name}; "
+                        "list it once"
+                    )
     return owner, rest
 
 
@@ -207,7 +231,9 @@ def _labels_of(word: str, names: Mapping[int, str], present: NDArray[np.int64]) 
             raise InputError(f"`merge`: {error}") from error
     first, last = int(match[1]), int(match[2] or match[1])
     if not first <= last <= LARGEST_LABEL:
-        raise InputError(f"`merge`: expected labels or an increasing range up to {LARGEST_LABEL}, got {word}")
+        raise InputError(
+            f"`merge`: expected labels or an increasing range up to {LARGEST_LABEL}, got {word}"
+        )
     return [first] if first == last else present[(first <= present) & (present <= last)].tolist()
 
 

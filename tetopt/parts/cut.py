@@ -1,10 +1,11 @@
 """Assignment of cells to parts in each round, and joining of the parts.
 
-Parts are boxes of about equal work: planes divide the cells' centroids along one axis after the other into slabs of
-equal weight (recursive coordinate bisection, Berger and Bokhari 1987, with more than two slabs at a time). A part's
-surface follows its cells. The planes move every round, so that nodes that a part shared with others, and could not
-move, are inside a part in the next round. A space-filling curve through the cells (Morton's) would need only one sort,
-but its parts have ragged surfaces or two components, and boxes of voxels up to the whole volume.
+Parts are boxes of about equal work: planes divide the cells' centroids along one axis after the
+other into slabs of equal weight (recursive coordinate bisection, Berger and Bokhari 1987, with more
+than two slabs at a time). A part's surface follows its cells. The planes move every round, so that
+nodes that a part shared with others, and could not move, are inside a part in the next round. A
+space-filling curve through the cells (Morton's) would need only one sort, but its parts have ragged
+surfaces or two components, and boxes of voxels up to the whole volume.
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ class Piece(NamedTuple):
 
 
 def counts_of(n_parts: int, lengths: Sequence[float]) -> tuple[int, ...]:
-    """Return the number of slabs along each axis that gives at least `n_parts` parts as close to cubes as possible.
+    """Return the number of slabs along each axis that gives at least `n_parts` parts as close to
+    cubes as possible.
 
     Examples
     --------
@@ -51,7 +53,10 @@ def counts_of(n_parts: int, lengths: Sequence[float]) -> tuple[int, ...]:
 
 
 def cut(
-    centroids: NDArray[np.float64], weights: NDArray[np.float64], counts: Sequence[int], shift: float
+    centroids: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    counts: Sequence[int],
+    shift: float,
 ) -> NDArray[np.int64]:
     """Return the part of each cell, (M,) int64, numbered from 0 without gaps.
 
@@ -64,8 +69,8 @@ def cut(
     counts : sequence of three int
         Slabs along each axis.
     shift : float
-        Position of the first plane, 0 to 1 slab. Unless it is 0, each divided axis has one more slab, and its first and
-        last slabs are smaller.
+        Position of the first plane, 0 to 1 slab. Unless it is 0, each divided axis has one more
+        slab, and its first and last slabs are smaller.
     """
     part = np.zeros(len(centroids), dtype=np.int64)
     for axis, count in enumerate(counts):
@@ -75,7 +80,9 @@ def cut(
         order = np.lexsort((centroids[:, axis], part))
         total = np.cumsum(weights[order])
         start = np.flatnonzero(np.diff(part[order], prepend=-1))
-        before = np.repeat(np.concatenate([[0.0], total[start[1:] - 1]]), np.diff(np.append(start, len(order))))
+        before = np.repeat(
+            np.concatenate([[0.0], total[start[1:] - 1]]), np.diff(np.append(start, len(order)))
+        )
         whole = np.bincount(part, weights)
         at = (total - 0.5 * weights[order] - before) / whole[part[order]]  # 0 to 1 within its part
         slab = np.empty(len(order), dtype=np.int64)
@@ -91,7 +98,9 @@ def pieces(mesh: Shared) -> list[Piece]:
     result = []
     for first, last in pairwise(bounds):
         nodes, cells = np.unique(mesh.cells[order[first:last]], return_inverse=True)
-        result.append(Piece(mesh.ticks[nodes], cells.reshape(-1, mesh.cells.shape[1]).astype(np.int64), nodes))
+        result.append(
+            Piece(mesh.ticks[nodes], cells.reshape(-1, mesh.cells.shape[1]).astype(np.int64), nodes)
+        )
     return result
 
 
@@ -101,12 +110,15 @@ def joined(ticks: Sequence[NDArray[np.int64]], cells: Sequence[NDArray[np.int64]
     Nodes and cells are numbered part by part; a shared node belongs to the first of its parts.
     """
     every = np.concatenate(ticks)
-    # Whole rows are compared: ticks are below 2^31, so that three of them would take 93 bits in a single key.
+    # Whole rows are compared: ticks are below 2^31, so that three of them would take 93 bits in a
+    # single key.
     _, first, inverse = np.unique(every, axis=0, return_index=True, return_inverse=True)
     rank = np.empty(len(first), dtype=np.int64)
     rank[np.argsort(first, kind="stable")] = np.arange(len(first))
     number = rank[inverse.ravel()]
     offsets = np.cumsum([0, *map(len, ticks[:-1])])
-    whole = np.concatenate([number[each + offset] for each, offset in zip(cells, offsets, strict=True)])
+    whole = np.concatenate(
+        [number[each + offset] for each, offset in zip(cells, offsets, strict=True)]
+    )
     part = np.repeat(np.arange(len(cells)), [len(each) for each in cells])
     return Shared(every[np.sort(first)], whole, part)

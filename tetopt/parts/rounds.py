@@ -1,9 +1,11 @@
-"""Optimisation in rounds of parts: the mesh is cut, optimised part by part, joined, and cut elsewhere.
+"""Optimisation in rounds of parts: the mesh is cut, optimised part by part, joined, and cut
+elsewhere.
 
-Each round moves and exchanges everything except shared nodes, a fifth of the nodes in parts of 5,000; the planes of the
-next round lie elsewhere. Each part is normalised by the whole initial mesh, so that its gain is the decrease of E, and
-keeps its number of nodes, or gets its fraction of those still to be added. The result of a round does not depend on
-which workers run its parts, or on how many run at a time.
+Each round moves and exchanges everything except shared nodes, a fifth of the nodes in parts of
+5,000; the planes of the next round lie elsewhere. Each part is normalised by the whole initial
+mesh, so that its gain is the decrease of E, and keeps its number of nodes, or gets its fraction of
+those still to be added. The result of a round does not depend on which workers run its parts, or on
+how many run at a time.
 """
 
 from __future__ import annotations
@@ -50,12 +52,15 @@ from tetopt.start.octree import octree_mesh
 from tetopt.start.sizes import Sizes
 from tetopt.system.work_directory import locked
 
-MOST_CELLS = 100_000  # in a part: 17,000 nodes, a tenth to a fifth of them shared, and some seconds per round
+# in a part: 17,000 nodes, a tenth to a fifth of them shared, and some seconds per round
+MOST_CELLS = 100_000
 MOST_VOXELS = 2**25  # in the cells of a part, 34 million: with sums less than 1.5 GB
-# Sweeps in a round. Four rounds of 4 left 3.5 % more E_D than one piece of 16 sweeps (MNI152, 40,000 nodes, 4 parts),
-# six rounds of 3 left 2.4 %: nodes that are shared, and fixed, in the last round have had more sweeps before.
+# Sweeps in a round. Four rounds of 4 left 3.5 % more E_D than one piece of 16 sweeps (MNI152,
+# 40,000 nodes, 4 parts), six rounds of 3 left 2.4 %: nodes that are shared, and fixed, in the last
+# round have had more sweeps before.
 ROUND_SWEEPS = 3
-BOX_EXCESS = 1.25  # ratio of the largest box of any round to that of the first cut: 1.08 was measured
+# ratio of the largest box of any round to that of the first cut: 1.08 was measured
+BOX_EXCESS = 1.25
 
 Runner = Callable[[Sequence[str]], Iterator[Any]]
 """Runs `work_on` for each part's file, and yields as they end."""
@@ -100,30 +105,37 @@ def in_turn(names: Sequence[str]) -> Iterator[Any]:
 
 
 def mesh_in_parts(
-    request: PartsRequest, folder: Path, known: Statistics | None = None, *,
+    request: PartsRequest,
+    folder: Path,
+    known: Statistics | None = None,
+    *,
     volume: VolumeFile | Image | None = None,
-    crew: Callable[[int, float], AbstractContextManager[Runner]] = lambda n_parts, task_bytes: nullcontext(in_turn),
+    crew: Callable[[int, float], AbstractContextManager[Runner]] = lambda n_parts, task_bytes: (
+        nullcontext(in_turn)
+    ),
     is_over: Callable[[], bool] = lambda: False,
     watch: Callable[[Round, list[IterationRecord]], None] = lambda now, history: None,
     check: Callable[[Mesh], None] = lambda initial: None,
-) -> Parted:  # fmt: skip
+) -> Parted:
     """Create a graded mesh of an image's box in parts, as `mesh_image` does in one piece.
 
     Parameters
     ----------
     request : PartsRequest
     folder : Path
-        The work directory. It keeps all results, so that the same request resumes after any interruption, unless it is
-        rejected before the first part begins.
+        The work directory. It keeps all results, so that the same request resumes after any
+        interruption, unless it is rejected before the first part begins.
     known : Statistics, optional
         Statistics of the image, if a pass over it has computed them.
     volume : VolumeFile or Image, optional
-        The image, unless `tetopt.parts.work.save_volume` has recorded the location of its voxels in the folder.
+        The image, unless `tetopt.parts.work.save_volume` has recorded the location of its voxels in
+        the folder.
     crew : callable
-        Takes the number of parts and the bytes of the largest; returns a context manager that gives a function to run
-        them.
+        Takes the number of parts and the bytes of the largest; returns a context manager that gives
+        a function to run them.
     is_over : callable
-        Called after each part. Once it returns True, the result is the mesh of the last complete round.
+        Called after each part. Once it returns True, the result is the mesh of the last complete
+        round.
     watch : callable
         Called after each part.
     check : callable
@@ -137,16 +149,19 @@ def mesh_in_parts(
     Raises
     ------
     InputError
-        For the reasons of `octree_mesh`; the folder belongs to another request or another run; errors of `crew` and the
-        parts; the run ends before the initial mesh is measured.
+        For the reasons of `octree_mesh`; the folder belongs to another request or another run;
+        errors of `crew` and the parts; the run ends before the initial mesh is measured.
     """
     with locked(folder), gone_if_refused(folder) as keep:
         state = load_state(folder, request.checksum)
-        if state is None and volume is not None:  # an earlier run without a state may have recorded another image
+        # an earlier run without a state may have recorded another image
+        if state is None and volume is not None:
             save_volume(folder, volume)
         image = open_volume(folder)
         state = state or _begun(request, folder, image, known)
-        run = _Run(request, folder, image, time.perf_counter() - state.known["seconds"], is_over, watch)
+        run = _Run(
+            request, folder, image, time.perf_counter() - state.known["seconds"], is_over, watch
+        )
         check(_initial(run, state))
         counts = _counts(run, state)
         largest = max(part_bytes(*sizes) for sizes in _part_sizes(run, state, counts))
@@ -179,7 +194,9 @@ def _n_rounds(request: PartsRequest) -> int:
     return ceil(request.iterations / ROUND_SWEEPS)
 
 
-def _begun(request: PartsRequest, folder: Path, image: Image, known: Statistics | None) -> WorkState:
+def _begun(
+    request: PartsRequest, folder: Path, image: Image, known: Statistics | None
+) -> WorkState:
     """Create the state before the first round: the octree on the grid of ticks."""
     begin = time.perf_counter()
     of_image = statistics(image) if known is None else known
@@ -188,10 +205,19 @@ def _begun(request: PartsRequest, folder: Path, image: Image, known: Statistics 
     ticks = np.rint(image.to_index(mesh.points) * 2.0**bits).astype(np.int64)
     sizes = (Sizes() if request.sizes is None else request.sizes).prepared(3)
     settings = PartSettings(
-        request.k_D, request.shape_power, request.min_dihedral, request.tolerance,
-        _n_rounds(request) * ROUND_SWEEPS, int(EXCHANGING_FRACTION * request.iterations) if request.k_D > 0.0 else 0,
-        sizes.smallest, sizes.longest_edge(image, request.nodes), sizes.gradation, image.shape, bits, of_image.noise,
-    )  # fmt: skip
+        request.k_D,
+        request.shape_power,
+        request.min_dihedral,
+        request.tolerance,
+        _n_rounds(request) * ROUND_SWEEPS,
+        int(EXCHANGING_FRACTION * request.iterations) if request.k_D > 0.0 else 0,
+        sizes.smallest,
+        sizes.longest_edge(image, request.nodes),
+        sizes.gradation,
+        image.shape,
+        bits,
+        of_image.noise,
+    )
     noted = {"settings": settings._asdict(), "history": [], "seconds": time.perf_counter() - begin}
     state = WorkState(request.checksum, 0, noted)
     arrays = {"ticks": ticks, "cells": mesh.cells}
@@ -218,7 +244,9 @@ def _cut(run: _Run, state: WorkState, counts: tuple[int, ...], shift: float) -> 
 
 def _initial(run: _Run, state: WorkState) -> Mesh:
     arrays = load_arrays(run.folder / INITIAL_NAME)[0]
-    return Mesh(run.image.to_world(arrays["ticks"] * 2.0 ** -_settings(state).bits), arrays["cells"])
+    return Mesh(
+        run.image.to_world(arrays["ticks"] * 2.0 ** -_settings(state).bits), arrays["cells"]
+    )
 
 
 def _weights(index: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -242,7 +270,9 @@ def _part_sizes(run: _Run, state: WorkState, counts: tuple[int, ...]) -> Iterato
         yield int(BOX_EXCESS * n_voxels), len(piece.cells)
 
 
-def _round(run: _Run, state: WorkState, counts: tuple[int, ...], runner: Runner) -> WorkState | None:
+def _round(
+    run: _Run, state: WorkState, counts: tuple[int, ...], runner: Runner
+) -> WorkState | None:
     """Run one round; None if it was interrupted."""
     number = state.n_rounds
     kind: Kind = "measure" if number == 0 else "improve"
@@ -271,11 +301,21 @@ def _completed(run: _Run, state: WorkState, mesh: Shared, numbers: list[Numbers]
     seconds, n_voxels = time.perf_counter() - run.begin, sum(each.n_voxels for each in numbers)
     history.append(
         IterationRecord(
-            number * ROUND_SWEEPS, float(E), float(E_G), float(E_D), float(movement), number > 0, len(mesh.cells),
-            n_voxels, seconds,
+            number * ROUND_SWEEPS,
+            float(E),
+            float(E_G),
+            float(E_D),
+            float(movement),
+            number > 0,
+            len(mesh.cells),
+            n_voxels,
+            seconds,
         )
-    )  # fmt: skip
-    known = state.known | {"settings": settings._asdict(), "history": [list(row) for row in history]}
+    )
+    known = state.known | {
+        "settings": settings._asdict(),
+        "history": [list(row) for row in history],
+    }
     after = WorkState(state.request, number + 1, known | {"seconds": seconds})
     save_state(run.folder, after, {"ticks": mesh.ticks, "cells": mesh.cells})
     return after
@@ -292,13 +332,24 @@ def _prepared(run: _Run, state: WorkState, parts: list[Piece], kind: Kind) -> li
     iterations = (first, first + ROUND_SWEEPS - 1) if kind == "improve" else (1, 0)
     paths = [folder / f"part-{at}.npz" for at in range(len(parts))]
     for path, piece in zip(paths, parts, strict=True):
-        nodes = round(len(piece.ticks) * run.request.nodes / n_nodes) if kind == "improve" else len(piece.ticks)
-        text = {"kind": kind, "settings": _settings(state)._asdict(), "iterations": iterations, "nodes": nodes}
+        nodes = (
+            round(len(piece.ticks) * run.request.nodes / n_nodes)
+            if kind == "improve"
+            else len(piece.ticks)
+        )
+        text = {
+            "kind": kind,
+            "settings": _settings(state)._asdict(),
+            "iterations": iterations,
+            "nodes": nodes,
+        }
         save_arrays(path, {"ticks": piece.ticks, "cells": piece.cells}, text)
     return paths
 
 
-def _is_run(run: _Run, state: WorkState, now: Round, parts: list[Piece], paths: list[Path], runner: Runner) -> bool:
+def _is_run(
+    run: _Run, state: WorkState, now: Round, parts: list[Piece], paths: list[Path], runner: Runner
+) -> bool:
     """Run the parts; return False if they were interrupted before all were done."""
     # The largest first, as it takes longest.
     order = sorted(range(len(parts)), key=lambda at: (-len(parts[at].cells), at))
@@ -308,7 +359,8 @@ def _is_run(run: _Run, state: WorkState, now: Round, parts: list[Piece], paths: 
         run.watch(now._replace(done=n_done), _history(state))
         if n_done < len(parts) and run.is_over():
             break
-    # Count parts and not files, which may come from an earlier run that was stopped here and computed its fields.
+    # Count parts and not files, which may come from an earlier run that was stopped here and
+    # computed its fields.
     return n_done == len(parts)
 
 
@@ -320,11 +372,17 @@ def _is_converged(request: PartsRequest, state: WorkState) -> bool:
     return 1.0 - history[-1].E / history[-2].E < request.tolerance * ROUND_SWEEPS
 
 
-def _finished(run: _Run, state: WorkState, counts: tuple[int, ...], runner: Runner, ended: str) -> Parted:
-    """Return the result of the complete rounds, with cells in the order of the parts that computed their fields."""
+def _finished(
+    run: _Run, state: WorkState, counts: tuple[int, ...], runner: Runner, ended: str
+) -> Parted:
+    """Return the result of the complete rounds, with cells in the order of the parts that
+    computed their fields.
+    """
     history = _history(state)
     if not history:
-        raise InputError(f"{run.folder}: ended before the first round was complete; run this again to resume")
+        raise InputError(
+            f"{run.folder}: ended before the first round was complete; run this again to resume"
+        )
     parts = _cut(run, state, counts, ROUND_SHIFTS[0])
     whole = run._replace(is_over=lambda: False)
     paths = _prepared(run, state, parts, "fields")
@@ -336,9 +394,12 @@ def _finished(run: _Run, state: WorkState, counts: tuple[int, ...], runner: Runn
     scale = 2.0 ** -_settings(state).bits
     fields = {name: np.concatenate([each[name] for each in done]) for name in done[0]}
     result = MeshingResult(
-        Mesh(run.image.to_world(mesh.ticks * scale), mesh.cells), history, ended,
-        initial=_initial(run, state), nodes=run.request.nodes,
+        Mesh(run.image.to_world(mesh.ticks * scale), mesh.cells),
+        history,
+        ended,
+        initial=_initial(run, state),
+        nodes=run.request.nodes,
         seconds_run=time.perf_counter() - run.begin,
-    )  # fmt: skip
+    )
     result = checked_in_box(result, run.image, run.request.min_dihedral)
     return Parted(result, fields, mesh.part)

@@ -1,10 +1,10 @@
-"""The work directory of a run in parts, which holds its whole state, so that a rerun resumes where it ended.
+"""The work directory of a run in parts, which holds its whole state, so that a rerun resumes where
+it ended.
 
-volume.json, voxels.npy       the location of the voxels; for an image in memory, the voxels themselves
-initial.npz                   the initial mesh
-state.npz                     the request, and the state and the mesh after the last complete round
-round-R/part-P.npz            the input of a part of the next round
-round-R/done-P.npz            its result
+volume.json, voxels.npy       the location of the voxels; for an image in memory, the voxels
+themselves initial.npz                   the initial mesh state.npz                     the request,
+and the state and the mesh after the last complete round round-R/part-P.npz            the input of
+a part of the next round round-R/done-P.npz            its result
 
 Other entries stay, see `tetopt.system.work_directory`.
 """
@@ -33,17 +33,32 @@ from tetopt.io.text import plain
 from tetopt.system.files import save_json, written_whole
 from tetopt.system.work_directory import create, discard
 
-VOXELS_NAME, VOLUME_NAME, STATE_NAME, INITIAL_NAME = "voxels.npy", "volume.json", "state.npz", "initial.npz"
+VOXELS_NAME, VOLUME_NAME, STATE_NAME, INITIAL_NAME = (
+    "voxels.npy",
+    "volume.json",
+    "state.npz",
+    "initial.npz",
+)
 FILE_NAMES = (VOXELS_NAME, VOLUME_NAME, STATE_NAME, INITIAL_NAME)
 PART_NAMES = ("part-*.npz", "done-*.npz")  # in the folder of a round
 TEXT_NAME = "text"  # entry of a file of arrays with further information, in JSON
 
 
-# Errors that zipfile and numpy raise for damaged files. A damaged length may ask for any amount of memory.
+# Errors that zipfile and numpy raise for damaged files. A damaged length may ask for any amount of
+# memory.
 DAMAGE_ERRORS = (
-    OSError, EOFError, ValueError, KeyError, TypeError, MemoryError, OverflowError, RuntimeError, struct.error,
-    zipfile.BadZipFile, zlib.error,
-)  # fmt: skip
+    OSError,
+    EOFError,
+    ValueError,
+    KeyError,
+    TypeError,
+    MemoryError,
+    OverflowError,
+    RuntimeError,
+    struct.error,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 
 
 class VolumeFile(NamedTuple):
@@ -61,7 +76,9 @@ class VolumeFile(NamedTuple):
 
 
 def removed(folder: Path) -> list[str]:
-    """Remove the work directory; return the names of entries that are not tetopt's, which remain."""
+    """Remove the work directory; return the names of entries that are not tetopt's, which
+    remain.
+    """
     for each in folder.glob("round-*"):
         discard(each, PART_NAMES)
     return discard(folder, FILE_NAMES)
@@ -69,7 +86,8 @@ def removed(folder: Path) -> list[str]:
 
 @contextmanager
 def gone_if_refused(folder: Path) -> Iterator[Callable[[], None]]:
-    """Remove a work directory without a state after an InputError, unless the yielded function was called before.
+    """Remove a work directory without a state after an InputError, unless the yielded function was
+    called before.
 
     Otherwise the remains of the rejected request would block the corrected one.
     """
@@ -88,17 +106,24 @@ def gone_if_refused(folder: Path) -> Iterator[Callable[[], None]]:
 
 
 def identity(file: VolumeFile | None, sha256: str) -> tuple[str, str | None]:
-    """Return a checksum that identifies an image, and its path if it is left in its file, which is not read here."""
+    """Return a checksum that identifies an image, and its path if it is left in its file, which
+    is not read here.
+    """
     if file is None:
         return sha256, None
     return stored_checksum(file.path), str(file.path.resolve())
 
 
 def save_volume(folder: Path, volume: VolumeFile | Image) -> None:
-    """Record the location of the voxels, or save those of an image in memory to the folder, to be mapped from there."""
+    """Record the location of the voxels, or save those of an image in memory to the folder, to
+    be mapped from there.
+    """
     create(folder)
     if isinstance(volume, Image):
-        with written_whole(folder / VOXELS_NAME, volume.data.nbytes) as temporary, temporary.open("wb") as stream:
+        with (
+            written_whole(folder / VOXELS_NAME, volume.data.nbytes) as temporary,
+            temporary.open("wb") as stream,
+        ):
             np.save(stream, volume.data)
         words: dict[str, Any] = {"path": None, "affine": volume.affine.tolist()}
     else:
@@ -107,7 +132,9 @@ def save_volume(folder: Path, volume: VolumeFile | Image) -> None:
 
 
 def open_volume(folder: Path) -> Image:
-    """Open the image of a work directory; InputError for the reasons of `open_stored`, or if the folder is damaged."""
+    """Open the image of a work directory; InputError for the reasons of `open_stored`, or if the
+    folder is damaged.
+    """
     path = folder / VOLUME_NAME
     try:
         words = json.loads(path.read_text("utf-8"))
@@ -122,11 +149,14 @@ def open_volume(folder: Path) -> Image:
 
 
 def save_arrays(path: Path, arrays: dict[str, NDArray], text: dict[str, Any]) -> None:
-    """Write arrays and further information, whole or not at all; each with its checksum (CRC-32)."""
+    """Write arrays and further information, whole or not at all; each with its checksum
+    (CRC-32).
+    """
     words = np.frombuffer(json.dumps(text, sort_keys=True).encode(), dtype=np.uint8)
     size = sum(array.nbytes for array in arrays.values())
     with written_whole(path, size) as temporary, temporary.open("wb") as stream:
-        # The text last: a damaged length may swallow the following entries, and a missing text is noticed.
+        # The text last: a damaged length may swallow the following entries, and a missing text is
+        # noticed.
         np.savez(stream, **arrays, **{TEXT_NAME: words})  # type: ignore[arg-type]
 
 
@@ -144,7 +174,9 @@ def load_arrays(path: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
 def _damaged(path: Path, error: Exception) -> InputError:
     """Return the error for a damaged file that cannot be recreated."""
     words = plain(" ".join(str(error).split()))
-    return InputError(f"{path}: the file is damaged ({words}); remove {path.parent} and run this again")
+    return InputError(
+        f"{path}: the file is damaged ({words}); remove {path.parent} and run this again"
+    )
 
 
 def checksum(arrays: dict[str, NDArray], text: dict[str, Any]) -> str:
@@ -174,7 +206,8 @@ def save_state(folder: Path, state: WorkState, mesh: dict[str, NDArray]) -> None
 
 
 def load_state(folder: Path, request: str) -> WorkState | None:
-    """Return the state after the last complete round of a run with this request; None if there is none.
+    """Return the state after the last complete round of a run with this request; None if there is
+    none.
 
     Raises
     ------
@@ -187,7 +220,8 @@ def load_state(folder: Path, request: str) -> WorkState | None:
     state = WorkState(**load_arrays(path)[1])
     if state.request != request:
         raise InputError(
-            f"{folder}: work directory of another, unfinished run; resume it with the same options and "
+            f"{folder}: work directory of another, unfinished run; resume it with the same "
+            "options and "
             "image, or remove it"
         )
     return state

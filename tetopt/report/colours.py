@@ -1,4 +1,6 @@
-"""Colours of labels, suited to the colour-blind and the same in every picture of a volume; greys of intensities."""
+"""Colours of labels, suited to the colour-blind and the same in every picture of a volume; greys
+of intensities.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +22,9 @@ def label_colours(
 ) -> NDArray[np.float64]:
     """Return the colour of each label.
 
-    A label has the same colour in all pictures: its `own`, e.g. from `tetopt.model.labels.LabelTable.colours`, or
-    that of its number (`tetopt.contents.labels.colours_by_number`). 0, the background, is always light grey, although
+    A label has the same colour in all pictures: its `own`, e.g. from
+    `tetopt.model.labels.LabelTable.colours`, or that of its number
+    (`tetopt.contents.labels.colours_by_number`). 0, the background, is always light grey, although
     label tables make it black.
 
     Parameters
@@ -48,16 +51,21 @@ def plain_text(text: str) -> str:
 
 
 def grey_limits(values: Sequence[NDArray], brightest: float = 99.5) -> tuple[float, float]:
-    """Return the values drawn black and white, always distinct: the 0.5 and the `brightest` percentile of `values`."""
+    """Return the values drawn black and white, always distinct: the 0.5 and the `brightest`
+    percentile of `values`.
+    """
     low, high = np.percentile(np.concatenate([part.ravel() for part in values]), [0.5, brightest])
     return (float(low), float(high)) if high > low else (float(low) - 0.5, float(low) + 0.5)
 
 
 def legend_patches(
-    labels: NDArray[np.int64], colours: NDArray[np.float64], shown: NDArray[np.integer],
+    labels: NDArray[np.int64],
+    colours: NDArray[np.float64],
+    shown: NDArray[np.integer],
     names: Mapping[int, str] | None = None,
-) -> list[Patch]:  # fmt: skip
-    """Return a legend's entries: the `LISTED_LABELS` labels that cover most, ascending, and the number of others.
+) -> list[Patch]:
+    """Return a legend's entries: the `LISTED_LABELS` labels that cover most, ascending, and the
+    number of others.
 
     Parameters
     ----------

@@ -18,20 +18,35 @@ from tetopt.model.labels import NO_TABLE, LabelTable, table_of_labels
 from tetopt.report.colours import grey_limits, label_colours
 
 COLOUR_MAP = "viridis"  # perceptually even
-MOST_CATEGORIES = 128  # whole numbers with more values are a quantity: a longer list of colours is unreadable
+# whole numbers with more values are a quantity: a longer list of colours is unreadable
+MOST_CATEGORIES = 128
 NO_VALUE = "#aaaaaa"  # colour of cells whose value is NaN
-OUTLIERS_PERCENT = 1.0  # of the cells, at either end of a field, which do not affect its colour range
+# of the cells, at either end of a field, which do not affect its colour range
+OUTLIERS_PERCENT = 1.0
 # Fields that tetopt writes: they are quantities, even if their values are whole numbers.
 FIELD_UNITS = {
-    "mean": "intensity", "variance": "intensity²", "n_voxels": "voxels", "min": "intensity", "max": "intensity",
-    "volume": "mm³", "rho": "0 to 1/3", "min_dihedral": "degrees", "young": "kPa", "displacement": "mm",
-    "von_mises": "kPa", "von_mises_nodes": "kPa", "young_nodes": "kPa", "density": "kg/m³",
-}  # fmt: skip
-LABEL_FIELD = "label"  # the cell data to which a table's names and colours belong, and by which labels are selected
+    "mean": "intensity",
+    "variance": "intensity²",
+    "n_voxels": "voxels",
+    "min": "intensity",
+    "max": "intensity",
+    "volume": "mm³",
+    "rho": "0 to 1/3",
+    "min_dihedral": "degrees",
+    "young": "kPa",
+    "displacement": "mm",
+    "von_mises": "kPa",
+    "von_mises_nodes": "kPa",
+    "young_nodes": "kPa",
+    "density": "kg/m³",
+}
+# the cell data to which a table's names and colours belong, and by which labels are selected
+LABEL_FIELD = "label"
 DISPLACEMENT = "displacement"  # the point data that deform the mesh
 STEP_NAME = re.compile(r"(.+)_step([1-9]\d*)")  # of results of the second and further steps
 ROUNDED_FRACTION = 1e-9  # of the upper limit: a smaller lower limit is 0 up to rounding
-SEEN_FRACTION = 0.05  # of the mesh's diagonal: initial length of the largest displacement, so that it is visible
+# of the mesh's diagonal: initial length of the largest displacement, so that it is visible
+SEEN_FRACTION = 0.05
 MOST_TIMES = 5.0  # the initial factor: beyond, cells lose their shapes
 ROUND_NUMBERS = (1.0, 2.0, 5.0, 10.0)  # times powers of ten, the values of the factor
 
@@ -43,7 +58,8 @@ class Field(NamedTuple):
     unit: str  # "" if unknown
     values: NDArray[np.float32]  # (M,); for a field of nodes, the mean of each cell's corners
     limits: tuple[float, float]  # the range of the colour map; always distinct
-    categories: list[tuple[int, str]]  # value and colour "#rrggbb" of labels, ascending; empty for a quantity
+    # value and colour "#rrggbb" of labels, ascending; empty for a quantity
+    categories: list[tuple[int, str]]
     nodes: NDArray[np.float32] | None = None  # (N,), interpolated; None for a field of cells
     step: int = 0  # load step, from 1; 0 without a step, or for the only one
     names: dict[int, str] = {}  # noqa: RUF012 - never changed; names of categories
@@ -60,7 +76,8 @@ class Exhibit(NamedTuple):
     sets: dict[str, NDArray]  # (K, 3) integer: the nodes of facets, by name
     displacements: dict[int, NDArray[np.float64]]  # (N, 3) mm by step; a single one under 0
     n_nodes: int  # includes the mid-edge nodes of order 2, which are not drawn
-    reactions: dict[int, dict[str, list[float]]]  # by the same steps and by set: its reaction, (3,) mN
+    # by the same steps and by set: its reaction, (3,) mN
+    reactions: dict[int, dict[str, list[float]]]
 
 
 def exhibit(
@@ -80,18 +97,19 @@ def exhibit(
     mesh : Mesh
         Tetrahedra, world mm (RAS+).
     cell_data : dict of arrays of M rows
-        By name, as `tetopt.load_mesh` returns them. Data with one number per cell are fields: whole numbers from 0
-        with up to `MOST_CATEGORIES` values are labels, all others are quantities. Without any, the fields of
-        `tetopt.cell_fields` are used.
+        By name, as `tetopt.load_mesh` returns them. Data with one number per cell are fields: whole
+        numbers from 0 with up to `MOST_CATEGORIES` values are labels, all others are quantities.
+        Without any, the fields of `tetopt.cell_fields` are used.
     image : Image, optional
         Shown in the plane of the cut.
     title : str
     facet_sets : dict of (K, 3) integer, optional
         Triples of nodes to highlight, by name.
     point_data : dict of arrays of N rows or more, optional
-        By name; the first N rows belong to the mesh's nodes, later ones (mid-edge nodes of quadratic cells) are not
-        drawn. Data with one number per node are quantities. "displacement" (3 columns, mm) deforms the mesh, and its
-        length is a field; "displacement_step2" and so on define steps, and data with such a suffix belong to that step.
+        By name; the first N rows belong to the mesh's nodes, later ones (mid-edge nodes of
+        quadratic cells) are not drawn. Data with one number per node are quantities. "displacement"
+        (3 columns, mm) deforms the mesh, and its length is a field; "displacement_step2" and so on
+        define steps, and data with such a suffix belong to that step.
     reactions : dict, optional
         Reaction by step, from 1, and facet set: three numbers, mN.
     table : LabelTable
@@ -100,25 +118,36 @@ def exhibit(
     Raises
     ------
     InputError
-        The mesh has triangles; the length of a field is not the number of cells, or is less than the number of nodes;
-        the image is not 3-D; a facet set does not consist of triples of the mesh's nodes.
+        The mesh has triangles; the length of a field is not the number of cells, or is less than
+        the number of nodes; the image is not 3-D; a facet set does not consist of triples of the
+        mesh's nodes.
     """
     if mesh.ndim != 3:
         raise InputError(
-            "view: expected a tetrahedral mesh, got triangles; open 2-D meshes in another program, such as ParaView"
+            "view: expected a tetrahedral mesh, got triangles; open 2-D meshes in another "
+            "program, such as ParaView"
         )
     if image is not None and image.ndim != 3:
-        raise InputError(f"view: expected a 3-D image for a tetrahedral mesh, got a {image.ndim}-D one")
+        raise InputError(
+            f"view: expected a 3-D image for a tetrahedral mesh, got a {image.ndim}-D one"
+        )
     for name, values in cell_data.items():
         if len(values) != len(mesh.cells):
             raise InputError(
-                f"view: expected one row of {name!r} for each of {len(mesh.cells)} cells, got {len(values)}; "
+                f"view: expected one row of {name!r} for each of {len(mesh.cells)} cells, got "
+                f"{len(values)}; "
                 "pass the data of this mesh"
             )
     arrays = {name: np.asarray(values) for name, values in cell_data.items()}
-    scalars = {name: values for name, values in arrays.items() if values.ndim == 1 and values.dtype.kind in "buif"}
+    scalars = {
+        name: values
+        for name, values in arrays.items()
+        if values.ndim == 1 and values.dtype.kind in "buif"
+    }
     at_nodes, displacements, others = _nodal(mesh, point_data or {})
-    fields = [_field(name, values[mesh.cells].mean(axis=1), values) for name, values in at_nodes.items()]
+    fields = [
+        _field(name, values[mesh.cells].mean(axis=1), values) for name, values in at_nodes.items()
+    ]
     fields += [
         _field(name, values, table=table if name == LABEL_FIELD else NO_TABLE)
         for name, values in (scalars or cell_fields(mesh, image)).items()
@@ -127,14 +156,19 @@ def exhibit(
     if len(displacements) > 1:
         skipped = list(dict.fromkeys(STEP_NAME.sub(r"\1", name) for name in skipped))
     checked = _checked_sets(mesh, facet_sets or {})
-    forces = {step if len(displacements) > 1 else 0: by_set for step, by_set in (reactions or {}).items()}
+    forces = {
+        step if len(displacements) > 1 else 0: by_set for step, by_set in (reactions or {}).items()
+    }
     n_nodes = max([len(mesh.points), *(len(rows) for rows in (point_data or {}).values())])
     shown = _by_step(fields, displacements)
     return Exhibit(mesh, shown, skipped, image, title, checked, displacements, n_nodes, forces)
 
 
-def opened_on(shown: Exhibit, name: str | None = None, limits: tuple[float, float] | None = None) -> Exhibit:
-    """Return the exhibit with the named field first, whose colours it opens with, and with these colour limits.
+def opened_on(
+    shown: Exhibit, name: str | None = None, limits: tuple[float, float] | None = None
+) -> Exhibit:
+    """Return the exhibit with the named field first, whose colours it opens with, and with these
+    colour limits.
 
     Raises
     ------
@@ -143,32 +177,52 @@ def opened_on(shown: Exhibit, name: str | None = None, limits: tuple[float, floa
     """
     names = [field.name for field in shown.fields]
     if name is not None and name not in names:
-        raise InputError(f'field: the mesh has no field "{name}"; it has {", ".join(dict.fromkeys(names))}')
-    fields = sorted(shown.fields, key=lambda field: field.name != (names[0] if name is None else name))
+        raise InputError(
+            f'field: the mesh has no field "{name}"; it has {", ".join(dict.fromkeys(names))}'
+        )
+    fields = sorted(
+        shown.fields, key=lambda field: field.name != (names[0] if name is None else name)
+    )
     if limits is not None:
         if not -np.inf < limits[0] < limits[1] < np.inf:
-            raise InputError(f"range: expected LOW,HIGH with LOW below HIGH, got {limits[0]:g},{limits[1]:g}")
+            raise InputError(
+                f"range: expected LOW,HIGH with LOW below HIGH, got {limits[0]:g},{limits[1]:g}"
+            )
         if fields[0].categories:
-            raise InputError(f'range: "{fields[0].name}" has labels, which have fixed colours; give another `field`')
+            raise InputError(
+                f'range: "{fields[0].name}" has labels, which have fixed colours; give another '
+                "`field`"
+            )
         first = fields[0].name
-        fields = [field._replace(limits=limits) if field.name == first else field for field in fields]
+        fields = [
+            field._replace(limits=limits) if field.name == first else field for field in fields
+        ]
     return shown._replace(fields=fields)
 
 
 def warp_factors(shown: Exhibit) -> tuple[float, float]:
-    """Return the initial factor of displacements, 1 or more, which makes them visible, and the largest factor."""
-    largest = max((float(np.sqrt((u**2).sum(axis=1)).max()) for u in shown.displacements.values()), default=0.0)
+    """Return the initial factor of displacements, 1 or more, which makes them visible, and the
+    largest factor.
+    """
+    largest = max(
+        (float(np.sqrt((u**2).sum(axis=1)).max()) for u in shown.displacements.values()),
+        default=0.0,
+    )
     diagonal = float(np.sqrt((np.ptp(shown.mesh.points, axis=0) ** 2).sum()))
     if largest <= ROUNDED_FRACTION * diagonal:  # undeformed
         return 1.0, MOST_TIMES
     factor = SEEN_FRACTION * diagonal / largest
     power = 10.0 ** np.floor(np.log10(factor))
-    first = max(1.0, power * min(ROUND_NUMBERS, key=lambda number: abs(np.log(factor / power / number))))
+    first = max(
+        1.0, power * min(ROUND_NUMBERS, key=lambda number: abs(np.log(factor / power / number)))
+    )
     return float(first), MOST_TIMES * float(first)
 
 
 def first_axis(shown: Exhibit) -> int:
-    """Return the axis of the first cut, which makes the section largest or shows most of a deformation."""
+    """Return the axis of the first cut, which makes the section largest or shows most of a
+    deformation.
+    """
     if not shown.displacements:
         return int(np.argmin(np.ptp(shown.mesh.points, axis=0)))
     return int(np.argmin(np.abs(next(iter(shown.displacements.values()))).sum(axis=0)))
@@ -177,19 +231,26 @@ def first_axis(shown: Exhibit) -> int:
 def _nodal(
     mesh: Mesh, point_data: dict[str, NDArray]
 ) -> tuple[dict[str, NDArray], dict[int, NDArray[np.float64]], list[str]]:
-    """Return numbers by name, lengths of displacements first; displacements by step; and the names of other data."""
+    """Return numbers by name, lengths of displacements first; displacements by step; and the
+    names of other data.
+    """
     numbers: dict[str, NDArray] = {}
     displacements: dict[int, NDArray[np.float64]] = {}
     others = []
     for name, rows in point_data.items():
         if len(rows) < len(mesh.points):
             raise InputError(
-                f"view: expected one row of {name!r} for each of {len(mesh.points)} nodes, got {len(rows)}; "
+                f"view: expected one row of {name!r} for each of {len(mesh.points)} nodes, got "
+                f"{len(rows)}; "
                 "pass the data of this mesh"
             )
         values = np.asarray(rows)[: len(mesh.points)]
         match = STEP_NAME.fullmatch(name)
-        if (match[1] if match else name) == DISPLACEMENT and values.shape[1:] == (3,) and np.isfinite(values).all():
+        if (
+            (match[1] if match else name) == DISPLACEMENT
+            and values.shape[1:] == (3,)
+            and np.isfinite(values).all()
+        ):
             displacements[int(match[2]) if match else 1] = values.astype(np.float64)
             numbers[name] = np.sqrt((values.astype(np.float64) ** 2).sum(axis=1))
         elif values.ndim == 1 and values.dtype.kind in "buif":
@@ -216,7 +277,9 @@ def _by_step(fields: list[Field], displacements: dict[int, NDArray[np.float64]])
     ]
 
 
-def _field(name: str, values: NDArray, nodes: NDArray | None = None, table: LabelTable = NO_TABLE) -> Field:
+def _field(
+    name: str, values: NDArray, nodes: NDArray | None = None, table: LabelTable = NO_TABLE
+) -> Field:
     """Create a field of cells, or of nodes with its mean over the corners of each cell."""
     values, at_nodes = _single(values), None if nodes is None else _single(nodes)
     shown = values if at_nodes is None else at_nodes
@@ -224,7 +287,10 @@ def _field(name: str, values: NDArray, nodes: NDArray | None = None, table: Labe
     unit = FIELD_UNITS.get(STEP_NAME.sub(r"\1", name), "")
     if len(finite) == 0:
         return Field(name, unit, values, (0.0, 1.0), [], at_nodes)
-    low, high = (float(limit) for limit in np.percentile(finite, [OUTLIERS_PERCENT, 100.0 - OUTLIERS_PERCENT]))
+    low, high = (
+        float(limit)
+        for limit in np.percentile(finite, [OUTLIERS_PERCENT, 100.0 - OUTLIERS_PERCENT])
+    )
     low = 0.0 if abs(low) < ROUNDED_FRACTION * high else low
     limits = (low, high) if high > low else grey_limits([finite])
     is_quantity = unit or at_nodes is not None
@@ -241,28 +307,36 @@ def _single(values: NDArray) -> NDArray[np.float32]:
 
 
 def _categories(values: NDArray[np.float64], table: LabelTable) -> list[tuple[int, str]]:
-    """Return labels and their colours; none if values are negative, not whole, or too many for a list of colours."""
+    """Return labels and their colours; none if values are negative, not whole, or too many for a
+    list of colours.
+    """
     if (values != np.rint(values)).any() or values.min() < 0 or values.max() > LARGEST_LABEL:
         return []
     labels = np.unique(values).astype(np.int64)
     if len(labels) > MOST_CATEGORIES:
         return []
-    return list(zip(labels.tolist(), map(to_hex, label_colours(labels, table.colours)), strict=True))
+    return list(
+        zip(labels.tolist(), map(to_hex, label_colours(labels, table.colours)), strict=True)
+    )
 
 
 def _checked_sets(mesh: Mesh, facet_sets: dict[str, NDArray]) -> dict[str, NDArray]:
-    """Return the sets as arrays; InputError unless each consists of triples (K, 3) of the mesh's nodes."""
+    """Return the sets as arrays; InputError unless each consists of triples (K, 3) of the mesh's
+    nodes.
+    """
     sets = {name: np.asarray(nodes) for name, nodes in facet_sets.items()}
     last = len(mesh.points) - 1
     for name, nodes in sets.items():
         if nodes.ndim != 2 or nodes.shape[1] != 3 or nodes.dtype.kind not in "iu":
             raise InputError(
-                f"facet set {name!r}: expected (K, 3) whole numbers, the nodes of each facet, got {nodes.shape} of "
+                f"facet set {name!r}: expected (K, 3) whole numbers, the nodes of each facet, "
+                f"got {nodes.shape} of "
                 f"{nodes.dtype}"
             )
         if nodes.size and not (nodes.min() >= 0 and nodes.max() <= last):
             raise InputError(
-                f"facet set {name!r}: expected nodes 0..{last}, got {nodes.min()}..{nodes.max()}; pass the sets of "
+                f"facet set {name!r}: expected nodes 0..{last}, got "
+                f"{nodes.min()}..{nodes.max()}; pass the sets of "
                 "this mesh"
             )
     return sets

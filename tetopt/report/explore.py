@@ -1,4 +1,5 @@
-"""A page to explore a mesh and its image: cut it, colour it, select cells; drawn by `explore*.js` in WebGL.
+"""A page to explore a mesh and its image: cut it, colour it, select cells; drawn by `explore*.js`
+in WebGL.
 
 A single file without external references, which needs only a browser.
 """
@@ -17,7 +18,15 @@ from tetopt.geometry.box import box_sides
 from tetopt.image import Image
 from tetopt.io.text import plain
 from tetopt.report.colours import grey_limits
-from tetopt.report.exhibit import COLOUR_MAP, LABEL_FIELD, NO_VALUE, Exhibit, Field, first_axis, warp_factors
+from tetopt.report.exhibit import (
+    COLOUR_MAP,
+    LABEL_FIELD,
+    NO_VALUE,
+    Exhibit,
+    Field,
+    first_axis,
+    warp_factors,
+)
 from tetopt.report.page import data_html, packed, policy_html, printed, rendered, script_html
 from tetopt.system.files import save_text
 
@@ -27,7 +36,9 @@ PAGE_SIDE_VOXELS = 2048  # along an axis, which nearly all graphics cards suppor
 
 def colour_table() -> NDArray[np.uint8]:
     """Return the colour map of quantities, (256, 3) red, green and blue."""
-    return np.rint(255.0 * matplotlib.colormaps[COLOUR_MAP](np.linspace(0.0, 1.0, 256))[:, :3]).astype(np.uint8)
+    return np.rint(
+        255.0 * matplotlib.colormaps[COLOUR_MAP](np.linspace(0.0, 1.0, 256))[:, :3]
+    ).astype(np.uint8)
 
 
 def save_explorer(path: str | Path, shown: Exhibit) -> None:
@@ -41,10 +52,11 @@ def save_explorer(path: str | Path, shown: Exhibit) -> None:
 def explorer_html(shown: Exhibit) -> str:
     """Return a page to turn, cut, colour and threshold a tetrahedral mesh, together with its image.
 
-    The page contains everything, and forbids itself all network access. It shows a message in a browser without WebGL 2
-    or scripts. 1 M cells take 24 MB, each field 5 MB, and the image 1.3 bytes per voxel. The image is drawn in grey
-    from its 0.5 to its 99.5 percentile, with each voxel placed by the affine; above `PAGE_IMAGE_VOXELS` neighbouring
-    voxels are averaged, and the page notes this.
+    The page contains everything, and forbids itself all network access. It shows a message in a
+    browser without WebGL 2 or scripts. 1 M cells take 24 MB, each field 5 MB, and the image 1.3
+    bytes per voxel. The image is drawn in grey from its 0.5 to its 99.5 percentile, with each voxel
+    placed by the affine; above `PAGE_IMAGE_VOXELS` neighbouring voxels are averaged, and the page
+    notes this.
     """
     mesh, fields, skipped, image, title, sets, displacements, n_nodes, reactions = shown
     centre = (mesh.points.min(axis=0) + mesh.points.max(axis=0)) / 2.0
@@ -52,7 +64,8 @@ def explorer_html(shown: Exhibit) -> str:
         "centre": centre.tolist(),
         "points": packed(mesh.points - centre, "<f4"),
         "cells": packed(mesh.cells, "<u4"),
-        "volumes": None if mesh.midpoints is None else packed(mesh.cell_volumes, "<f4"),  # of curved cells
+        # of curved cells
+        "volumes": None if mesh.midpoints is None else packed(mesh.cell_volumes, "<f4"),
         "labelField": LABEL_FIELD,
         "fields": [_packed_field(field) for field in fields],
         "skipped": skipped,
@@ -60,13 +73,19 @@ def explorer_html(shown: Exhibit) -> str:
         "image": None if image is None else _packed_image(image, centre),
         "sets": [{"name": name, "triangles": packed(nodes, "<u4")} for name, nodes in sets.items()],
         "noValue": NO_VALUE,
-        "displacements": [{"step": step, "u": packed(u, "<f4")} for step, u in displacements.items()],
+        "displacements": [
+            {"step": step, "u": packed(u, "<f4")} for step, u in displacements.items()
+        ],
         "nNodes": n_nodes,
         "reactions": reactions,
         "factors": warp_factors(shown),
         "axis": first_axis(shown),
     }
-    markup = {"policy": policy_html(), "data": data_html("data", data), "script": script_html("explorer")}
+    markup = {
+        "policy": policy_html(),
+        "data": data_html("data", data),
+        "script": script_html("explorer"),
+    }
     return printed(f"{rendered('report/explore.html', title=plain(title), **markup)}\n")
 
 
@@ -76,7 +95,9 @@ def _packed_field(field: Field) -> dict[str, Any]:
 
 
 def _packed_image(image: Image, centre: NDArray[np.float64]) -> dict[str, Any]:
-    """Pack the image as bytes, the first axis fastest, with the map from places relative to `centre` to indices."""
+    """Pack the image as bytes, the first axis fastest, with the map from places relative to
+    `centre` to indices.
+    """
     shape = _shown_shape(image.shape)
     shown = image if shape == image.shape else averaged(image, shape)
     low, high = grey_limits([shown.data.astype(np.float64)])
@@ -96,7 +117,9 @@ def _packed_image(image: Image, centre: NDArray[np.float64]) -> dict[str, Any]:
 
 
 def _shown_shape(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the image's shape or, if that is too large for the page, a coarser one; the longest axes shrink first."""
+    """Return the image's shape or, if that is too large for the page, a coarser one; the longest
+    axes shrink first.
+    """
     sizes = np.minimum(shape, PAGE_SIDE_VOXELS)
     longest = int(sizes.max())
     while np.prod(np.minimum(sizes, longest), dtype=np.int64) > PAGE_IMAGE_VOXELS:

@@ -29,13 +29,20 @@ from tetopt.measure.fidelity import cell_labels, half_level_surface
 from tetopt.measure.quality import BAD_SHAPE, quality_errors, rho_histogram
 from tetopt.mesh import Mesh
 from tetopt.model.labels import NO_TABLE, LabelTable
-from tetopt.report.colours import LISTED_LABELS, UNCOVERED_COLOUR, grey_limits, label_colours, legend_patches
+from tetopt.report.colours import (
+    LISTED_LABELS,
+    UNCOVERED_COLOUR,
+    grey_limits,
+    label_colours,
+    legend_patches,
+)
 from tetopt.report.tables import nodes_in_words
 from tetopt.system.files import check_suffix, written_whole
 
 matplotlib.use("agg")
 FIGURE_SUFFIXES = (".png",)
-# Colours of histograms and curves: grey, then ColorBrewer's Dark2, which the colour-blind can distinguish.
+# Colours of histograms and curves: grey, then ColorBrewer's Dark2, which the colour-blind can
+# distinguish.
 CURVE_COLOURS = ("#7f7f7f", "#d95f02", "#1b9e77", "#7570b3")
 MESH_LINE = "#ffb000"  # orange, visible on every grey
 MASK_LINE = "#1e90ff"  # blue, which the colour-blind can distinguish from the orange
@@ -53,36 +60,52 @@ def save_figure(figure: Figure, path: str | Path, dpi: int = 150) -> None:
 
 
 def save_run_figures(
-    paths: Sequence[Path], image: Image, initial: Mesh, result: MeshingResult, start: str = "lattice",
-    whole: Image | None = None, mask: Image | None = None, order: int = 1,
-) -> None:  # fmt: skip
-    """Write three PNGs of a run: slice with mesh before and after, rho histograms before and after, energies.
+    paths: Sequence[Path],
+    image: Image,
+    initial: Mesh,
+    result: MeshingResult,
+    start: str = "lattice",
+    whole: Image | None = None,
+    mask: Image | None = None,
+    order: int = 1,
+) -> None:
+    """Write three PNGs of a run: slice with mesh before and after, rho histograms before and after,
+    energies.
 
-    `paths` are their names, and `start` names the initial mesh; cells have this `order`. If `image` is extended beyond
-    a mask, `whole` is the image to show.
+    `paths` are their names, and `start` names the initial mesh; cells have this `order`. If `image`
+    is extended beyond a mask, `whole` is the image to show.
     """
     first, last = result.history[0], result.history[-1]
     fit = f"{last.E_D / first.E_D:.3f} of the initial E_D" if first.E_D > 0.0 else "constant image"
     before = f"{start}, {nodes_in_words(initial, order)}"
     after = f"optimised, {fit}"
     meshes = [(before, initial), (after, result.mesh)]
-    save_figure(slice_figure(image if whole is None else whole, meshes, means_of=image, mask=mask), paths[0])
+    save_figure(
+        slice_figure(image if whole is None else whole, meshes, means_of=image, mask=mask), paths[0]
+    )
     save_figure(histogram_figure(meshes), paths[1])
     save_figure(energy_figure(result.history), paths[2])
 
 
 def slice_figure(
-    image: Image, meshes: Sequence[tuple[str, Mesh]], axis: int | None = None, index: int | None = None,
-    means_of: Image | None = None, mask: Image | None = None,
-) -> Figure:  # fmt: skip
+    image: Image,
+    meshes: Sequence[tuple[str, Mesh]],
+    axis: int | None = None,
+    index: int | None = None,
+    means_of: Image | None = None,
+    mask: Image | None = None,
+) -> Figure:
     """Draw a slice of the volume with the section of each mesh, and below it the mean of each cell.
 
-    `axis` and `index` choose the slice in voxel indices; by default it is the middle slice across the axis nearest to
-    the world's z (an axial slice), or the mesh's middle one if the mesh does not reach it. A 2-D image is shown whole.
-    Black and white are those of the voxels in the last mesh and its mask. The means are those of `means_of`, by default
-    of the image itself. In their row, parts of the image that a mesh does not cover are light blue.
+    `axis` and `index` choose the slice in voxel indices; by default it is the middle slice across
+    the axis nearest to the world's z (an axial slice), or the mesh's middle one if the mesh does
+    not reach it. A 2-D image is shown whole. Black and white are those of the voxels in the last
+    mesh and its mask. The means are those of `means_of`, by default of the image itself. In their
+    row, parts of the image that a mesh does not cover are light blue.
     """
-    view = SliceView(image, axis, _slice_through(meshes[-1][1], image, axis) if index is None else index)
+    view = SliceView(
+        image, axis, _slice_through(meshes[-1][1], image, axis) if index is None else index
+    )
     figure = Figure(figsize=(5.2 * len(meshes), 10.0 * view.aspect + 1.0), layout="constrained")
     grid = figure.subplots(2, len(meshes), squeeze=False)
     limits = limits_within(image, meshes[-1][1], [view], mask)
@@ -102,11 +125,17 @@ def slice_figure(
 
 def _curved_words(mesh: Mesh) -> str:
     """Return a line for the title of a slice through curved cells."""
-    return "" if mesh.midpoints is None else f"\ncurved cells drawn as {mesh.straight_pieces()[1]} straight ones"
+    return (
+        ""
+        if mesh.midpoints is None
+        else f"\ncurved cells drawn as {mesh.straight_pieces()[1]} straight ones"
+    )
 
 
 def _slice_through(mesh: Mesh, image: Image, axis: int | None) -> int | None:
-    """Return the index of the middle slice of a mesh that does not reach the image's middle one; None otherwise."""
+    """Return the index of the middle slice of a mesh that does not reach the image's middle one;
+    None otherwise.
+    """
     if image.ndim == 2:
         return None
     across = world_axes(image.affine).index(2) if axis is None else axis
@@ -119,13 +148,17 @@ def _slice_through(mesh: Mesh, image: Image, axis: int | None) -> int | None:
 def limits_within(
     image: Image, mesh: Mesh, views: Sequence[SliceView], mask: Image | None = None
 ) -> tuple[float, float]:
-    """Return the values drawn black and white in views of an image: those of the voxels in the mesh and its mask."""
+    """Return the values drawn black and white in views of an image: those of the voxels in the
+    mesh and its mask.
+    """
     inside = cell_of_voxel(image, mesh) >= 0
     inside &= True if mask is None else mask.data >= INSIDE_FRACTION
     pixels = [view.pixels for view in views]
     if not inside.all():
         covered = Image(inside, image.affine)
-        pixels = [view.pixels[SliceView(covered, view.across, view.index).pixels > 0.0] for view in views]
+        pixels = [
+            view.pixels[SliceView(covered, view.across, view.index).pixels > 0.0] for view in views
+        ]
     if sum(map(np.size, pixels)) == 0:
         pixels = [image.data[inside] if inside.any() else image.data]
     return grey_limits(pixels, brightest=99.8)
@@ -133,18 +166,28 @@ def limits_within(
 
 def draw_edges(axes: Axes, polygons: NDArray[np.float64]) -> None:
     """Draw the edges of a section's polygons over a slice."""
-    # Each line belongs to two polygons and is drawn twice. Where there are many, lines of full width (in points) would
-    # hide the image.
+    # Each line belongs to two polygons and is drawn twice. Where there are many, lines of full
+    # width (in points) would hide the image.
     width = min(0.6, 20.0 / np.sqrt(max(len(polygons), 1)))
-    axes.add_collection(PolyCollection(list(polygons), facecolors="none", edgecolors=MESH_LINE, linewidths=width))
+    axes.add_collection(
+        PolyCollection(list(polygons), facecolors="none", edgecolors=MESH_LINE, linewidths=width)
+    )
 
 
 def fill_cells(
-    axes: Axes, polygons: NDArray[np.float64], values: NDArray[np.float64], colours: str, limits: tuple[float, float]
+    axes: Axes,
+    polygons: NDArray[np.float64],
+    values: NDArray[np.float64],
+    colours: str,
+    limits: tuple[float, float],
 ) -> PolyCollection:
-    """Fill a section's polygons with values (K,) in the colours of a map, and the rest with light blue."""
+    """Fill a section's polygons with values (K,) in the colours of a map, and the rest with
+    light blue.
+    """
     # With antialiasing, the background would show along each border as a light seam.
-    painted = PolyCollection(list(polygons), array=values, cmap=colours, edgecolors="none", antialiaseds=False)
+    painted = PolyCollection(
+        list(polygons), array=values, cmap=colours, edgecolors="none", antialiaseds=False
+    )
     painted.set_clim(*limits)
     axes.set_facecolor(UNCOVERED_COLOUR)
     axes.add_collection(painted)
@@ -159,7 +202,8 @@ def label_figure(
     table: LabelTable = NO_TABLE,
     order: int = 1,
 ) -> Figure:
-    """Draw the labels of voxels and those of cells side by side, in the same colours and in three planes.
+    """Draw the labels of voxels and those of cells side by side, in the same colours and in three
+    planes.
 
     Parameters
     ----------
@@ -167,10 +211,11 @@ def label_figure(
         Whole numbers from 0 to `tetopt.contents.labels.LARGEST_LABEL`.
     mesh : Mesh
     of_cell : (M,) int64, optional
-        Label of each cell; by default that of most of its voxels (`tetopt.measure.fidelity.cell_labels`).
+        Label of each cell; by default that of most of its voxels
+        (`tetopt.measure.fidelity.cell_labels`).
     image : Image, optional
-        On the labels' voxels. A third column shows it with the interfaces of the cells' labels, each in the colour of
-        the adjacent label with fewer cells.
+        On the labels' voxels. A third column shows it with the interfaces of the cells' labels,
+        each in the colour of the adjacent label with fewer cells.
     table : LabelTable
         Names and colours of labels.
     order : {1, 2}
@@ -179,9 +224,9 @@ def label_figure(
     Returns
     -------
     Figure
-        The axial, coronal and sagittal middle slices of the volume, one above the other and in one scale; a 2-D image
-        is shown whole. The legend lists the labels that cover most; if it cannot list all, numbers are also written
-        into the picture of the voxels where they fit.
+        The axial, coronal and sagittal middle slices of the volume, one above the other and in one
+        scale; a 2-D image is shown whole. The legend lists the labels that cover most; if it cannot
+        list all, numbers are also written into the picture of the voxels where they fit.
 
     Raises
     ------
@@ -190,41 +235,67 @@ def label_figure(
     """
     of_cell = cell_labels(labels, mesh) if of_cell is None else of_cell
     values = np.unique(np.concatenate([np.unique(labels.data).astype(np.int64), of_cell]))
-    of_cell = np.searchsorted(values, of_cell)  # rows of these, of which there are fewer than numbers
+    # rows of these, of which there are fewer than numbers
+    of_cell = np.searchsorted(values, of_cell)
     colours = label_colours(values, table.colours)
     views = _middle_views(Image(np.searchsorted(values, labels.data), labels.affine))
     pixels = [view.pixels.astype(np.int64) for view in views]
     cuts = [view.section(mesh) for view in views]
-    shown = _counted(pixels, len(colours)) + (_counted([of_cell[cells] for _, cells in cuts], len(colours)) > 0)
+    shown = _counted(pixels, len(colours)) + (
+        _counted([of_cell[cells] for _, cells in cuts], len(colours)) > 0
+    )
     width, heights = max(view.size[0] for view in views), [view.size[1] for view in views]
     inches = min(SLICE_WIDTH_INCHES / width, SLICES_HEIGHT_INCHES / sum(heights))  # per mm
-    handles, n_columns = legend_patches(values, colours, shown, table.names), 2 if image is None else 3
+    handles, n_columns = (
+        legend_patches(values, colours, shown, table.names),
+        2 if image is None else 3,
+    )
     beside = 1.1 + LETTER_INCHES * max(len(str(handle.get_label())) for handle in handles)
-    figure = Figure(figsize=(n_columns * inches * width + beside, inches * sum(heights) + 0.6), layout="constrained")
+    figure = Figure(
+        figsize=(n_columns * inches * width + beside, inches * sum(heights) + 0.6),
+        layout="constrained",
+    )
     grid = figure.subplots(len(views), n_columns, squeeze=False, height_ratios=heights)
-    for (left, right, *_), view, numbers, (polygons, cells) in zip(grid, views, pixels, cuts, strict=True):
+    for (left, right, *_), view, numbers, (polygons, cells) in zip(
+        grid, views, pixels, cuts, strict=True
+    ):
         left.imshow(colours[numbers.T], origin="lower", extent=view.extent, interpolation="nearest")
         if np.count_nonzero(shown) > LISTED_LABELS:
             _write_numbers(left, view, numbers, values, colours, NUMBER_RADIUS_FRACTION * width)
         line = min(0.2, 10.0 / np.sqrt(max(len(polygons), 1)))  # points
         right.add_collection(
-            PolyCollection(list(polygons), facecolors=colours[of_cell[cells]], edgecolors="black", linewidths=line)
+            PolyCollection(
+                list(polygons),
+                facecolors=colours[of_cell[cells]],
+                edgecolors="black",
+                linewidths=line,
+            )
         )
         for axes in (left, right):
             view.frame(axes)
     grid[0, 0].set_title("labels of the voxels", fontsize=11)
-    grid[0, 1].set_title(f"labels of the cells, {nodes_in_words(mesh, order)}{_curved_words(mesh)}", fontsize=11)
+    grid[0, 1].set_title(
+        f"labels of the cells, {nodes_in_words(mesh, order)}{_curved_words(mesh)}", fontsize=11
+    )
     if image is not None:
         _draw_interfaces(list(grid[:, 2]), image, mesh, of_cell, colours)
         grid[0, 2].set_title("interfaces of the cells over the image", fontsize=11)
-    figure.legend(handles=handles, loc="outside right upper", fontsize=9, frameon=False, title="label")
+    figure.legend(
+        handles=handles, loc="outside right upper", fontsize=9, frameon=False, title="label"
+    )
     return figure
 
 
 def _draw_interfaces(
-    column: Sequence[Axes], image: Image, mesh: Mesh, of_cell: NDArray[np.int64], colours: NDArray[np.float64]
+    column: Sequence[Axes],
+    image: Image,
+    mesh: Mesh,
+    of_cell: NDArray[np.int64],
+    colours: NDArray[np.float64],
 ) -> None:
-    """Draw the middle slices of the image, and over them the sections of interfaces between the cells' labels."""
+    """Draw the middle slices of the image, and over them the sections of interfaces between the
+    cells' labels.
+    """
     views = _middle_views(image)
     limits = limits_within(image, mesh, views)
     n_cells = np.bincount(of_cell, minlength=len(colours))
@@ -233,8 +304,12 @@ def _draw_interfaces(
         rarer = np.take_along_axis(sides, n_cells[sides].argmin(axis=1)[:, None], axis=1).ravel()
         view.show_pixels(axes, limits)
         # A dark line beneath makes light colours visible on white.
-        axes.add_collection(LineCollection(list(lines), colors="black", linewidths=1.6, capstyle="round"))
-        axes.add_collection(LineCollection(list(lines), colors=colours[rarer], linewidths=1.1, capstyle="round"))
+        axes.add_collection(
+            LineCollection(list(lines), colors="black", linewidths=1.6, capstyle="round")
+        )
+        axes.add_collection(
+            LineCollection(list(lines), colors=colours[rarer], linewidths=1.1, capstyle="round")
+        )
         view.frame(axes)
 
 
@@ -244,13 +319,23 @@ def _counted(arrays: Sequence[NDArray[np.int64]], n: int) -> NDArray[np.int64]:
 
 
 def _write_numbers(
-    axes: Axes, view: SliceView, pixels: NDArray[np.int64], values: NDArray[np.int64], colours: NDArray[np.float64],
+    axes: Axes,
+    view: SliceView,
+    pixels: NDArray[np.int64],
+    values: NDArray[np.int64],
+    colours: NDArray[np.float64],
     room: float,
-) -> None:  # fmt: skip
-    """Write the number of each label except 0 at its widest place in the slice, if a circle of `room` mm fits there."""
+) -> None:
+    """Write the number of each label except 0 at its widest place in the slice, if a circle of
+    `room` mm fits there.
+    """
     for row in np.unique(pixels[values[pixels] > 0]):
-        # The transform measures the distance to the nearest outside centre, half a pixel beyond the border.
-        depth = distance_transform_edt(np.pad(pixels == row, 1), view.steps)[1:-1, 1:-1] - 0.5 * view.steps.min()
+        # The transform measures the distance to the nearest outside centre, half a pixel beyond the
+        # border.
+        depth = (
+            distance_transform_edt(np.pad(pixels == row, 1), view.steps)[1:-1, 1:-1]
+            - 0.5 * view.steps.min()
+        )
         deepest = np.unravel_index(depth.argmax(), depth.shape)
         if depth[deepest] >= room:
             is_dark = colours[row] @ (0.299, 0.587, 0.114) < 0.5
@@ -260,16 +345,22 @@ def _write_numbers(
 
 
 def boundary_figure(
-    image: Image, mask: Image, mesh: Mesh, axis: int | None = None, index: int | None = None, word: str = "mask"
+    image: Image,
+    mask: Image,
+    mesh: Mesh,
+    axis: int | None = None,
+    index: int | None = None,
+    word: str = "mask",
 ) -> Figure:
-    """Draw the outline of a mask and the boundary of a mesh over a slice, and an enlarged detail of both.
+    """Draw the outline of a mask and the boundary of a mesh over a slice, and an enlarged detail of
+    both.
 
     Parameters
     ----------
     image : Image
     mask : Image
-        From 0, outside, to 1, inside, on the image's voxels. Its outline is the level 1/2, interpolated linearly
-        between voxel centres.
+        From 0, outside, to 1, inside, on the image's voxels. Its outline is the level 1/2,
+        interpolated linearly between voxel centres.
     mesh : Mesh
         Its boundary is drawn, except on the faces of the image's box.
     axis, index : int, optional
@@ -280,7 +371,8 @@ def boundary_figure(
     Returns
     -------
     Figure
-        The slice, and the square of 25 voxels in it with the longest outline, with the cells' edges.
+        The slice, and the square of 25 voxels in it with the longest outline, with the cells'
+        edges.
 
     Raises
     ------
@@ -288,7 +380,9 @@ def boundary_figure(
         The shape of the mask differs from the image's.
     """
     if mask.shape != image.shape:
-        raise InputError(f"mask: expected the image's shape {image.shape}, got {mask.shape}; resample it")
+        raise InputError(
+            f"mask: expected the image's shape {image.shape}, got {mask.shape}; resample it"
+        )
     view = SliceView(image, axis, index)
     if index is None and view.across is not None:
         filled = np.unique(np.nonzero(mask.data >= 0.5)[view.across])
@@ -296,7 +390,9 @@ def boundary_figure(
     outline = _half_level(SliceView(mask, view.across, view.index))
     boundary = view.boundary(mesh)
     low, high = _longest_part(outline, view)
-    figure = Figure(figsize=(5.2 + 5.2 * view.aspect, 5.2 * view.aspect + 0.7), layout="constrained")
+    figure = Figure(
+        figsize=(5.2 + 5.2 * view.aspect, 5.2 * view.aspect + 0.7), layout="constrained"
+    )
     whole, detail = figure.subplots(1, 2, width_ratios=(1.0, view.aspect))
     limits = limits_within(image, mesh, [view], mask)
     for axes, width in ((whole, 0.7), (detail, 1.8)):
@@ -306,40 +402,59 @@ def boundary_figure(
         axes.add_collection(LineCollection(list(outline), colors=MASK_LINE, linewidths=2.0 * width))
         axes.add_collection(LineCollection(list(boundary), colors=MESH_LINE, linewidths=width))
     polygons, _ = view.section(mesh)
-    detail.add_collection(PolyCollection(list(polygons), facecolors="none", edgecolors=MESH_LINE, linewidths=0.4))
-    whole.add_patch(Rectangle((low[0], low[1]), *(high - low), fill=False, edgecolor="white", linewidth=1.2))
+    detail.add_collection(
+        PolyCollection(list(polygons), facecolors="none", edgecolors=MESH_LINE, linewidths=0.4)
+    )
+    whole.add_patch(
+        Rectangle((low[0], low[1]), *(high - low), fill=False, edgecolor="white", linewidth=1.2)
+    )
     detail.set_xlim(low[0], high[0])
     detail.set_ylim(low[1], high[1])
-    lines = ((MASK_LINE, f"outline of the {word}"), (MESH_LINE, f"boundary of the mesh{_curved_words(mesh)}"))
+    lines = (
+        (MASK_LINE, f"outline of the {word}"),
+        (MESH_LINE, f"boundary of the mesh{_curved_words(mesh)}"),
+    )
     handles = [Line2D([], [], color=colour, linewidth=2.0, label=label) for colour, label in lines]
     figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=10, frameon=False)
     return figure
 
 
 def _half_level(view: SliceView) -> NDArray[np.float64]:
-    """Return the level 1/2 of the pixels as segments (K, 2, 2), picture mm; see `half_level_surface`."""
+    """Return the level 1/2 of the pixels as segments (K, 2, 2), picture mm; see
+    `half_level_surface`.
+    """
     affine = np.diag([*view.steps, 1.0])
     affine[:2, 2] = 0.5 * view.steps
     outline = half_level_surface(view.pixels, affine)
     return outline.points[outline.facets]
 
 
-def _longest_part(outline: NDArray[np.float64], view: SliceView) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the corners, in picture mm, of the square of `DETAIL_VOXELS` voxels that holds most of the outline."""
+def _longest_part(
+    outline: NDArray[np.float64], view: SliceView
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the corners, in picture mm, of the square of `DETAIL_VOXELS` voxels that holds most
+    of the outline.
+    """
     length = np.zeros(view.pixels.shape)
     pixel = (outline.mean(axis=1) / view.steps).astype(np.int64)
-    # Lengths are measured along the nearer axis, so that straight lines through the square count the same in any
-    # direction, and only bent ones count more.
+    # Lengths are measured along the nearer axis, so that straight lines through the square count
+    # the same in any direction, and only bent ones count more.
     np.add.at(length, tuple(pixel.T), np.abs(outline[:, 1] - outline[:, 0]).max(axis=1))
     side = np.minimum(DETAIL_VOXELS * view.steps.max(), view.size)
     around = uniform_filter(length, np.rint(side / view.steps).astype(np.int64), mode="constant")
-    best = np.array(np.unravel_index(around.argmax(), around.shape)) if len(outline) else np.array(around.shape) // 2
+    best = (
+        np.array(np.unravel_index(around.argmax(), around.shape))
+        if len(outline)
+        else np.array(around.shape) // 2
+    )
     low = np.clip((best + 0.5) * view.steps - 0.5 * side, 0.0, view.size - side)
     return low, low + side
 
 
 class SliceView:
-    """One slice of an image in a standard orientation: right, front and top of the patient on fixed sides."""
+    """One slice of an image in a standard orientation: right, front and top of the patient on
+    fixed sides.
+    """
 
     def __init__(self, image: Image, axis: int | None, index: int | None) -> None:
         self.image = image
@@ -352,8 +467,12 @@ class SliceView:
         inside = [a for a in range(image.ndim) if a != self.across]
         self.axes = sorted(inside, key=lambda a: nearest[a])  # horizontal, vertical
         self.flip = [image.affine[nearest[a], a] < 0 for a in self.axes]
-        self.letters = [("LR", "PA", "IS")[nearest[a]] if image.ndim == 3 else "" for a in self.axes]
-        pixels = image.data if self.across is None else np.take(image.data, self.index, axis=self.across)
+        self.letters = [
+            ("LR", "PA", "IS")[nearest[a]] if image.ndim == 3 else "" for a in self.axes
+        ]
+        pixels = (
+            image.data if self.across is None else np.take(image.data, self.index, axis=self.across)
+        )
         pixels = pixels if self.axes == inside else pixels.T
         self.pixels = np.flip(pixels, axis=tuple(np.flatnonzero(self.flip)))
         self.steps = image.spacing[self.axes]  # mm, of a pixel
@@ -363,10 +482,19 @@ class SliceView:
 
     def show_pixels(self, axes: Axes, limits: tuple[float, float]) -> None:
         """Draw the pixels in grey, black and white at the `limits`."""
-        axes.imshow(self.pixels.T, origin="lower", extent=self.extent, cmap="gray", vmin=limits[0], vmax=limits[1])
+        axes.imshow(
+            self.pixels.T,
+            origin="lower",
+            extent=self.extent,
+            cmap="gray",
+            vmin=limits[0],
+            vmax=limits[1],
+        )
 
     def section(self, mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return the polygons (K, 3 or 4, 2) of the mesh in the slice, in picture mm, and their cells (K,)."""
+        """Return the polygons (K, 3 or 4, 2) of the mesh in the slice, in picture mm, and their
+        cells (K,).
+        """
         pieces, n_pieces = mesh.straight_pieces()
         index = self.image.to_index(pieces.points)
         if self.across is None:
@@ -376,20 +504,30 @@ class SliceView:
         return self._flat(corners), cells // n_pieces
 
     def boundary(self, mesh: Mesh) -> NDArray[np.float64]:
-        """Return the mesh's boundary in the slice, off the image's box, as segments (K, 2, 2), picture mm."""
+        """Return the mesh's boundary in the slice, off the image's box, as segments (K, 2, 2),
+        picture mm.
+        """
         pieces = mesh.straight_pieces()[0]
         index = self.image.to_index(pieces.points)
         outer, is_on_box = facets_on_box(pieces, self.image)
         if self.across is None:
             return self._flat(index[outer[~is_on_box]])
-        return self._flat(triangle_cut(index, outer[~is_on_box], index[:, self.across] - self.index)[0])
+        return self._flat(
+            triangle_cut(index, outer[~is_on_box], index[:, self.across] - self.index)[0]
+        )
 
-    def interfaces(self, mesh: Mesh, of_cell: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return the interfaces between labels as segments (K, 2, 2), picture mm, and their two labels (K, 2)."""
+    def interfaces(
+        self, mesh: Mesh, of_cell: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return the interfaces between labels as segments (K, 2, 2), picture mm, and their two
+        labels (K, 2).
+        """
         pieces, n_pieces = mesh.straight_pieces()
         index, shared = self.image.to_index(pieces.points), facets(pieces.cells)
         of_cell = np.repeat(of_cell, n_pieces)
-        is_between = (shared.n_cells == 2) & (of_cell[shared.cells[:, 0]] != of_cell[shared.cells[:, 1]])
+        is_between = (shared.n_cells == 2) & (
+            of_cell[shared.cells[:, 0]] != of_cell[shared.cells[:, 1]]
+        )
         nodes, sides = shared.nodes[is_between], of_cell[shared.cells[is_between]]
         if self.across is None:
             return self._flat(index[nodes]), sides
@@ -402,7 +540,9 @@ class SliceView:
         return np.where(self.flip, self.size - flat, flat)
 
     def frame(self, axes: Axes) -> None:
-        """Frame the whole slice in one scale, with the patient's sides as letters instead of ticks."""
+        """Frame the whole slice in one scale, with the patient's sides as letters instead of
+        ticks.
+        """
         axes.set_xlim(0.0, self.size[0])
         axes.set_ylim(0.0, self.size[1])
         axes.set_aspect("equal")
@@ -411,9 +551,15 @@ class SliceView:
         places = ((0.02, 0.5), (0.98, 0.5), (0.5, 0.02), (0.5, 0.98))
         for letter, place in zip("".join(self.letters), places, strict=False):
             axes.text(
-                *place, letter, transform=axes.transAxes, color="white", ha="center", va="center", fontsize=9,
+                *place,
+                letter,
+                transform=axes.transAxes,
+                color="white",
+                ha="center",
+                va="center",
+                fontsize=9,
                 bbox={"facecolor": "black", "alpha": 0.5, "linewidth": 0, "pad": 1.5},
-            )  # fmt: skip
+            )
 
 
 def _middle_views(image: Image) -> list[SliceView]:
@@ -424,7 +570,9 @@ def _middle_views(image: Image) -> list[SliceView]:
 
 
 def histogram_figure(meshes: Sequence[tuple[str, Mesh]]) -> Figure:
-    """Draw normalised rho histograms of meshes over each other, as in Fig. 1(d), with the paper's four errors."""
+    """Draw normalised rho histograms of meshes over each other, as in Fig. 1(d), with the
+    paper's four errors.
+    """
     figure = Figure(figsize=(7.5, 4.6), layout="constrained")
     axes = figure.subplots()
     for colour, (title, mesh) in zip(CURVE_COLOURS, meshes, strict=False):
@@ -443,12 +591,15 @@ def histogram_figure(meshes: Sequence[tuple[str, Mesh]]) -> Figure:
     axes.set_xlim(0.0, 1.0 / n * 1.02)
     axes.set_xlabel(f"rho = inradius / circumradius (1/{n} for a regular cell)")
     axes.set_ylabel("fraction of cells")
-    figure.legend(loc="outside upper center", fontsize=8, frameon=False)  # where no bar can overlap it
+    # where no bar can overlap it
+    figure.legend(loc="outside upper center", fontsize=8, frameon=False)
     return figure
 
 
 def energy_figure(history: Sequence[IterationRecord]) -> Figure:
-    """Draw E, E_G and E_D relative to the initial mesh, and the relative movement of nodes, by iteration; Fig. 1(c)."""
+    """Draw E, E_G and E_D relative to the initial mesh, and the relative movement of nodes, by
+    iteration; Fig. 1(c).
+    """
     figure = Figure(figsize=(7.5, 5.6), layout="constrained")
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
     iterations = [row.iteration for row in history]
@@ -460,7 +611,14 @@ def energy_figure(history: Sequence[IterationRecord]) -> Figure:
     if first.E_D > 0.0:
         curves.append(("E_D, image", [row.E_D / first.E_D for row in history]))
     for colour, (label, values) in zip(("black", *CURVE_COLOURS[1:]), curves, strict=False):
-        top.plot(iterations, values, marker="o", markersize=3, color=colour, label=f"{label}: {values[-1]:.3f}")
+        top.plot(
+            iterations,
+            values,
+            marker="o",
+            markersize=3,
+            color=colour,
+            label=f"{label}: {values[-1]:.3f}",
+        )
     top.set_ylabel("relative to the initial mesh")
     top.set_ylim(bottom=0.0)
     top.legend(fontsize=9, frameon=False)
@@ -474,5 +632,7 @@ def energy_figure(history: Sequence[IterationRecord]) -> Figure:
     for row in history:
         if row.is_retessellated:
             for axes in (top, bottom):
-                axes.axvspan(row.iteration - 0.5, row.iteration + 0.5, color="#dddddd", linewidth=0, zorder=0)
+                axes.axvspan(
+                    row.iteration - 0.5, row.iteration + 0.5, color="#dddddd", linewidth=0, zorder=0
+                )
     return figure

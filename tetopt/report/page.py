@@ -1,4 +1,6 @@
-"""HTML pages in a single file: sections, tables, pictures, data and scripts, without external references."""
+"""HTML pages in a single file: sections, tables, pictures, data and scripts, without external
+references.
+"""
 
 from __future__ import annotations
 
@@ -23,15 +25,19 @@ PAGE_SCRIPTS = {
     "explorer": ("webgl.js", "explore_mesh.js", "explore_gl.js", "explore.js"),
     "cohort": ("cohort.js",),
 }
-BROAD_RATIO = 1.4  # width over height beyond which a picture keeps a readable width on a phone, and scrolls
+# width over height beyond which a picture keeps a readable width on a phone, and scrolls
+BROAD_RATIO = 1.4
 
 
 @cache
 def _environment() -> Environment:
     return Environment(
-        loader=FunctionLoader(package_text), autoescape=True, trim_blocks=True, lstrip_blocks=True,
+        loader=FunctionLoader(package_text),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
         undefined=StrictUndefined,
-    )  # fmt: skip
+    )
 
 
 def package_text(name: str) -> str:
@@ -50,17 +56,24 @@ def rendered(template: str, **values: Any) -> Markup:
 def write_page(path: Path, title: str, content: str, style: str = "") -> None:
     """Write markup under a heading as one HTML file, whole or not at all.
 
-    `content` and `style` (CSS after the page's own) are inserted unchanged, except for unprintable characters, such as
-    marks that reverse the direction of writing, which are shown as Python escapes; `title` is text. See `policy_html`.
+    `content` and `style` (CSS after the page's own) are inserted unchanged, except for unprintable
+    characters, such as marks that reverse the direction of writing, which are shown as Python
+    escapes; `title` is text. See `policy_html`.
     """
     page = rendered(
-        "report/page.html", policy=policy_html(), title=plain(title), style=Markup(style), content=Markup(content)
-    )  # fmt: skip
+        "report/page.html",
+        policy=policy_html(),
+        title=plain(title),
+        style=Markup(style),
+        content=Markup(content),
+    )
     save_text(path, printed(f"{page}\n"))
 
 
 def picture_html(path: str | Path, caption: str) -> Markup:
-    """Embed a PNG as markup, with its caption as text and as alternative text for screen readers."""
+    """Embed a PNG as markup, with its caption as text and as alternative text for screen
+    readers.
+    """
     png = Path(path).read_bytes()
     width, height = struct.unpack(">II", png[16:24])  # in the IHDR chunk, which always comes first
     data = base64.b64encode(png).decode("ascii")
@@ -106,14 +119,21 @@ def _script(name: str) -> str:
 
 
 def policy_html() -> Markup:
-    """Return the markup by which a page forbids itself the network, forms, and all scripts except tetopt's.
+    """Return the markup by which a page forbids itself the network, forms, and all scripts except
+    tetopt's.
 
-    Scripts are allowed by the hash of their text, so that code injected through a name is neither run nor fetched.
-    W3C, Content Security Policy Level 3, https://www.w3.org/TR/CSP3/, 6.7.3 and 8.3.
+    Scripts are allowed by the hash of their text, so that code injected through a name is neither
+    run nor fetched. W3C, Content Security Policy Level 3, https://www.w3.org/TR/CSP3/, 6.7.3 and
+    8.3.
     """
     digests = (hashlib.sha256(_script(name).encode()).digest() for name in PAGE_SCRIPTS)
     scripts = " ".join(f"'sha256-{base64.b64encode(digest).decode('ascii')}'" for digest in digests)
-    rules = ["default-src 'none'", "img-src data:", "style-src 'unsafe-inline'", f"script-src {scripts}"]
+    rules = [
+        "default-src 'none'",
+        "img-src data:",
+        "style-src 'unsafe-inline'",
+        f"script-src {scripts}",
+    ]
     rules += ["base-uri 'none'", "form-action 'none'"]
     return Markup(f'<meta http-equiv="Content-Security-Policy" content="{"; ".join(rules)}">')
 

@@ -35,7 +35,9 @@ class View(NamedTuple):
     values: NDArray[np.float64]  # (K,) of each triangle's cell, drawn in grey
 
 
-def view_of(mesh: Mesh, means: NDArray[np.float64], title: str, centre: NDArray[np.float64] | None = None) -> View:
+def view_of(
+    mesh: Mesh, means: NDArray[np.float64], title: str, centre: NDArray[np.float64] | None = None
+) -> View:
     """Return the surface of a mesh without its right, front, upper octant, which shows the inside.
 
     Parameters
@@ -46,8 +48,8 @@ def view_of(mesh: Mesh, means: NDArray[np.float64], title: str, centre: NDArray[
         The value of each cell; a triangle gets that of its cell.
     title : str
     centre : (3,) float64, optional
-        Corner of the octant, world mm; by default the middle of the mesh's box. Cells whose centroids lie beyond it are
-        removed whole; if that would be all cells, none is removed.
+        Corner of the octant, world mm; by default the middle of the mesh's box. Cells whose
+        centroids lie beyond it are removed whole; if that would be all cells, none is removed.
 
     Raises
     ------
@@ -57,7 +59,9 @@ def view_of(mesh: Mesh, means: NDArray[np.float64], title: str, centre: NDArray[
     if mesh.ndim != 3:
         raise InputError(f"{title}: expected a tetrahedral mesh, got triangles")
     if len(means) != len(mesh.cells):
-        raise InputError(f"{title}: expected one mean for each of {len(mesh.cells)} cells, got {len(means)}")
+        raise InputError(
+            f"{title}: expected one mean for each of {len(mesh.cells)} cells, got {len(means)}"
+        )
     if centre is None:
         centre = (mesh.points.min(axis=0) + mesh.points.max(axis=0)) / 2.0
     is_kept = (centroids(mesh.points, mesh.cells) <= centre).any(axis=1)
@@ -66,20 +70,35 @@ def view_of(mesh: Mesh, means: NDArray[np.float64], title: str, centre: NDArray[
     cells, values = mesh.cells[is_kept], np.asarray(means, dtype=np.float64)[is_kept]
     sides = facets(cells)
     used, triangles = np.unique(boundary_facets(cells), return_inverse=True)
-    return View(title, mesh.points[used], triangles.reshape(-1, 3), values[sides.cells[sides.n_cells == 1, 0]])
+    return View(
+        title,
+        mesh.points[used],
+        triangles.reshape(-1, 3),
+        values[sides.cells[sides.n_cells == 1, 0]],
+    )
 
 
-def save_scenes(path: str | Path, scenes: Sequence[tuple[str, Draw]], columns: int | None = None) -> None:
-    """Write a PNG of scenes with titles, seen from the same side, in one row or in rows of `columns`.
+def save_scenes(
+    path: str | Path, scenes: Sequence[tuple[str, Draw]], columns: int | None = None
+) -> None:
+    """Write a PNG of scenes with titles, seen from the same side, in one row or in rows of
+    `columns`.
 
-    A scene is a function that adds its parts to a plotter, such as the result of `structure_before_slices`.
+    A scene is a function that adds its parts to a plotter, such as the result of
+    `structure_before_slices`.
     """
     # Without a display, VTK issues a warning before it renders off screen.
-    with written_whole(check_suffix(path, FIGURE_SUFFIXES)) as temporary, pyvista.vtk_verbosity("off"):
+    with (
+        written_whole(check_suffix(path, FIGURE_SUFFIXES)) as temporary,
+        pyvista.vtk_verbosity("off"),
+    ):
         columns = min(columns or len(scenes), len(scenes))
         rows = -(-len(scenes) // columns)
         plotter = pyvista.Plotter(
-            off_screen=True, shape=(rows, columns), border=False, window_size=(1100 * columns, 1000 * rows)
+            off_screen=True,
+            shape=(rows, columns),
+            border=False,
+            window_size=(1100 * columns, 1000 * rows),
         )
         plotter.set_background("white")
         for number, (title, draw) in enumerate(scenes):
@@ -92,14 +111,18 @@ def save_scenes(path: str | Path, scenes: Sequence[tuple[str, Draw]], columns: i
 
 
 def put_scene(plotter: pyvista.Plotter, draw: Draw) -> None:
-    """Draw a scene in the plotter's current part, and move the camera to the viewpoint of all scenes."""
+    """Draw a scene in the plotter's current part, and move the camera to the viewpoint of all
+    scenes.
+    """
     draw(plotter)
     plotter.view_vector(SCENE_VIEWPOINT, viewup=(0.0, 0.0, 1.0))
     plotter.camera.zoom(SCENE_ZOOM)
 
 
 def structure_before_slices(image: Image, mesh: Mesh, chosen: NDArray[np.int64]) -> Draw:
-    """Return a scene of the boundary of chosen cells in front of the volume's middle slices, on the box's far sides."""
+    """Return a scene of the boundary of chosen cells in front of the volume's middle slices, on
+    the box's far sides.
+    """
     surface = pyvista.PolyData.from_regular_faces(mesh.points, boundary_facets(mesh.cells[chosen]))
     return _before_slices(image, surface, show_edges=True, edge_color="#402000", line_width=1)
 
@@ -118,36 +141,50 @@ def _before_slices(image: Image, surface: pyvista.PolyData, **look: Any) -> Draw
 
 
 def slices_in_mesh(image: Image, mesh: Mesh) -> Draw:
-    """Return a scene of the volume's middle slices in place, with the edges of cells below the horizontal one."""
+    """Return a scene of the volume's middle slices in place, with the edges of cells below the
+    horizontal one.
+    """
     middle = image.to_world((np.array(image.shape) - 1.0) / 2.0)
 
     def draw(plotter: pyvista.Plotter) -> None:
         _add_slices(plotter, image, [image.shape[axis] // 2 for axis in range(3)])
         part = mesh.cells[mesh.points[mesh.cells].mean(axis=1)[:, 2] < middle[2]]
-        edges = pyvista.PolyData.from_regular_faces(mesh.points, boundary_facets(part)).extract_all_edges()
+        edges = pyvista.PolyData.from_regular_faces(
+            mesh.points, boundary_facets(part)
+        ).extract_all_edges()
         plotter.add_mesh(edges, color="#2060c0", line_width=1.5)
 
     return draw
 
 
 def cutaway(view: View, limits: tuple[float, float]) -> Draw:
-    """Return a scene of the surface of an opened mesh, shaded by cell values between `limits`, with edges."""
+    """Return a scene of the surface of an opened mesh, shaded by cell values between `limits`,
+    with edges.
+    """
     # The darkest grey is not quite black, so that light still shows the orientation of a facet.
     shown = (limits[0] - 0.25 * (limits[1] - limits[0]), limits[1])
     surface = pyvista.PolyData.from_regular_faces(view.points, view.triangles)
     surface.cell_data["h"] = view.values
     return lambda plotter: plotter.add_mesh(
-        surface, scalars="h", cmap="gray", clim=shown, show_scalar_bar=False, show_edges=True, edge_color=MESH_LINE,
-        line_width=1, ambient=0.3,
-    )  # fmt: skip
+        surface,
+        scalars="h",
+        cmap="gray",
+        clim=shown,
+        show_scalar_bar=False,
+        show_edges=True,
+        edge_color=MESH_LINE,
+        line_width=1,
+        ambient=0.3,
+    )
 
 
 def dark_structure_surface(image: Image, below: float, near: NDArray[np.bool_]) -> pyvista.PolyData:
     """Return the surface at level `below` of the dark structures within the mask `near`, world mm.
 
-    Voxels below the level are eroded by one voxel, which separates the ventricles from the sulci. The connected
-    component with most voxels in `near`, and those with at least a tenth of that, are dilated again, and marching cubes
-    run on the intensities of the voxels in and next to them. Without such components the surface has no points.
+    Voxels below the level are eroded by one voxel, which separates the ventricles from the sulci.
+    The connected component with most voxels in `near`, and those with at least a tenth of that, are
+    dilated again, and marching cubes run on the intensities of the voxels in and next to them.
+    Without such components the surface has no points.
     """
     is_dark = image.data < below
     pieces, _ = ndimage.label(ndimage.binary_erosion(is_dark))
@@ -157,7 +194,9 @@ def dark_structure_surface(image: Image, below: float, near: NDArray[np.bool_]) 
     h = np.where(ndimage.binary_dilation(kept) | ~is_dark, image.data, image.data.max())
     grid = pyvista.ImageData(dimensions=image.shape)
     grid.point_data["h"] = h.astype(np.float64).ravel(order="F")
-    return grid.contour([below], scalars="h", method="flying_edges").transform(image.affine, inplace=False)
+    return grid.contour([below], scalars="h", method="flying_edges").transform(
+        image.affine, inplace=False
+    )
 
 
 def _far_side(image: Image, axis: int) -> float:
@@ -167,16 +206,25 @@ def _far_side(image: Image, axis: int) -> float:
 
 
 def _add_slices(plotter: pyvista.Plotter, image: Image, places: Sequence[float]) -> None:
-    """Add the middle slice across each index axis, drawn at an index of `places` along that axis."""
+    """Add the middle slice across each index axis, drawn at an index of `places` along that
+    axis.
+    """
     limits = grey_limits([image.data], brightest=99.8)
     for axis, at in enumerate(places):
         plotter.add_mesh(
-            _slice_sheet(image, axis, at), scalars="h", cmap="gray", clim=limits, show_scalar_bar=False, lighting=False
+            _slice_sheet(image, axis, at),
+            scalars="h",
+            cmap="gray",
+            clim=limits,
+            show_scalar_bar=False,
+            lighting=False,
         )
 
 
 def _slice_sheet(image: Image, axis: int, at: float) -> pyvista.StructuredGrid:
-    """Return the middle slice across an index axis, moved to index `at`, in world mm, with one facet per pixel."""
+    """Return the middle slice across an index axis, moved to index `at`, in world mm, with one
+    facet per pixel.
+    """
     pixels = np.take(image.data, image.shape[axis] // 2, axis=axis)
     corners = [np.arange(s + 1) - 0.5 for s in image.shape]
     corners[axis] = np.array([at])

@@ -31,7 +31,9 @@ def versions() -> dict[str, str]:
 
 
 def mesh_hash(mesh: Mesh) -> str:
-    """Return the SHA-256 of points, cells and midpoints, if any: equal for bitwise identical meshes."""
+    """Return the SHA-256 of points, cells and midpoints, if any: equal for bitwise identical
+    meshes.
+    """
     digest = hashlib.sha256(np.ascontiguousarray(mesh.points).tobytes())
     digest.update(np.ascontiguousarray(mesh.cells).tobytes())
     if mesh.midpoints is not None:
@@ -46,7 +48,11 @@ def image_summary(image: Image | Content) -> dict[str, Any]:
     """
     what = plain(image)
     grid, (mean, low, high, variance) = what.given, what.spread
-    volume = grid.volume if what.continuation is None else what.continuation.inside.sum() * grid.voxel_volume
+    volume = (
+        grid.volume
+        if what.continuation is None
+        else what.continuation.inside.sum() * grid.voxel_volume
+    )
     return {
         "shape": grid.shape,
         "spacing_mm": grid.spacing,
@@ -60,16 +66,24 @@ def image_summary(image: Image | Content) -> dict[str, Any]:
 
 
 def run_summary(
-    image: Image | Content, initial: Mesh, result: MeshingResult, about: dict[str, Any],
-    seconds: dict[str, float], shapes: tuple[Quality | None, Quality | None] | None = None,
-) -> dict[str, Any]:  # fmt: skip
-    """Return all numbers of a run: options and file (`about`), versions, energies by iteration, quality (both meshes).
+    image: Image | Content,
+    initial: Mesh,
+    result: MeshingResult,
+    about: dict[str, Any],
+    seconds: dict[str, float],
+    shapes: tuple[Quality | None, Quality | None] | None = None,
+) -> dict[str, Any]:
+    """Return all numbers of a run: options and file (`about`), versions, energies by iteration,
+    quality (both meshes).
 
     `shapes` are these qualities, if already measured; None for one that could not be measured.
     """
     if shapes is None:
         made = result.mesh
-        shapes = quality(initial.points, initial.cells), quality(made.points, made.cells, made.midpoints)
+        shapes = (
+            quality(initial.points, initial.cells),
+            quality(made.points, made.cells, made.midpoints),
+        )
     first, last = result.history[0], result.history[-1]
     own = plain(image)
     is_varied = own.variance > 0.0
@@ -82,7 +96,11 @@ def run_summary(
     return {
         **about,
         "versions": versions(),
-        "machine": {"cores": os.cpu_count(), "threads": numba.get_num_threads(), "system": platform.platform()},
+        "machine": {
+            "cores": os.cpu_count(),
+            "threads": numba.get_num_threads(),
+            "system": platform.platform(),
+        },
         "image_properties": image_summary(own),
         "ended": result.ended,
         "iterations_done": last.iteration,
@@ -104,9 +122,16 @@ def run_summary(
 
 
 def size_summary(mesh: Mesh, order: int) -> dict[str, Any]:
-    """Return the numbers of nodes, of nodes including those of order 2 ("n_nodes_in_all"), and of cells of a mesh."""
+    """Return the numbers of nodes, of nodes including those of order 2 ("n_nodes_in_all"), and
+    of cells of a mesh.
+    """
     n_nodes = node_count(mesh.points, mesh.cells, order)
-    return {"order": order, "n_nodes": len(mesh.points), "n_nodes_in_all": n_nodes, "n_cells": len(mesh.cells)}
+    return {
+        "order": order,
+        "n_nodes": len(mesh.points),
+        "n_nodes_in_all": n_nodes,
+        "n_cells": len(mesh.cells),
+    }
 
 
 def model_summary(model: Model) -> dict[str, Any]:
@@ -119,7 +144,12 @@ def model_summary(model: Model) -> dict[str, Any]:
     }
     if (table := model.materials) is not None:
         young, nu = table.young, table.nu
-        summary["materials"] = {"count": len(young), "young_kPa": young, "nu": nu, "binning": table.binning}
+        summary["materials"] = {
+            "count": len(young),
+            "young_kPa": young,
+            "nu": nu,
+            "binning": table.binning,
+        }
         if table.density is not None:
             summary["materials"]["density_kg_m3"] = table.density
     if model.loads:

@@ -24,9 +24,12 @@ WORST_ROWS = 5  # thin labels and pairs shown; run.json has all
 WORST_LABELS = 12  # the same of labels
 LONGEST_NAME = 24  # of a label with its number, characters
 TOLD_CONTACT = 1.5  # of the voxels' contact: pairs with more are shown
-SOME_CONTACT = 0.25  # of the last contact shown: that of the largest ratio has as much, or is too small to matter
+# of the last contact shown: that of the largest ratio has as much, or is too small to matter
+SOME_CONTACT = 0.25
 THIN_ACROSS = 2.0  # cells: labels with fewer are thin
-STRAIGHT_WORDS = "Sizes are those of the curved cells; shapes, E_D and voxels are those of straight ones."
+STRAIGHT_WORDS = (
+    "Sizes are those of the curved cells; shapes, E_D and voxels are those of straight ones."
+)
 LARGE_SIZE = 1e4  # mm3 or mm2: larger labels are shown without decimals
 
 
@@ -44,7 +47,8 @@ def size_words(ndim: int) -> str:
 
 
 def size_text(number: float, decimals: int) -> str:
-    """Format a length, area or volume with these decimals, or more for three significant digits; "-" if not finite.
+    """Format a length, area or volume with these decimals, or more for three significant digits;
+    "-" if not finite.
 
     Examples
     --------
@@ -58,22 +62,34 @@ def size_text(number: float, decimals: int) -> str:
 
 
 def nodes_in_words(mesh: Mesh, order: int) -> str:
-    """Describe the number of nodes of a mesh: "4864 nodes", or for order 2 "716 corner nodes, 5012 in all"."""
+    """Describe the number of nodes of a mesh: "4864 nodes", or for order 2 "716 corner nodes,
+    5012 in all".
+    """
     if order == 1:
         return f"{len(mesh.points)} nodes"
     return f"{len(mesh.points)} corner nodes, {node_count(mesh.points, mesh.cells, order)} in all"
 
 
 def add_quality(
-    table: Table, *meshes: Quality, in_all: Sequence[int] = (), jacobian: float | None = None, every: bool = False,
+    table: Table,
+    *meshes: Quality,
+    in_all: Sequence[int] = (),
+    jacobian: float | None = None,
+    every: bool = False,
     is_curved: bool = False,
-) -> None:  # fmt: skip
-    """Add rows on the shape of one or more meshes, one column each; `in_all` are the numbers of nodes of quadratic
-    meshes, `jacobian` is the smallest scaled Jacobian determinant of curved cells. `every` adds all measures of rho and
-    the kinds of bad cells; `is_curved` a caption on what is measured of curved cells."""
+) -> None:
+    """Add rows on the shape of one or more meshes, one column each; `in_all` are the numbers of
+    nodes of quadratic meshes, `jacobian` is the smallest scaled Jacobian determinant of curved
+    cells. `every` adds all measures of rho and the kinds of bad cells; `is_curved` a caption on
+    what is measured of curved cells.
+    """
     table.caption = STRAIGHT_WORDS if is_curved else None
     nodes = [str(q.n_nodes) for q in meshes]
-    nodes = [f"{whole} ({own} corners)" for whole, own in zip(in_all, nodes, strict=True)] if in_all else nodes
+    nodes = (
+        [f"{whole} ({own} corners)" for whole, own in zip(in_all, nodes, strict=True)]
+        if in_all
+        else nodes
+    )
     table.add_row("nodes", *nodes)
     rows: list[tuple[str, Callable[[Quality], str]]] = [
         ("cells", lambda q: str(q.n_cells)),
@@ -92,7 +108,10 @@ def add_quality(
             ("rho error (ii), harmonic mean", lambda q: f"{q.errors.harmonic_mean:.4f}"),
             ("rho error (iii), sum of squares", lambda q: f"{q.errors.l2:.4f}"),
             ("rho error (iv), worst", lambda q: f"{q.errors.worst:.4f}"),
-            *((f"bad cells: {kind}s", lambda q, kind=kind: str(q.kinds[kind])) for kind in meshes[0].kinds),
+            *(
+                (f"bad cells: {kind}s", lambda q, kind=kind: str(q.kinds[kind]))
+                for kind in meshes[0].kinds
+            ),
         ]
     for name, text in rows:
         table.add_row(name, *(text(q) for q in meshes))
@@ -104,18 +123,36 @@ def mask_table(mask: MaskFidelity, ndim: int, word: str = "mask") -> Table:
     """Return a table of how well a mesh fills its mask, which the table calls `word`."""
     table = new_table(word, "in voxels", "in the mesh")
     change = 100.0 * (mask.mesh_volume / mask.volume - 1.0)
-    table.add_row(size_words(ndim), size_text(mask.volume, 1), f"{size_text(mask.mesh_volume, 1)} ({change:+.1f} %)")
+    table.add_row(
+        size_words(ndim),
+        size_text(mask.volume, 1),
+        f"{size_text(mask.mesh_volume, 1)} ({change:+.1f} %)",
+    )
     table.add_row("Dice, by voxels", "", f"{mask.dice:.4f}")
     for title, *distances in (
-        (f"boundary to the {word}'s surface, mean, 95 %", mask.distance_mean, mask.distance_p95, mask.distance_mean_mm,
-         mask.distance_p95_mm),
-        (f"the {word}'s surface to the boundary, mean, 95 %", mask.reverse_mean, mask.reverse_p95, mask.reverse_mean_mm,
-         mask.reverse_p95_mm),
-    ):  # fmt: skip
+        (
+            f"boundary to the {word}'s surface, mean, 95 %",
+            mask.distance_mean,
+            mask.distance_p95,
+            mask.distance_mean_mm,
+            mask.distance_p95_mm,
+        ),
+        (
+            f"the {word}'s surface to the boundary, mean, 95 %",
+            mask.reverse_mean,
+            mask.reverse_p95,
+            mask.reverse_mean_mm,
+            mask.reverse_p95_mm,
+        ),
+    ):
         mean, p95 = (f"{voxels:.3f}" for voxels in distances[:2])
         mean_mm, p95_mm = (size_text(mm, 3) for mm in distances[2:])
         is_there = not np.isnan(distances).any()  # both surfaces exist off the faces of the box
-        shown = (f"{mean}, {p95} voxels", f"{mean_mm}, {p95_mm} mm") if is_there else ("one surface is missing", "")
+        shown = (
+            (f"{mean}, {p95} voxels", f"{mean_mm}, {p95_mm} mm")
+            if is_there
+            else ("one surface is missing", "")
+        )
         table.add_row(title, *shown)
     table.add_row("connected components", str(mask.components), str(mask.mesh_components))
     table.add_row("Euler number of the surface", str(mask.euler), str(mask.mesh_euler))
@@ -125,7 +162,8 @@ def mask_table(mask: MaskFidelity, ndim: int, word: str = "mask") -> Table:
 def sizes_in_words(edges: EdgeRatios) -> str:
     """Describe how well the edges of a mesh match their target sizes."""
     return (
-        f"ratio of edges to their target size: {edges.mean:.2f} on average; {edges.below:.1%} are below "
+        f"ratio of edges to their target size: {edges.mean:.2f} on average; {edges.below:.1%} "
+        "are below "
         f"{SHORT_EDGE_FRACTION:.2f}, "
         f"where the image needs smaller cells; {edges.above:.1%} are above {LONG_EDGE:.2f}"
     )
@@ -134,14 +172,19 @@ def sizes_in_words(edges: EdgeRatios) -> str:
 def curving_in_words(curving: Curving) -> str:
     """Describe the curved edges on interfaces and on a mask's surface."""
     return (
-        f"{curving.n_on_level} of {curving.n_edges} edges on smooth surfaces have their mid-edge node on the surface, "
-        f"{curving.n_part_way} are partly curved and {curving.n_straight} are straight; largest offset "
-        f"{curving.farthest:.2g} mm from the straight edge, scaled Jacobian at least {curving.least_jacobian:.2f}"
+        f"{curving.n_on_level} of {curving.n_edges} edges on smooth surfaces have their mid-edge "
+        "node on the surface, "
+        f"{curving.n_part_way} are partly curved and {curving.n_straight} are straight; largest "
+        "offset "
+        f"{curving.farthest:.2g} mm from the straight edge, scaled Jacobian at least "
+        f"{curving.least_jacobian:.2f}"
     )
 
 
 def worst_labels(rows: Sequence[LabelFidelity], most: int | None = WORST_LABELS) -> list[int]:
-    """Return the places of at most `most` labels, by default 12: the worst by Dice or volume if there are more."""
+    """Return the places of at most `most` labels, by default 12: the worst by Dice or volume if
+    there are more.
+    """
     places = list(range(len(rows)))
     if most is None or len(rows) <= most:
         return places
@@ -156,45 +199,73 @@ def worst_labels(rows: Sequence[LabelFidelity], most: int | None = WORST_LABELS)
 def label_table(rows: Sequence[LabelFidelity], names: Mapping[int, str], ndim: int) -> Table:
     """Return a table of how well a mesh represents labels.
 
-    Each label has a row, with its name if any. "volume, %" is by how much its cells are larger than its voxels; the
-    distance is that of their surfaces, and parts are connected components.
+    Each label has a row, with its name if any. "volume, %" is by how much its cells are larger than
+    its voxels; the distance is that of their surfaces, and parts are connected components.
     """
     table = _table_of_labels(
-        "voxels", size_words(ndim).replace(" ", "\n"), "cells", "volume,\n%", "Dice", "distance\n95 %, mm",
-        "parts of\nvoxels", "of\ncells",
-    )  # fmt: skip
+        "voxels",
+        size_words(ndim).replace(" ", "\n"),
+        "cells",
+        "volume,\n%",
+        "Dice",
+        "distance\n95 %, mm",
+        "parts of\nvoxels",
+        "of\ncells",
+    )
     for row in rows:
         change = 100.0 * (row.mesh_volume / row.volume - 1.0)
         size = size_text(row.volume, 1 if row.volume < LARGE_SIZE else 0)
         table.add_row(
-            _label_words(row.label, names), str(row.voxels), size, str(row.n_cells), f"{change:+.1f}",
-            f"{row.dice:.4f}", size_text(row.distance_p95, 3), str(row.components), str(row.mesh_components),
-        )  # fmt: skip
+            _label_words(row.label, names),
+            str(row.voxels),
+            size,
+            str(row.n_cells),
+            f"{change:+.1f}",
+            f"{row.dice:.4f}",
+            size_text(row.distance_p95, 3),
+            str(row.components),
+            str(row.mesh_components),
+        )
     return table
 
 
 def surface_table(
     rows: Sequence[LabelFidelity], interfaces: Sequence[LabelInterface], names: Mapping[int, str]
 ) -> Table:
-    """Return a table of further measures of labels: Dice by volume and majority, distances, smoothness, topology."""
+    """Return a table of further measures of labels: Dice by volume and majority, distances,
+    smoothness, topology.
+    """
     table = _table_of_labels(
-        "Dice by\nvolume", "Dice by\nmajority", "distance\nmean, mm", "largest,\nmm", "area\nratio", "folded,\n%",
+        "Dice by\nvolume",
+        "Dice by\nmajority",
+        "distance\nmean, mm",
+        "largest,\nmm",
+        "area\nratio",
+        "folded,\n%",
         "edges in\n> 2 facets",
-    )  # fmt: skip
+    )
     for row, surface in zip(rows, interfaces, strict=True):
         table.add_row(
-            _label_words(row.label, names), f"{row.volume_dice:.4f}", f"{row.dice_majority:.4f}",
-            size_text(row.distance_mean, 3), size_text(row.distance_max, 3), _decimals(surface.area_ratio, 3),
+            _label_words(row.label, names),
+            f"{row.volume_dice:.4f}",
+            f"{row.dice_majority:.4f}",
+            size_text(row.distance_mean, 3),
+            size_text(row.distance_max, 3),
+            _decimals(surface.area_ratio, 3),
             _decimals(100.0 * surface.folded, 1),
             str(surface.nonmanifold_edges),
-        )  # fmt: skip
+        )
     return table
 
 
 def _table_of_labels(*columns: str) -> Table:
     """Create a table with a row for each label, whose long names are cut."""
     table = new_table("label", *(Text(column) for column in columns))
-    table.columns[0].overflow, table.columns[0].no_wrap, table.columns[0].max_width = "ellipsis", True, LONGEST_NAME
+    table.columns[0].overflow, table.columns[0].no_wrap, table.columns[0].max_width = (
+        "ellipsis",
+        True,
+        LONGEST_NAME,
+    )
     for column in table.columns:
         column.vertical = "bottom"
     for column in table.columns[1:]:
@@ -207,34 +278,53 @@ def _decimals(number: float, count: int) -> str:
 
 
 def thin_table(rows: Sequence[LabelFidelity], names: Mapping[int, str]) -> Table | None:
-    """Return a table of the `WORST_ROWS` labels with the largest one-layer fraction, worst first, then thinnest.
+    """Return a table of the `WORST_ROWS` labels with the largest one-layer fraction, worst first,
+    then thinnest.
 
-    Label 0 is not a tissue and is omitted, as are labels without a thickness, or with a median at its limit, or with
-    `THIN_ACROSS` cells across or more; None if none is left.
+    Label 0 is not a tissue and is omitted, as are labels without a thickness, or with a median at
+    its limit, or with `THIN_ACROSS` cells across or more; None if none is left.
     """
     there = [
-        row for row in rows if row.n_cells and row.label != BACKGROUND_LABEL and not row.cells_across >= THIN_ACROSS
-        and row.thickness_voxels is not None and row.thickness_voxels.p50 < row.thickness_voxels.limit
-    ]  # fmt: skip
+        row
+        for row in rows
+        if row.n_cells
+        and row.label != BACKGROUND_LABEL
+        and not row.cells_across >= THIN_ACROSS
+        and row.thickness_voxels is not None
+        and row.thickness_voxels.p50 < row.thickness_voxels.limit
+    ]
     if not there:
         return None
     table = _table_of_labels(
-        "in one\nlayer, %", "thickness of\nvoxels, mm", "of cells,\nmm", "edges,\nmm", "cells\nacross"
+        "in one\nlayer, %",
+        "thickness of\nvoxels, mm",
+        "of cells,\nmm",
+        "edges,\nmm",
+        "cells\nacross",
     )
     table.columns[0].header = "thin labels"
 
     def goodness(row: LabelFidelity) -> tuple[float, float, int]:
-        return -row.one_layer_fraction, np.inf if row.thickness_voxels is None else row.thickness_voxels.p50, row.label
+        return (
+            -row.one_layer_fraction,
+            np.inf if row.thickness_voxels is None else row.thickness_voxels.p50,
+            row.label,
+        )
 
     for row in sorted(there, key=goodness)[:WORST_ROWS]:
         thick = [_percentiles_text(each) for each in (row.thickness_voxels, row.thickness_mesh)]
         layer, edges = _decimals(100.0 * row.one_layer_fraction, 1), size_text(row.edge, 2)
-        table.add_row(_label_words(row.label, names), layer, *thick, edges, _decimals(row.cells_across, 1))
+        table.add_row(
+            _label_words(row.label, names), layer, *thick, edges, _decimals(row.cells_across, 1)
+        )
     return table
 
 
-def contact_table(contacts: Sequence[LabelContact], names: Mapping[int, str], ndim: int) -> Table | None:
-    """Return a table of pairs with over 1.5 times the contact of the voxels, largest excess first; None if empty.
+def contact_table(
+    contacts: Sequence[LabelContact], names: Mapping[int, str], ndim: int
+) -> Table | None:
+    """Return a table of pairs with over 1.5 times the contact of the voxels, largest excess first;
+    None if empty.
 
     The last one is that of the largest ratio, unless it is among the others or its area is small.
     """
@@ -244,7 +334,11 @@ def contact_table(contacts: Sequence[LabelContact], names: Mapping[int, str], nd
     unit = "mm2" if ndim == 3 else "mm"
     table = new_table("contact", f"of cells, {unit}", f"of voxels, {unit}", "ratio")
     shown = sorted(more, key=lambda each: each.voxels_mm2 - each.mesh_mm2)[:WORST_ROWS]
-    large = [each for each in more if each.voxels_mm2 and each.mesh_mm2 >= SOME_CONTACT * shown[-1].mesh_mm2]
+    large = [
+        each
+        for each in more
+        if each.voxels_mm2 and each.mesh_mm2 >= SOME_CONTACT * shown[-1].mesh_mm2
+    ]
     worst = max(large, key=lambda each: each.ratio, default=shown[-1])
     for each in shown if worst in shown else [*shown[:-1], worst]:
         words = ", ".join(_label_words(label, names) for label in each.labels)
@@ -257,8 +351,10 @@ def contacts_in_words(totals: Mapping[str, float], ndim: int) -> str:
     """Describe the excess contact between labels."""
     unit = "mm2" if ndim == 3 else "mm"
     return (
-        f"contact beyond {TOLERATED_CONTACT:g} times that of the voxels: {size_text(totals['excess_mm2'], 1)} {unit}, "
-        f"including {size_text(totals['false_mm2'], 1)} {unit} between labels that do not touch in the voxels"
+        f"contact beyond {TOLERATED_CONTACT:g} times that of the voxels: "
+        f"{size_text(totals['excess_mm2'], 1)} {unit}, "
+        f"including {size_text(totals['false_mm2'], 1)} {unit} between labels that do not touch "
+        "in the voxels"
     )
 
 
@@ -277,7 +373,9 @@ def _label_words(label: int, names: Mapping[int, str]) -> str:
 def label_differences(
     rows: Sequence[LabelFidelity], interfaces: Sequence[LabelInterface], names: Mapping[int, str]
 ) -> list[str]:
-    """Describe labels whose cells differ from their voxels in topology, or strongly in size: one line per label."""
+    """Describe labels whose cells differ from their voxels in topology, or strongly in size: one
+    line per label.
+    """
     lines: list[str] = []
     for row, surface in zip(rows, interfaces, strict=True):
         cavities, of_cells = surface.cavities, surface.mesh_cavities
@@ -286,7 +384,10 @@ def label_differences(
         if abs(more) > CHANGED_FRACTION * row.volume:
             parts.append(f"{abs(more) / row.volume:.0%} {'smaller' if more < 0.0 else 'larger'}")
         if row.components != row.mesh_components:
-            parts.append(f"{_number_of(row.components, 'component')} of voxels, {row.mesh_components} of cells")
+            parts.append(
+                f"{_number_of(row.components, 'component')} of voxels, {row.mesh_components} of "
+                "cells"
+            )
         parts += _surplus(row.mesh_components + of_cells - surface.mesh_euler // 2 - holes, "hole")
         parts += _surplus(of_cells - cavities, "cavity")
         if parts and row.n_cells:

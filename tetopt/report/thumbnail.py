@@ -1,7 +1,8 @@
-"""A picture of a few kB to judge one of hundreds of subjects at a glance: two slices along the world's axes.
+"""A picture of a few kB to judge one of hundreds of subjects at a glance: two slices along the
+world's axes.
 
-Slices follow the world's axes, not those of the voxels: a wrong affine is visible, whatever the order of the voxels,
-and an oblique image appears rotated.
+Slices follow the world's axes, not those of the voxels: a wrong affine is visible, whatever the
+order of the voxels, and an oblique image appears rotated.
 """
 
 from __future__ import annotations
@@ -34,9 +35,11 @@ from tetopt.system.files import check_suffix, save_bytes
 SIDE_PIXELS = 128  # of a view: enough for a head, where a page has 500 of them
 SAMPLES_PER_PIXEL = 2  # along each side: fine stripes would cause aliasing with single samples
 MARGIN_FRACTION = 0.08  # of the mesh's largest side, on each side of it
-SLAB_COUNT = 20  # slabs across the mesh: it is cut in the fullest if its middle has less than half as much
+# slabs across the mesh: it is cut in the fullest if its middle has less than half as much
+SLAB_COUNT = 20
 PALETTE_COLOURS = 32  # greys and oranges, enough for the eye: half of the bytes of 256
-EDGE_POINTS = 4.0  # width of edges times the root of the number of cut cells: a constant tint for any number
+# width of edges times the root of the number of cut cells: a constant tint for any number
+EDGE_POINTS = 4.0
 LABEL_ALPHA = 0.45  # opacity of the cells' labels over the image
 SIDE_LETTERS = ("LR", "PA")  # at the left and the right of a view along this world axis
 LETTER_POINTS = 4.5  # 8 pixels, the smallest readable size
@@ -47,16 +50,23 @@ VIEW_AXES = {
 
 
 def save_thumbnail(
-    path: Path, image: Image, mesh: Mesh, mask: Image | None = None, labels: Image | None = None,
-    of_cell: NDArray[np.int64] | None = None, table: LabelTable = NO_TABLE,
-) -> None:  # fmt: skip
-    """Write slices of an image with its mesh as a PNG, whole or not at all; the same inputs give the same bytes.
+    path: Path,
+    image: Image,
+    mesh: Mesh,
+    mask: Image | None = None,
+    labels: Image | None = None,
+    of_cell: NDArray[np.int64] | None = None,
+    table: LabelTable = NO_TABLE,
+) -> None:
+    """Write slices of an image with its mesh as a PNG, whole or not at all; the same inputs give
+    the same bytes.
 
-    A volume gives an axial slice on the left and a sagittal one on the right, 256 x 128 pixels, through the mesh's
-    middle (or, if that is hollow, where most of it is); a 2-D image gives one view. Both have the same isotropic scale
-    and are centred on the mesh: x from left to right (left of the patient on the left), y upwards or, in the sagittal
-    view, to the right (back on the left), z upwards. Letters in the lower corners mark the sides: L and R, P and A.
-    Pixels outside the image are black.
+    A volume gives an axial slice on the left and a sagittal one on the right, 256 x 128 pixels,
+    through the mesh's middle (or, if that is hollow, where most of it is); a 2-D image gives one
+    view. Both have the same isotropic scale and are centred on the mesh: x from left to right (left
+    of the patient on the left), y upwards or, in the sagittal view, to the right (back on the
+    left), z upwards. Letters in the lower corners mark the sides: L and R, P and A. Pixels outside
+    the image are black.
 
     Parameters
     ----------
@@ -79,26 +89,46 @@ def save_thumbnail(
     InputError
         The name has another suffix.
     """
-    save_bytes(check_suffix(path, FIGURE_SUFFIXES), thumbnail_png(image, mesh, mask, labels, of_cell, table))
+    save_bytes(
+        check_suffix(path, FIGURE_SUFFIXES),
+        thumbnail_png(image, mesh, mask, labels, of_cell, table),
+    )
 
 
 def thumbnail_png(
-    image: Image, mesh: Mesh, mask: Image | None = None, labels: Image | None = None,
-    of_cell: NDArray[np.int64] | None = None, table: LabelTable = NO_TABLE,
-) -> bytes:  # fmt: skip
+    image: Image,
+    mesh: Mesh,
+    mask: Image | None = None,
+    labels: Image | None = None,
+    of_cell: NDArray[np.int64] | None = None,
+    table: LabelTable = NO_TABLE,
+) -> bytes:
     """Return the bytes of `save_thumbnail`."""
     views = VIEW_AXES[image.ndim]
-    low, high = mesh.points[np.unique(mesh.cells)].min(axis=0), mesh.points[np.unique(mesh.cells)].max(axis=0)
+    low, high = (
+        mesh.points[np.unique(mesh.cells)].min(axis=0),
+        mesh.points[np.unique(mesh.cells)].max(axis=0),
+    )
     half = (0.5 + MARGIN_FRACTION) * float((high - low).max())
     places = [(low + high) / 2.0] * len(views)
     if image.ndim == 3:
-        places = [_at(place, axis, _fullest(mesh, axis)) for place, axis in zip(places, (2, 0), strict=True)]
+        places = [
+            _at(place, axis, _fullest(mesh, axis))
+            for place, axis in zip(places, (2, 0), strict=True)
+        ]
     pixels = [_sampled(image, place, axes, half) for place, axes in zip(places, views, strict=True)]
     inside = cell_of_voxel(image, mesh) >= 0
-    covered = Image(inside if mask is None else inside & (mask.data >= INSIDE_FRACTION), image.affine)
-    is_in = [_sampled(covered, place, axes, half) > 0.5 for place, axes in zip(places, views, strict=True)]
+    covered = Image(
+        inside if mask is None else inside & (mask.data >= INSIDE_FRACTION), image.affine
+    )
+    is_in = [
+        _sampled(covered, place, axes, half) > 0.5
+        for place, axes in zip(places, views, strict=True)
+    ]
     seen = [each[np.isfinite(each) & within] for each, within in zip(pixels, is_in, strict=True)]
-    limits = grey_limits([np.concatenate(seen)] if sum(map(len, seen)) else [np.zeros(1)], brightest=99.8)
+    limits = grey_limits(
+        [np.concatenate(seen)] if sum(map(len, seen)) else [np.zeros(1)], brightest=99.8
+    )
     colours = None
     if labels is not None and of_cell is not None:
         values, row = np.unique(of_cell, return_inverse=True)
@@ -110,20 +140,30 @@ def thumbnail_png(
         panel.set_axis_off()
         extent = (centre[0] - half, centre[0] + half, centre[1] - half, centre[1] + half)
         shown = np.nan_to_num(pixels[k], nan=limits[0])
-        panel.imshow(shown.T, origin="lower", extent=extent, cmap="gray", vmin=limits[0], vmax=limits[1])
+        panel.imshow(
+            shown.T, origin="lower", extent=extent, cmap="gray", vmin=limits[0], vmax=limits[1]
+        )
         if mask is not None:
             inside = np.nan_to_num(_sampled(mask, place, axes, half), nan=0.0)
             if inside.min() < 0.5 <= inside.max():
-                panel.contour(inside.T, levels=[0.5], extent=extent, colors=MASK_LINE, linewidths=1.0)
+                panel.contour(
+                    inside.T, levels=[0.5], extent=extent, colors=MASK_LINE, linewidths=1.0
+                )
         _draw_mesh(panel, mesh, place, axes, colours)
         panel.set_xlim(extent[:2])
         panel.set_ylim(extent[2:])
         if image.ndim == 3:
             for letter, x in zip(SIDE_LETTERS[axes[0]], (0.04, 0.96), strict=True):
                 panel.text(
-                    x, 0.05, letter, transform=panel.transAxes, color="white", ha="center", va="center",
+                    x,
+                    0.05,
+                    letter,
+                    transform=panel.transAxes,
+                    color="white",
+                    ha="center",
+                    va="center",
                     fontsize=LETTER_POINTS,
-                )  # fmt: skip
+                )
     return _png(figure)
 
 
@@ -134,12 +174,17 @@ def _at(place: NDArray[np.float64], axis: int, value: float) -> NDArray[np.float
 
 
 def _fullest(mesh: Mesh, axis: int) -> float:
-    """Return the position of the cut along a world axis, mm: the mesh's middle, if that is not hollow."""
+    """Return the position of the cut along a world axis, mm: the mesh's middle, if that is not
+    hollow.
+    """
     x, v = mesh.points[mesh.cells][..., axis], volumes(mesh.points, mesh.cells)
     first, last = x.min(axis=1), x.max(axis=1)
     ends = np.linspace(first.min(), last.max(), SLAB_COUNT + 1)
-    # Each cell's volume is spread evenly between its ends, so that a few large cells count as well as many small ones.
-    filled = np.diff([float((v * np.clip((end - first) / (last - first), 0.0, 1.0)).sum()) for end in ends])
+    # Each cell's volume is spread evenly between its ends, so that a few large cells count as well
+    # as many small ones.
+    filled = np.diff(
+        [float((v * np.clip((end - first) / (last - first), 0.0, 1.0)).sum()) for end in ends]
+    )
     middle = SLAB_COUNT // 2
     if filled[middle - 1 : middle + 1].mean() >= 0.5 * filled.max():
         return float(ends[middle])
@@ -147,7 +192,9 @@ def _fullest(mesh: Mesh, axis: int) -> float:
     return float(ends[slab : slab + 2].mean())
 
 
-def _sampled(image: Image, place: NDArray[np.float64], axes: Sequence[int], half: float) -> NDArray[np.float64]:
+def _sampled(
+    image: Image, place: NDArray[np.float64], axes: Sequence[int], half: float
+) -> NDArray[np.float64]:
     """Sample the image in a square around a place, along two world axes; NaN outside the image."""
     n = SIDE_PIXELS * SAMPLES_PER_PIXEL
     steps = (np.arange(n) + 0.5) / n * 2.0 * half - half
@@ -165,9 +212,15 @@ def _sampled(image: Image, place: NDArray[np.float64], axes: Sequence[int], half
 
 
 def _draw_mesh(
-    panel: Axes, mesh: Mesh, place: NDArray[np.float64], axes: Sequence[int], colours: NDArray[np.float64] | None
+    panel: Axes,
+    mesh: Mesh,
+    place: NDArray[np.float64],
+    axes: Sequence[int],
+    colours: NDArray[np.float64] | None,
 ) -> None:
-    """Draw the cells that the plane through a place cuts, in their colours (M, 3) if any, and the mesh's boundary."""
+    """Draw the cells that the plane through a place cuts, in their colours (M, 3) if any, and
+    the mesh's boundary.
+    """
     flat, (mesh, n_pieces) = list(axes), mesh.straight_pieces()
     if len(place) == 2:
         corners, cells = mesh.points[mesh.cells], np.arange(len(mesh.cells))
@@ -177,7 +230,8 @@ def _draw_mesh(
         across = ({0, 1, 2} - set(flat)).pop()
         height = mesh.points[:, across] - place[across]
         corners, cells = plane_cut(mesh.points, mesh.cells, height)
-        # The plane cuts all cells of a facet that it cuts, so these cells suffice to find the boundary.
+        # The plane cuts all cells of a facet that it cuts, so these cells suffice to find the
+        # boundary.
         shared = facets(mesh.cells[cells]) if len(cells) else facets(mesh.cells)
         boundary, _ = triangle_cut(mesh.points, shared.nodes[shared.n_cells == 1], height)
     polygons = corners[..., flat]
@@ -185,10 +239,16 @@ def _draw_mesh(
         colours = colours[cells // n_pieces]
         is_shown = np.isfinite(colours[:, 0])
         faces = np.column_stack([colours[is_shown], np.full(is_shown.sum(), LABEL_ALPHA)])
-        panel.add_collection(PolyCollection(list(polygons[is_shown]), facecolors=faces, edgecolors="none"))
+        panel.add_collection(
+            PolyCollection(list(polygons[is_shown]), facecolors=faces, edgecolors="none")
+        )
     width = min(0.25, EDGE_POINTS / np.sqrt(max(len(polygons), 1)))  # points
-    panel.add_collection(PolyCollection(list(polygons), facecolors="none", edgecolors=MESH_LINE, linewidths=width))
-    panel.add_collection(LineCollection(list(boundary[..., flat]), colors=MESH_LINE, linewidths=0.6))
+    panel.add_collection(
+        PolyCollection(list(polygons), facecolors="none", edgecolors=MESH_LINE, linewidths=width)
+    )
+    panel.add_collection(
+        LineCollection(list(boundary[..., flat]), colors=MESH_LINE, linewidths=0.6)
+    )
 
 
 def _png(figure: Figure) -> bytes:
@@ -197,7 +257,7 @@ def _png(figure: Figure) -> bytes:
     canvas.draw()
     whole = PIL.Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
     stream = io.BytesIO()
-    whole.quantize(PALETTE_COLOURS, PIL.Image.Quantize.MEDIANCUT, dither=PIL.Image.Dither.NONE).save(
-        stream, "PNG", optimize=True
-    )
+    whole.quantize(
+        PALETTE_COLOURS, PIL.Image.Quantize.MEDIANCUT, dither=PIL.Image.Dither.NONE
+    ).save(stream, "PNG", optimize=True)
     return stream.getvalue()

@@ -1,4 +1,6 @@
-"""Remove cells within a mask: at pinches of the boundary, and in small components that the mask does not have."""
+"""Remove cells within a mask: at pinches of the boundary, and in small components that the mask
+does not have.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +18,9 @@ from tetopt.geometry.topology import compact, components
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 
-# of the largest component of cells within a component of voxels: smaller ones are dropped. A larger one is a part of
-# the mask that cells do not join to the rest, which is better told (requirement `components`) than lost.
+# of the largest component of cells within a component of voxels: smaller ones are dropped. A larger
+# one is a part of the mask that cells do not join to the rest, which is better told (requirement
+# `components`) than lost.
 DROPPED_FRACTION = 0.01
 
 
@@ -30,13 +33,19 @@ class Carved(NamedTuple):
 
 
 def carved(
-    mesh: Mesh, image: Image, region: Region, keeps_components: bool = False, members: Memberships | None = None
+    mesh: Mesh,
+    image: Image,
+    region: Region,
+    keeps_components: bool = False,
+    members: Memberships | None = None,
 ) -> Carved:
-    """Select the cells of a mesh to keep, so that its boundary is a manifold and its components are the mask's.
+    """Select the cells of a mesh to keep, so that its boundary is a manifold and its components are
+    the mask's.
 
-    Cells at pinches of the boundary are dropped (`manifold_part`). Within each face-connected component of voxels, the
-    largest connected component of cells stays, and those of a hundredth of its volume or more; with `keeps_components`
-    all stay. With labels, `members`, a component with most of a label's volume stays, too.
+    Cells at pinches of the boundary are dropped (`manifold_part`). Within each face-connected
+    component of voxels, the largest connected component of cells stays, and those of a hundredth of
+    its volume or more; with `keeps_components` all stay. With labels, `members`, a component with
+    most of a label's volume stays, too.
     """
     size = volumes(mesh.points, mesh.cells)
     is_kept = manifold_part(_welded(mesh), size)
@@ -61,12 +70,16 @@ def carved(
     is_kept[chosen[is_dropped[number]]] = False
     lost = by_label[is_dropped].sum(axis=0)
     return Carved(
-        is_kept, int(is_dropped.sum()), dict(zip(labels[lost > 0].tolist(), lost[lost > 0].tolist(), strict=True))
+        is_kept,
+        int(is_dropped.sum()),
+        dict(zip(labels[lost > 0].tolist(), lost[lost > 0].tolist(), strict=True)),
     )
 
 
 def _welded(mesh: Mesh) -> NDArray[np.int64]:
-    """The cells with one number for coincident nodes, where parts of a boundary may touch without sharing a node."""
+    """The cells with one number for coincident nodes, where parts of a boundary may touch
+    without sharing a node.
+    """
     order = np.lexsort(mesh.points.T)
     is_new = np.append(True, (mesh.points[order[1:]] != mesh.points[order[:-1]]).any(axis=1))
     first = np.empty(len(order), dtype=np.int64)
@@ -83,15 +96,21 @@ def part_of(mesh: Mesh, is_kept: NDArray[np.bool_]) -> Mesh:
 
 
 def _home(
-    voxel: tuple[NDArray[np.int64], ...], number: NDArray[np.int64], size: NDArray[np.float64], region: Region
+    voxel: tuple[NDArray[np.int64], ...],
+    number: NDArray[np.int64],
+    size: NDArray[np.float64],
+    region: Region,
 ) -> NDArray[np.int64]:
-    """The component of voxels, from 1, that contains most of each component of cells, (C,); 0 for none.
+    """The component of voxels, from 1, that contains most of each component of cells, (C,); 0 for
+    none.
 
     Cells have a `number` of their component, a size, and a voxel at their centroid.
     """
     of_voxel, n_homes = scipy.ndimage.label(region.inside)
     at = of_voxel[voxel].astype(np.int64)
-    fractions = scipy.sparse.coo_array((size, (number, at)), shape=(int(number.max()) + 1, n_homes + 1)).tocsr()
+    fractions = scipy.sparse.coo_array(
+        (size, (number, at)), shape=(int(number.max()) + 1, n_homes + 1)
+    ).tocsr()
     fractions = fractions[:, 1:]  # a component that lies partly outside has its home inside
     home = np.zeros(fractions.shape[0], dtype=np.int64)
     has_home = np.diff(fractions.indptr) > 0

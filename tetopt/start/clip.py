@@ -1,7 +1,7 @@
 """Clip a mesh of an image's box at the surface of a mask's region.
 
-Nodes near the surface move onto it; then edges that still cross it are split there, so that every cell lies on one
-side (after the isosurface stuffing of Labelle and Shewchuk 2007, for any mesh).
+Nodes near the surface move onto it; then edges that still cross it are split there, so that every
+cell lies on one side (after the isosurface stuffing of Labelle and Shewchuk 2007, for any mesh).
 """
 
 from __future__ import annotations
@@ -20,18 +20,22 @@ from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice_mesh
 
 SNAP_FRACTION = 0.3  # of an edge: a node this near to the surface along it moves onto the surface
-TOUCH_FRACTION = 0.15  # of an edge: a node this near to the surface counts as on it, even if it cannot move there
+# of an edge: a node this near to the surface counts as on it, even if it cannot move there
+TOUCH_FRACTION = 0.15
 LEAST_FULLNESS = 0.2  # least `_fullness` of a cell when nodes move onto the surface
 LATTICE_TRIALS = 4  # lattices tried for a number of nodes within a region
 SNAP_STEPS = 8  # Newton steps towards the surface
 VOLUME_POINTS = 2**16  # for the volume of cells outside a region: a tenth is exact to 0.1 % of all
-OVERHANG_RATIO = 2.5  # of the volume that facets cut off outside: without gaps, cells lie outside by 1.3 to 2.2 of it
-LEAST_RISE = 0.3  # of the usual slope, along the normal of a facet that cuts off volume: across a wall there is none
+# of the volume that facets cut off outside: without gaps, cells lie outside by 1.3 to 2.2 of it
+OVERHANG_RATIO = 2.5
+# of the usual slope, along the normal of a facet that cuts off volume: across a wall there is none
+LEAST_RISE = 0.3
 BISECTION_ROUNDS = 20  # along an edge that crosses the surface: to 1e-6 of its length
 
 
 def clipped(mesh: Mesh, image: Image, region: Region) -> Mesh:
-    """The part of a mesh of the image's box within the region, with nodes on its surface and whole cells.
+    """The part of a mesh of the image's box within the region, with nodes on its surface and whole
+    cells.
 
     Raises
     ------
@@ -41,7 +45,8 @@ def clipped(mesh: Mesh, image: Image, region: Region) -> Mesh:
     index = image.to_index(mesh.points)
     level = levels(region.level, index)
     level[np.abs(level) < ON_SURFACE_VOXELS] = 0.0
-    # The surface changes only cells that share a node with one that it crosses, which are few in a large mesh.
+    # The surface changes only cells that share a node with one that it crosses, which are few in a
+    # large mesh.
     is_inside, is_outside = _sides(level, mesh.cells)
     is_touched = np.zeros(len(level), dtype=bool)
     is_touched[mesh.cells[is_inside & is_outside]] = True
@@ -52,17 +57,22 @@ def clipped(mesh: Mesh, image: Image, region: Region) -> Mesh:
     is_flat = ~(is_inside | is_outside)
     is_inside[is_flat] = levels(region.level, index[cells[is_flat]].mean(axis=1)) < 0.0
     if not is_inside.any():
-        raise InputError("mask: it is thinner than the cells, so no cell is left inside; increase the number of nodes")
+        raise InputError(
+            "mask: it is thinner than the cells, so no cell is left inside; increase the number "
+            "of nodes"
+        )
     used, kept = compact(cells[is_inside], len(index))
     return Mesh(image.to_world(index[used]), kept)
 
 
 def lost_fraction(mesh: Mesh, image: Image, region: Region) -> float:
-    """Fraction of a region's volume, as of thin walls, without cells, apart from what a mesh's flat facets cut off.
+    """Fraction of a region's volume, as of thin walls, without cells, apart from what a mesh's flat
+    facets cut off.
 
-    Facets with corners on a round surface have on average n / (n + 1) of the depth of their centres within it; those
-    inside that cross a torn wall, along whose normals the level hardly changes, cut nothing off; those that cross it
-    obliquely count. Cells that bridge gaps of the region do not make up for lost walls.
+    Facets with corners on a round surface have on average n / (n + 1) of the depth of their centres
+    within it; those inside that cross a torn wall, along whose normals the level hardly changes,
+    cut nothing off; those that cross it obliquely count. Cells that bridge gaps of the region do
+    not make up for lost walls.
     """
     index = image.to_index(mesh.points)
     facets = boundary_facets(mesh.cells)
@@ -76,31 +86,48 @@ def lost_fraction(mesh: Mesh, image: Image, region: Region) -> float:
     is_surface = (level > 0.0) | (np.abs((slope * normal).sum(axis=1)) >= least_rise)
     cut_off = np.where(is_surface, -area * level * image.ndim / (image.ndim + 1), 0.0)
     volume = mesh.cell_volumes / image.voxel_volume
-    bridged = _volume_outside(region, index[mesh.cells], volume) + OVERHANG_RATIO * np.minimum(cut_off, 0.0).sum()
+    bridged = (
+        _volume_outside(region, index[mesh.cells], volume)
+        + OVERHANG_RATIO * np.minimum(cut_off, 0.0).sum()
+    )
     covered = volume.sum() + cut_off.sum() - max(bridged, 0.0)
     return float(1.0 - covered / region.inside.sum())
 
 
-def _volume_outside(region: Region, corners: NDArray[np.float64], volume: NDArray[np.float64]) -> float:
-    """Volume of the cells' parts outside a region, by points spread evenly over the volume of the cells, (M,)."""
+def _volume_outside(
+    region: Region, corners: NDArray[np.float64], volume: NDArray[np.float64]
+) -> float:
+    """Volume of the cells' parts outside a region, by points spread evenly over the volume of
+    the cells, (M,).
+    """
     ends = np.cumsum(volume)
-    chosen = corners[np.searchsorted(ends, (np.arange(VOLUME_POINTS) + 0.5) / VOLUME_POINTS * ends[-1])]
-    weights = np.random.default_rng(0).exponential(size=chosen.shape[:2])  # over their sums, uniform within a simplex
+    chosen = corners[
+        np.searchsorted(ends, (np.arange(VOLUME_POINTS) + 0.5) / VOLUME_POINTS * ends[-1])
+    ]
+    # over their sums, uniform within a simplex
+    weights = np.random.default_rng(0).exponential(size=chosen.shape[:2])
     points = (weights[:, :, None] * chosen).sum(axis=1) / weights.sum(axis=1, keepdims=True)
     return float(ends[-1] * np.mean(levels(region.level, points) > 0.0))
 
 
-def _sides(level: NDArray[np.float64], cells: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _sides(
+    level: NDArray[np.float64], cells: NDArray[np.int64]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Masks of the cells with a node inside, and of those with a node outside, (M,) each."""
     of_cells = level[cells]
     return np.asarray(of_cells.min(axis=1) < 0.0), np.asarray(of_cells.max(axis=1) > 0.0)
 
 
 def lattice_within(
-    image: Image, region: Region | None, kind: str | None = None, *, nodes: int | None = None,
+    image: Image,
+    region: Region | None,
+    kind: str | None = None,
+    *,
+    nodes: int | None = None,
     spacing: float | None = None,
-) -> Mesh:  # fmt: skip
-    """`tetopt.lattice_mesh` of the image's box, clipped at the region's surface, with about `nodes` nodes.
+) -> Mesh:
+    """`tetopt.lattice_mesh` of the image's box, clipped at the region's surface, with about `nodes`
+    nodes.
 
     Raises
     ------
@@ -110,7 +137,8 @@ def lattice_within(
     if region is None or nodes is None:
         mesh = lattice_mesh(image, kind, nodes=nodes, spacing=spacing)
         return mesh if region is None else clipped(mesh, image, region)
-    in_box, nearest = nodes * region.inside.size / region.inside.sum(), list[Mesh]()  # nodes of a lattice of the box
+    # nodes of a lattice of the box
+    in_box, nearest = nodes * region.inside.size / region.inside.sum(), list[Mesh]()
     for _ in range(LATTICE_TRIALS):
         mesh = clipped(lattice_mesh(image, kind, nodes=int(in_box)), image, region)
         nearest = [min([*nearest, mesh], key=lambda each: abs(len(each.points) - nodes))]
@@ -119,9 +147,15 @@ def lattice_within(
 
 
 def _snapped(
-    index: NDArray[np.float64], level: NDArray[np.float64], cells: NDArray[np.int64], image: Image, region: Region
+    index: NDArray[np.float64],
+    level: NDArray[np.float64],
+    cells: NDArray[np.int64],
+    image: Image,
+    region: Region,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Move nodes that are near to the surface along an edge onto it, unless that flattens a cell."""
+    """Move nodes that are near to the surface along an edge onto it, unless that flattens a
+    cell.
+    """
     edge = edge_ends(cells)
     edge = edge[level[edge].prod(axis=2) < 0.0]
     edge = np.column_stack(np.divmod(np.unique(edge @ [len(level), 1]), len(level)))  # each once
@@ -133,7 +167,11 @@ def _snapped(
     there, is_there = onto_surface(index[close], image, region)
     # The edges of a node that cannot get there on a short way are split instead.
     length = np.full(len(level), np.inf)
-    np.minimum.at(length, edge.ravel(), np.repeat(np.linalg.norm(np.diff(index[edge], axis=1)[:, 0], axis=1), 2))
+    np.minimum.at(
+        length,
+        edge.ravel(),
+        np.repeat(np.linalg.norm(np.diff(index[edge], axis=1)[:, 0], axis=1), 2),
+    )
     way = np.zeros(len(level))
     way[close] = np.linalg.norm(there - index[close], axis=1) / length[close]
     is_there &= way[close] < 2.0 * SNAP_FRACTION
@@ -148,7 +186,8 @@ def _snapped(
             break
         moved[back], way[back] = index[back], 0.0
     level = np.where(way > 0.0, 0.0, level)
-    # A node that remains very near to a crossing counts as on the surface; it gets there as soon as it moves.
+    # A node that remains very near to a crossing counts as on the surface; it gets there as soon as
+    # it moves.
     still_crosses = level[edge].prod(axis=1) < 0.0
     edge, part = edge[still_crosses], part[still_crosses]
     level[edge[part < TOUCH_FRACTION, 0]] = 0.0
@@ -157,16 +196,21 @@ def _snapped(
 
 
 def _fullness(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Volume relative to the regular cell with the same sum of squared edges, (M,): 0 to 1, negative if inverted."""
+    """Volume relative to the regular cell with the same sum of squared edges, (M,): 0 to 1,
+    negative if inverted.
+    """
     n = points.shape[1]
     regular = 2.0**0.5 / 12.0 / 6.0**1.5 if n == 3 else 3.0**0.5 / 4.0 / 3.0
-    return volumes(points, cells) / (regular * squared_edges(points, cells).sum(axis=1) ** (0.5 * n))
+    return volumes(points, cells) / (
+        regular * squared_edges(points, cells).sum(axis=1) ** (0.5 * n)
+    )
 
 
 def onto_surface(
     index: NDArray[np.float64], image: Image, region: Region
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Move points (K, n) to the surface, nearly the shortest way in mm; also return a mask of those that arrive, (K,).
+    """Move points (K, n) to the surface, nearly the shortest way in mm; also return a mask of those
+    that arrive, (K,).
 
     Those on the box's faces stay on them.
     """
@@ -188,17 +232,23 @@ def onto_surface(
 def _slopes(level: NDArray[np.float32], index: NDArray[np.float64]) -> NDArray[np.float64]:
     """Derivatives of the level function along the axes at index coordinates (K, n), (K, n)."""
     off = 0.25 * np.eye(index.shape[1])
-    return np.stack([2.0 * (levels(level, index + way) - levels(level, index - way)) for way in off], axis=1)
+    return np.stack(
+        [2.0 * (levels(level, index + way) - levels(level, index - way)) for way in off], axis=1
+    )
 
 
 def _cut(
-    index: NDArray[np.float64], level: NDArray[np.float64], cells: NDArray[np.int64], near: NDArray[np.int64],
+    index: NDArray[np.float64],
+    level: NDArray[np.float64],
+    cells: NDArray[np.int64],
+    near: NDArray[np.int64],
     region: Region,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:  # fmt: skip
-    """Split every edge that crosses the surface there; `near` numbers the cells. Return nodes, their levels and cells.
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """Split every edge that crosses the surface there; `near` numbers the cells. Return nodes,
+    their levels and cells.
 
-    Each round splits every cell at the first of its crossing edges, in an order that is the same for all cells, so that
-    two cells always cut the facet between them alike.
+    Each round splits every cell at the first of its crossing edges, in an order that is the same
+    for all cells, so that two cells always cut the facet between them alike.
     """
     n_nodes = len(index)
     ends = edge_ends(cells[near])
@@ -216,7 +266,9 @@ def _cut(
         is_cut = crosses.any(axis=1)
         done.append(open_cells[~is_cut])
         cut = open_cells[is_cut]
-        first = np.where(crosses[is_cut], ends[is_cut] @ [n_nodes, 1], n_nodes * n_nodes).min(axis=1)
+        first = np.where(crosses[is_cut], ends[is_cut] @ [n_nodes, 1], n_nodes * n_nodes).min(
+            axis=1
+        )
         node = n_nodes + np.searchsorted(code, first)
         one, other = cut.copy(), cut.copy()
         one[cut == (first // n_nodes)[:, None]] = node
@@ -225,8 +277,12 @@ def _cut(
     return index, level, np.concatenate(done)
 
 
-def _crossings(a: NDArray[np.float64], b: NDArray[np.float64], region: Region) -> NDArray[np.float64]:
-    """Fractions of the way from a to b (K, n) at which the surface crosses these edges, (K,), by bisection."""
+def _crossings(
+    a: NDArray[np.float64], b: NDArray[np.float64], region: Region
+) -> NDArray[np.float64]:
+    """Fractions of the way from a to b (K, n) at which the surface crosses these edges, (K,), by
+    bisection.
+    """
     low, high = np.zeros(len(a)), np.ones(len(a))
     sign = np.sign(levels(region.level, a))
     for _ in range(BISECTION_ROUNDS):

@@ -15,12 +15,13 @@ TIE_BREAK = 1e-7  # of the squared typical edge
 def delaunay(index: NDArray[np.float64], affine: NDArray[np.float64]) -> NDArray[np.int64] | None:
     """Delaunay cells of nodes in index space, with cospherical ties broken so that no cell is flat.
 
-    The Delaunay tessellation is the lower hull of the nodes lifted to (x, |x|^2) (Brown 1979). The lift is linear
-    in x apart from the height, so x may stay in index space, where the box's faces are coordinate planes and
-    nodes on them are coplanar to the last bit, with |x|^2 measured in mm. Lattices are full of cospherical nodes,
-    which Qhull turns into flat cells. Raising each node by a tiny fixed pseudo-random height (1e-7 of the squared
-    typical edge; a regular triangulation with those weights) leaves no ties, moves no node, and makes Qhull faster.
-    Cells that are Delaunay by more than that margin are not affected.
+    The Delaunay tessellation is the lower hull of the nodes lifted to (x, |x|^2) (Brown 1979). The
+    lift is linear in x apart from the height, so x may stay in index space, where the box's faces
+    are coordinate planes and nodes on them are coplanar to the last bit, with |x|^2 measured in mm.
+    Lattices are full of cospherical nodes, which Qhull turns into flat cells. Raising each node by
+    a tiny fixed pseudo-random height (1e-7 of the squared typical edge; a regular triangulation
+    with those weights) leaves no ties, moves no node, and makes Qhull faster. Cells that are
+    Delaunay by more than that margin are not affected.
 
     Parameters
     ----------
@@ -32,8 +33,8 @@ def delaunay(index: NDArray[np.float64], affine: NDArray[np.float64]) -> NDArray
     Returns
     -------
     (M, n+1) int64 or None
-        Cells, positively oriented in the world; None if Qhull fails or omits a node. The caller must check
-        that they fill the box.
+        Cells, positively oriented in the world; None if Qhull fails or omits a node. The caller
+        must check that they fill the box.
     """
     n = index.shape[1]
     centred = index - 0.5 * (index.min(axis=0) + index.max(axis=0))
@@ -48,7 +49,8 @@ def delaunay(index: NDArray[np.float64], affine: NDArray[np.float64]) -> NDArray
         hull = scipy.spatial.ConvexHull(lifted)
     except scipy.spatial.QhullError:
         return None
-    is_lower = hull.equations[:, n] < -1e-9  # 0, up to rounding, for faces of the box, which are vertical
+    # 0, up to rounding, for faces of the box, which are vertical
+    is_lower = hull.equations[:, n] < -1e-9
     cells = oriented(world, hull.simplices[is_lower])
     # Qhull's order of cells depends on its version; a sorted one does not.
     cells = cells[np.lexsort(np.sort(cells, axis=1).T[::-1])]

@@ -1,8 +1,9 @@
-"""Sizes of cells by label: a number of cells across where a label is thin, a length, or a fraction of its thickness.
+"""Sizes of cells by label: a number of cells across where a label is thin, a length, or a fraction
+of its thickness.
 
-The targets of `tetopt.start.sizes` by place follow from the local thickness of labels (`tetopt.contents.thickness`), as
-in proximity sizing in Ansys, narrow regions in COMSOL, and the slopes of SimNIBS' charm (Puonti et al. 2020, NeuroImage
-219, 117044).
+The targets of `tetopt.start.sizes` by place follow from the local thickness of labels
+(`tetopt.contents.thickness`), as in proximity sizing in Ansys, narrow regions in COMSOL, and the
+slopes of SimNIBS' charm (Puonti et al. 2020, NeuroImage 219, 117044).
 """
 
 from __future__ import annotations
@@ -22,16 +23,21 @@ from tetopt.start.octree import nodes_of_sizes
 from tetopt.start.sizes import LONGEST_IN_BLOCK, NO_BOUND_MM, USUAL_IN_BLOCK, Sizes
 
 EVERY_LABEL = "*"  # all labels without their own size
-SIZE_FORM = re.compile(r"(?P<length>[0-9.eE+-]+)(?P<t>t?)(\[(?P<least>[0-9.eE+-]*):(?P<most>[0-9.eE+-]*)\])?")
-DEFAULT_SIZED_NODES = 5000  # of the uniform mesh that sets the largest targets if no nodes or lengths are given
+SIZE_FORM = re.compile(
+    r"(?P<length>[0-9.eE+-]+)(?P<t>t?)(\[(?P<least>[0-9.eE+-]*):(?P<most>[0-9.eE+-]*)\])?"
+)
+# of the uniform mesh that sets the largest targets if no nodes or lengths are given
+DEFAULT_SIZED_NODES = 5000
 BELOW_FRACTION = 0.98  # of the requested cells: a place with fewer across counts as below
-SCALE_STEPS = 12  # bisection steps for the factor that enlarges sizes to fit a number of nodes: to 1e-3
+# bisection steps for the factor that enlarges sizes to fit a number of nodes: to 1e-3
+SCALE_STEPS = 12
 LARGEST_SCALE = 64.0  # upper limit of that factor
 MOST_ACROSS = 20.0  # cells across a label
 
 
 class LabelSize(NamedTuple):
-    """The size of a label's cells, mm: a length, or a multiple of the local thickness between bounds.
+    """The size of a label's cells, mm: a length, or a multiple of the local thickness between
+    bounds.
 
     Parameters
     ----------
@@ -71,7 +77,9 @@ class LabelSize(NamedTuple):
         >>> tetopt.LabelSize(1.5).at(np.array([1.0, 4.0]))
         array([1.5, 1.5])
         """
-        size = self.length * thickness if self.is_slope else np.full(np.shape(thickness), self.length)
+        size = (
+            self.length * thickness if self.is_slope else np.full(np.shape(thickness), self.length)
+        )
         return np.asarray(np.clip(size, self.least, self.most), dtype=np.float64)
 
 
@@ -89,7 +97,8 @@ class LabelLayers(NamedTuple):
     cells_across : float
         Median of thickness over target.
     below : float
-        Fraction of its voxels with fewer cells across than requested; 0 if none is requested, as for label 0.
+        Fraction of its voxels with fewer cells across than requested; 0 if none is requested, as
+        for label 0.
 
     Examples
     --------
@@ -115,8 +124,8 @@ class SizesByLabel(NamedTuple):
     sizes : Sizes
         Sizes with a field of targets.
     nodes : int
-        Approximate number of nodes that the requested sizes take; without `edge_size` more if there are more nodes, as
-        cells outside thin labels become smaller.
+        Approximate number of nodes that the requested sizes take; without `edge_size` more if there
+        are more nodes, as cells outside thin labels become smaller.
     scale : float
         Factor by which they are larger than requested to meet a lower number of nodes; else 1.
     layers : list of LabelLayers
@@ -138,12 +147,14 @@ class SizesByLabel(NamedTuple):
 
 
 def parse_label_sizes(text: str) -> dict[int | str, LabelSize]:
-    """Parse sizes by label, or by labels' names, as written on a command line; `*` stands for all others.
+    """Parse sizes by label, or by labels' names, as written on a command line; `*` stands for all
+    others.
 
     Parameters
     ----------
     text : str
-        "NAME=SIZE, ...", where a size is in mm, or a fraction of the thickness t with optional bounds in mm.
+        "NAME=SIZE, ...", where a size is in mm, or a fraction of the thickness t with optional
+        bounds in mm.
 
     Returns
     -------
@@ -186,23 +197,32 @@ def parse_label_size(text: str | float) -> LabelSize:
         if match is None:
             raise ValueError(text)
         size = LabelSize(
-            float(match["length"]), bool(match["t"]), float(match["least"] or 0.0), float(match["most"] or np.inf)
+            float(match["length"]),
+            bool(match["t"]),
+            float(match["least"] or 0.0),
+            float(match["most"] or np.inf),
         )
     except ValueError:
         raise InputError(
-            f'label_size: expected mm, or a fraction of the thickness t such as 0.6t or 0.6t[1:10], got "{text}"'
+            "label_size: expected mm, or a fraction of the thickness t such as 0.6t or "
+            f'0.6t[1:10], got "{text}"'
         ) from None
     if not (0.0 < size.length < np.inf and 0.0 <= size.least <= size.most and size.most > 0.0):
-        raise InputError(f'label_size: expected lengths above 0 mm with increasing bounds, got "{text}"')
+        raise InputError(
+            f'label_size: expected lengths above 0 mm with increasing bounds, got "{text}"'
+        )
     return size
 
 
-def sizes_by_label(sizes: Sizes, image: Image | Content, nodes: int | None = None) -> SizesByLabel | None:
+def sizes_by_label(
+    sizes: Sizes, image: Image | Content, nodes: int | None = None
+) -> SizesByLabel | None:
     """Targets by place from `cells_across` and `by_label` of sizes; None without them.
 
-    A place gets the smallest of its label's size; its local thickness over `cells_across`, except in label 0, which is
-    not a tissue; `field`; and `edge_size`, but never less than `smallest`. Without `edge_size`, places that are not
-    thin get no target if `nodes` is given, and otherwise the usual edge of a uniform mesh of 5,000 nodes.
+    A place gets the smallest of its label's size; its local thickness over `cells_across`, except
+    in label 0, which is not a tissue; `field`; and `edge_size`, but never less than `smallest`.
+    Without `edge_size`, places that are not thin get no target if `nodes` is given, and otherwise
+    the usual edge of a uniform mesh of 5,000 nodes.
 
     Parameters
     ----------
@@ -211,7 +231,8 @@ def sizes_by_label(sizes: Sizes, image: Image | Content, nodes: int | None = Non
     image : Image or Content
         A content with labels.
     nodes : int, optional
-        Available number of nodes (corners of cells): if sizes take more, a common factor enlarges all.
+        Available number of nodes (corners of cells): if sizes take more, a common factor enlarges
+        all.
 
     Returns
     -------
@@ -253,24 +274,37 @@ def sizes_by_label(sizes: Sizes, image: Image | Content, nodes: int | None = Non
         low, high = 1.0, LARGEST_SCALE
         for _ in range(SCALE_STEPS):
             scale = float(np.sqrt(low * high))
-            low, high = (low, scale) if nodes_of_sizes(content, scaled(scale))[0] <= nodes else (scale, high)
+            low, high = (
+                (low, scale)
+                if nodes_of_sizes(content, scaled(scale))[0] <= nodes
+                else (scale, high)
+            )
         scale = high
     made = scaled(scale)
     assert made.field is not None
     layers = _layers(sizes, content, thickness, made.field.data)
     if not is_everywhere:
         data = np.where(made.field.data < largest, made.field.data, 0.0)
-        made = made._replace(edge_size=None, field=Image(data, content.image.affine) if data.any() else None)
+        made = made._replace(
+            edge_size=None, field=Image(data, content.image.affine) if data.any() else None
+        )
     return SizesByLabel(made, needed, scale, layers)
 
 
 def _rules(sizes: Sizes, content: Content) -> dict[int, LabelSize]:
-    """The size of each label that has one, by row; raise InputError for unknown labels and invalid values."""
+    """The size of each label that has one, by row; raise InputError for unknown labels and
+    invalid values.
+    """
     members = content.memberships
     if members is None:
-        raise InputError("sizes: cells_across and by_label require labels with smooth interfaces; give labels")
+        raise InputError(
+            "sizes: cells_across and by_label require labels with smooth interfaces; give labels"
+        )
     if sizes.cells_across is not None and not 0.0 < sizes.cells_across <= MOST_ACROSS:
-        raise InputError(f"cells_across: expected above 0 and up to {MOST_ACROSS:g} cells, got {sizes.cells_across}")
+        raise InputError(
+            f"cells_across: expected above 0 and up to {MOST_ACROSS:g} cells, got "
+            f"{sizes.cells_across}"
+        )
     by_label = {
         label: size if isinstance(size, LabelSize) else parse_label_size(size)
         for label, size in (sizes.by_label or {}).items()
@@ -279,7 +313,9 @@ def _rules(sizes: Sizes, content: Content) -> dict[int, LabelSize]:
     rows = {int(label): row for row, label in enumerate(members.labels)}
     if missing := [label for label in by_label if label not in rows]:
         names = ", ".join(map(str, rows))
-        raise InputError(f"label_size: no meshed voxel has label {missing[0]}; the labels are {names}")
+        raise InputError(
+            f"label_size: no meshed voxel has label {missing[0]}; the labels are {names}"
+        )
     rules = {rows[int(label)]: size for label, size in by_label.items()}
     return rules if rest is None else {row: rules.get(row, rest) for row in rows.values()}
 
@@ -293,7 +329,9 @@ def _largest(sizes: Sizes, content: Content, nodes: int | None) -> tuple[float, 
     return min(longest * USUAL_IN_BLOCK[n] / LONGEST_IN_BLOCK[n], NO_BOUND_MM), nodes is None
 
 
-def _thickness(sizes: Sizes, content: Content, rules: dict[int, LabelSize], largest: float) -> NDArray[np.float32]:
+def _thickness(
+    sizes: Sizes, content: Content, rules: dict[int, LabelSize], largest: float
+) -> NDArray[np.float32]:
     """The local thickness by voxel, mm, clipped where sizes no longer depend on it."""
     assert content.memberships is not None
     spacing = content.image.spacing
@@ -304,7 +342,11 @@ def _thickness(sizes: Sizes, content: Content, rules: dict[int, LabelSize], larg
 
 
 def _targets(
-    sizes: Sizes, content: Content, rules: dict[int, LabelSize], thickness: NDArray[np.float32], largest: float
+    sizes: Sizes,
+    content: Content,
+    rules: dict[int, LabelSize],
+    thickness: NDArray[np.float32],
+    largest: float,
 ) -> NDArray[np.float64]:
     """The smallest requested target at each voxel, mm."""
     assert content.memberships is not None
@@ -319,7 +361,9 @@ def _targets(
     return target
 
 
-def _layers(sizes: Sizes, content: Content, thickness: NDArray[np.float32], target: NDArray) -> list[LabelLayers]:
+def _layers(
+    sizes: Sizes, content: Content, thickness: NDArray[np.float32], target: NDArray
+) -> list[LabelLayers]:
     """The thickness and sizes of each label, the thinnest first, the background last."""
     assert content.memberships is not None
     rows = []
@@ -332,8 +376,14 @@ def _layers(sizes: Sizes, content: Content, thickness: NDArray[np.float32], targ
         thick, edge = thickness[is_label], target[is_label]
         low, middle, high = np.percentile(thick, THICKNESS_PERCENTILES)
         across = thick / edge
-        number = 0.0 if sizes.cells_across is None or label == BACKGROUND_LABEL else sizes.cells_across
+        number = (
+            0.0 if sizes.cells_across is None or label == BACKGROUND_LABEL else sizes.cells_across
+        )
         below = float((across < BELOW_FRACTION * number).mean())
         numbers = float(low), float(middle), float(high)
-        rows.append(LabelLayers(int(label), numbers, float(np.median(edge)), float(np.median(across)), below))
+        rows.append(
+            LabelLayers(
+                int(label), numbers, float(np.median(edge)), float(np.median(across)), below
+            )
+        )
     return sorted(rows, key=lambda each: (each.label == BACKGROUND_LABEL, each.thickness))

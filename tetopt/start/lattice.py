@@ -1,13 +1,16 @@
 """Initial meshes: regular lattices that cover an image's box exactly.
 
-The paper starts from "a uniform mesh of regular elements throughout the domain". Connectivity is written down
-directly. Each lattice divides the box, index -0.5 to shape - 0.5, into equal blocks as near to cubes (squares) as
-the box allows:
+The paper starts from "a uniform mesh of regular elements throughout the domain". Connectivity is
+written down directly. Each lattice divides the box, index -0.5 to shape - 0.5, into equal blocks as
+near to cubes (squares) as the box allows:
 
-- ``criss-cross`` (2-D): its centre divides every square into four triangles; the meshes of Fig. 2(a) and 3(a, c).
-- ``five-tet`` (3-D): every cube consists of five tetrahedra, mirrored between neighbours; the mesh of Fig. 3(e).
-- ``bcc`` (3-D): body-centred cubic, four congruent tetrahedra around each edge between neighbouring cube centres
-  (dihedral angles 60 and 90 degrees, rho 0.3162); on the box's faces, halves of pyramids below the cube centres.
+- ``criss-cross`` (2-D): its centre divides every square into four triangles; the meshes of Fig.
+  2(a) and 3(a, c).
+- ``five-tet`` (3-D): every cube consists of five tetrahedra, mirrored between neighbours; the mesh
+  of Fig. 3(e).
+- ``bcc`` (3-D): body-centred cubic, four congruent tetrahedra around each edge between neighbouring
+  cube centres (dihedral angles 60 and 90 degrees, rho 0.3162); on the box's faces, halves of
+  pyramids below the cube centres.
 """
 
 from __future__ import annotations
@@ -26,7 +29,8 @@ from tetopt.mesh import Mesh
 from tetopt.system.budget import at_most, check_memory
 
 Kind = Literal["bcc", "five-tet", "criss-cross"]
-KINDS: dict[int, tuple[Kind, ...]] = {2: ("criss-cross",), 3: ("bcc", "five-tet")}  # by dimension; the default first
+# by dimension; the default first
+KINDS: dict[int, tuple[Kind, ...]] = {2: ("criss-cross",), 3: ("bcc", "five-tet")}
 LATTICE_NODE_BYTES = 800.0  # six cells of four node numbers, and three times that during assembly
 MAX_NODES = 50_000_000  # six times as many cells, whose node numbers alone take 10 GB
 
@@ -48,7 +52,8 @@ def lattice_mesh(
     kind : str, optional
         "criss-cross" in 2-D; "bcc" (default) or "five-tet" in 3-D.
     nodes : int, optional
-        Desired number of nodes. The lattice with the nearest count is used, among those with the most cubic blocks.
+        Desired number of nodes. The lattice with the nearest count is used, among those with the
+        most cubic blocks.
     spacing : float, optional
         Edge length of a block, mm, rounded to the nearest that divides the box.
     blocks : tuple of n int, optional
@@ -57,7 +62,8 @@ def lattice_mesh(
     Returns
     -------
     Mesh
-        A conforming, positively oriented mesh without unused nodes or flat cells, with the volume of the box.
+        A conforming, positively oriented mesh without unused nodes or flat cells, with the volume
+        of the box.
 
     Raises
     ------
@@ -91,7 +97,9 @@ def lattice_mesh(
     elif spacing is not None:
         blocks = _blocks_for_spacing(lengths, spacing)
     blocks = _checked_blocks(kind, blocks, n)
-    unit_points, cells = {"criss-cross": _criss_cross, "five-tet": _five_tet, "bcc": _bcc}[kind](blocks)
+    unit_points, cells = {"criss-cross": _criss_cross, "five-tet": _five_tet, "bcc": _bcc}[kind](
+        blocks
+    )
     points = image.to_world(unit_points / np.array(blocks) * image.shape - 0.5)
     return Mesh(points, oriented(points, cells))
 
@@ -105,11 +113,14 @@ def _checked_blocks(kind: str, counts: tuple[int, ...] | None, n: int) -> tuple[
         raise InputError(f"lattice: expected {n} whole numbers >= 1 for blocks, got {counts!r}")
     if _node_count(kind, blocks) > MAX_NODES:
         raise InputError(
-            f"lattice: {blocks} blocks have {_node_count(kind, blocks)} nodes, more than {MAX_NODES}; use fewer blocks"
+            f"lattice: {blocks} blocks have {_node_count(kind, blocks)} nodes, more than "
+            f"{MAX_NODES}; use fewer blocks"
         )
     n_nodes = _node_count(kind, blocks)
     need = LATTICE_NODE_BYTES * n_nodes
-    check_memory(need, f"lattice: {n_nodes} nodes", lambda room: at_most(room / LATTICE_NODE_BYTES, "nodes"))
+    check_memory(
+        need, f"lattice: {n_nodes} nodes", lambda room: at_most(room / LATTICE_NODE_BYTES, "nodes")
+    )
     return blocks
 
 
@@ -125,10 +136,11 @@ def _blocks_for_spacing(lengths: NDArray[np.float64], spacing: float) -> tuple[i
 
 
 def near_cubes(kind: str, lengths: NDArray[np.float64], nodes: int) -> tuple[int, ...]:
-    """The most cubic blocks whose node count is within 3 % of `nodes`; else those with the nearest count.
+    """The most cubic blocks whose node count is within 3 % of `nodes`; else those with the nearest
+    count.
 
-    On a brain's box every number from 3000 is met within 3 %; smaller ones are missed by up to 10 %, since only blocks
-    far from cubes would meet them.
+    On a brain's box every number from 3000 is met within 3 %; smaller ones are missed by up to 10
+    %, since only blocks far from cubes would meet them.
     """
     fewest = _node_count(kind, (1,) * len(lengths))
     if not fewest <= nodes <= MAX_NODES:
@@ -174,8 +186,8 @@ def _criss_cross(blocks: tuple[int, ...]) -> tuple[NDArray[np.float64], NDArray[
     return points, np.stack(cells, axis=2).reshape(-1, 3)
 
 
-# The five tetrahedra of a cube whose corner (x, y, z) has local number 4x + 2y + z: one of the two regular ones in
-# the middle, on corners of even or odd parity, and the four remaining corners.
+# The five tetrahedra of a cube whose corner (x, y, z) has local number 4x + 2y + z: one of the two
+# regular ones in the middle, on corners of even or odd parity, and the four remaining corners.
 _FIVE_EVEN = np.array([[0, 3, 5, 6], [1, 0, 3, 5], [2, 0, 3, 6], [4, 0, 5, 6], [7, 3, 5, 6]])
 _FIVE_ODD = np.array([[1, 2, 4, 7], [0, 1, 2, 4], [3, 1, 2, 7], [5, 1, 4, 7], [6, 2, 4, 7]])
 
@@ -184,7 +196,8 @@ def _five_tet(blocks: tuple[int, ...]) -> tuple[NDArray[np.float64], NDArray[np.
     corner = _corner_number(blocks)
     b0, b1, b2 = blocks
     local = np.stack(
-        [corner[x : x + b0, y : y + b1, z : z + b2] for x, y, z in product((0, 1), repeat=3)], axis=-1
+        [corner[x : x + b0, y : y + b1, z : z + b2] for x, y, z in product((0, 1), repeat=3)],
+        axis=-1,
     ).reshape(-1, 8)
     is_odd = (np.indices(blocks).sum(axis=0) % 2 == 1).reshape(-1)
     pattern = np.where(is_odd[:, None, None], _FIVE_ODD, _FIVE_EVEN)
@@ -200,22 +213,36 @@ def _bcc(blocks: tuple[int, ...]) -> tuple[NDArray[np.float64], NDArray[np.int64
     return points, np.concatenate(cells)
 
 
-def _bcc_across(corner: NDArray[np.int64], centre: NDArray[np.int64], axis: int) -> list[NDArray[np.int64]]:
-    """Cells at the block faces normal to `axis`: between two centres inside, half pyramids on the box."""
+def _bcc_across(
+    corner: NDArray[np.int64], centre: NDArray[np.int64], axis: int
+) -> list[NDArray[np.int64]]:
+    """Cells at the block faces normal to `axis`: between two centres inside, half pyramids on
+    the box.
+    """
     corner = np.moveaxis(corner, axis, 0)
     centre = np.moveaxis(centre, axis, 0)
     loop = [corner[:, :-1, :-1], corner[:, 1:, :-1], corner[:, 1:, 1:], corner[:, :-1, 1:]]
     inside = [
-        np.stack([centre[:-1], centre[1:], loop[k][1:-1], loop[(k + 1) % 4][1:-1]], axis=-1).reshape(-1, 4)
+        np.stack(
+            [centre[:-1], centre[1:], loop[k][1:-1], loop[(k + 1) % 4][1:-1]], axis=-1
+        ).reshape(-1, 4)
         for k in range(4)
     ]
-    return inside + _half_pyramids([p[0] for p in loop], centre[0]) + _half_pyramids([p[-1] for p in loop], centre[-1])
+    return (
+        inside
+        + _half_pyramids([p[0] for p in loop], centre[0])
+        + _half_pyramids([p[-1] for p in loop], centre[-1])
+    )
 
 
-def _half_pyramids(square: list[NDArray[np.int64]], apex: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+def _half_pyramids(
+    square: list[NDArray[np.int64]], apex: NDArray[np.int64]
+) -> list[NDArray[np.int64]]:
     """The pyramids over the box's squares, cut in two along alternating diagonals."""
     a, b, c, d = square
     is_odd = np.indices(apex.shape).sum(axis=0) % 2 == 1
     first = np.where(is_odd[..., None], np.stack([b, c, d], axis=-1), np.stack([a, b, c], axis=-1))
     second = np.where(is_odd[..., None], np.stack([b, d, a], axis=-1), np.stack([a, c, d], axis=-1))
-    return [np.concatenate([half, apex[..., None]], axis=-1).reshape(-1, 4) for half in (first, second)]
+    return [
+        np.concatenate([half, apex[..., None]], axis=-1).reshape(-1, 4) for half in (first, second)
+    ]

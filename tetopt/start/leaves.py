@@ -1,15 +1,17 @@
-"""Nodes and cells of an octree's leaves (in 2-D a quadtree's): corners and centres, joined by templates.
+"""Nodes and cells of an octree's leaves (in 2-D a quadtree's): corners and centres, joined by
+templates.
 
-Neighbouring leaves differ by at most one division, also across edges and corners: each edge of a leaf has at most a
-node in its middle, each face at most one in its centre, and both sides of a face divide it alike. The cells of a leaf
-share its centre. In 2-D their other nodes are the ends of an edge, or of half an edge with a node in its middle. In 3-D
-they depend on the neighbour across a face:
+Neighbouring leaves differ by at most one division, also across edges and corners: each edge of a
+leaf has at most a node in its middle, each face at most one in its centre, and both sides of a face
+divide it alike. The cells of a leaf share its centre. In 2-D their other nodes are the ends of an
+edge, or of half an edge with a node in its middle. In 3-D they depend on the neighbour across a
+face:
 
-- A leaf of the same size: its centre, and two neighbouring nodes around the face. Without nodes in the middle of edges
-  these are the four cells of a body-centred lattice.
+- A leaf of the same size: its centre, and two neighbouring nodes around the face. Without nodes in
+  the middle of edges these are the four cells of a body-centred lattice.
 - Smaller leaves: the node in the face's centre, and two neighbouring nodes around the face.
-- A larger leaf, the outside of the box, or a leaf of the same size across a face with nodes in the middle of opposite
-  edges: a triangle of the face.
+- A larger leaf, the outside of the box, or a leaf of the same size across a face with nodes in the
+  middle of opposite edges: a triangle of the face.
 
 If blocks are cubes, the cells are Delaunay and no dihedral angle is below 30 degrees.
 """
@@ -30,9 +32,11 @@ LEAVES_AT_A_TIME = 2**16  # leaves whose cells are assembled at a time
 
 
 class LeafNodes(NamedTuple):
-    """Distinct corners and centres of leaves in lexicographic order of their places; made by `leaf_nodes`.
+    """Distinct corners and centres of leaves in lexicographic order of their places; made by
+    `leaf_nodes`.
 
-    Places are in halves of the smallest leaves; a code combines the coordinates of a place into one number.
+    Places are in halves of the smallest leaves; a code combines the coordinates of a place into one
+    number.
     """
 
     codes: NDArray[np.int64]  # (N,) sorted
@@ -53,7 +57,9 @@ class LeafNodes(NamedTuple):
         return np.where(self.codes[node] == codes, node, -1)
 
 
-def leaves_by_depth(divided: list[NDArray[np.bool_]], roots: tuple[int, ...]) -> Iterator[NDArray[np.int64]]:
+def leaves_by_depth(
+    divided: list[NDArray[np.bool_]], roots: tuple[int, ...]
+) -> Iterator[NDArray[np.int64]]:
     """Places of the leaves of each depth, (K, n), the coarsest first."""
     blocks = np.argwhere(np.ones(roots, dtype=bool))
     half = np.argwhere(np.ones((2,) * len(roots), dtype=bool))
@@ -64,9 +70,13 @@ def leaves_by_depth(divided: list[NDArray[np.bool_]], roots: tuple[int, ...]) ->
 
 
 def leaf_nodes(
-    divided: list[NDArray[np.bool_]], roots: tuple[int, ...], regions: Sequence[NDArray[np.bool_]] = ()
+    divided: list[NDArray[np.bool_]],
+    roots: tuple[int, ...],
+    regions: Sequence[NDArray[np.bool_]] = (),
 ) -> LeafNodes:
-    """Corners and centres of the leaves; with regions, given by depth, leaves outside are skipped."""
+    """Corners and centres of the leaves; with regions, given by depth, leaves outside are
+    skipped.
+    """
     n, depth = len(roots), len(divided)
     corner = np.stack(np.meshgrid(*[[0, 2]] * n, indexing="ij"), axis=-1).reshape(-1, n)
     of_leaf = np.vstack([corner, np.ones((1, n), dtype=np.int64)])  # in halves of a leaf
@@ -83,7 +93,10 @@ def leaf_nodes(
 
 
 def leaf_cells(
-    divided: list[NDArray[np.bool_]], roots: tuple[int, ...], nodes: LeafNodes, points: NDArray[np.float64]
+    divided: list[NDArray[np.bool_]],
+    roots: tuple[int, ...],
+    nodes: LeafNodes,
+    points: NDArray[np.float64],
 ) -> NDArray[np.int64]:
     """Positively oriented cells that fill the leaves, (M, n+1), sorted by their lowest nodes.
 
@@ -100,7 +113,9 @@ def leaf_cells(
     return joined[np.argsort(joined.min(axis=1), kind="stable")]
 
 
-def _cells_in_plane(leaves: NDArray[np.int64], nodes: LeafNodes, depth: int) -> Iterator[NDArray[np.int64]]:
+def _cells_in_plane(
+    leaves: NDArray[np.int64], nodes: LeafNodes, depth: int
+) -> Iterator[NDArray[np.int64]]:
     shift = nodes.depth - depth
     first = 2 * leaves @ nodes.steps
     ring = np.stack([nodes.at(first + step << shift) for step in FACE_RING @ nodes.steps], axis=1)
@@ -108,7 +123,9 @@ def _cells_in_plane(leaves: NDArray[np.int64], nodes: LeafNodes, depth: int) -> 
 
 
 def _cells(leaves: NDArray[np.int64], nodes: LeafNodes, depth: int) -> Iterator[NDArray[np.int64]]:
-    """The tetrahedra of leaves of one depth, face by face; the first of two leaves lists those between them."""
+    """The tetrahedra of leaves of one depth, face by face; the first of two leaves lists those
+    between them.
+    """
     first, shift = 2 * leaves @ nodes.steps, nodes.depth - depth
     centre = nodes.at(first + nodes.steps.sum() << shift)
     for axis in range(3):
@@ -117,10 +134,11 @@ def _cells(leaves: NDArray[np.int64], nodes: LeafNodes, depth: int) -> Iterator[
             face = first + (1 + side) * step
             ring = np.stack([nodes.at(face + more << shift) for more in FACE_RING @ along], axis=1)
             middle = nodes.at(face + along.sum() << shift)
-            # Beyond the box this is the code of a place with odd and even coordinates, which has no node.
+            # Beyond the box this is the code of a place with odd and even coordinates, which has no
+            # node.
             across = nodes.at(first + nodes.steps.sum() + 2 * side * step << shift)
-            # The middles of opposite edges and the two centres form a square with two possible diagonals: the one in
-            # the face gives more cells, and 1 % less E_D.
+            # The middles of opposite edges and the two centres form a square with two possible
+            # diagonals: the one in the face gives more cells, and 1 % less E_D.
             is_square = (ring[:, [1, 5]].min(axis=1) >= 0) | (ring[:, [3, 7]].min(axis=1) >= 0)
             is_fine, is_even = middle >= 0, (middle < 0) & (across >= 0) & ~is_square
             yield _around(ring[is_fine], np.stack([centre, middle], axis=1)[is_fine])
@@ -133,7 +151,8 @@ def _cells(leaves: NDArray[np.int64], nodes: LeafNodes, depth: int) -> Iterator[
 def _between(ring: NDArray[np.int64], ends: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
     """Cells between the centres of two leaves, (K, 2), that share a face.
 
-    Where a corner of the face lies between two mid-edge nodes, these three are cut off, as in Delaunay cells.
+    Where a corner of the face lies between two mid-edge nodes, these three are cut off, as in
+    Delaunay cells.
     """
     left = ring.copy()
     for k in (0, 2, 4, 6):
@@ -145,21 +164,28 @@ def _between(ring: NDArray[np.int64], ends: NDArray[np.int64]) -> Iterator[NDArr
 
 
 def _around(ring: NDArray[np.int64], tips: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Cells of the tips, (K, t), and any two neighbours in a ring, (K, 8), with -1 for missing nodes."""
+    """Cells of the tips, (K, t), and any two neighbours in a ring, (K, 8), with -1 for missing
+    nodes.
+    """
     cells = []
     for k in range(8):
         first, second, third = ring[:, k], ring[:, (k + 1) % 8], ring[:, (k + 2) % 8]
-        cells.append(np.column_stack([tips, first, np.where(second < 0, third, second)])[first >= 0])
+        cells.append(
+            np.column_stack([tips, first, np.where(second < 0, third, second)])[first >= 0]
+        )
     return np.concatenate(cells)
 
 
 def _on_squares(
-    ring: NDArray[np.int64], centre: NDArray[np.int64], is_odd: NDArray[np.bool_], chosen: NDArray[np.bool_]
+    ring: NDArray[np.int64],
+    centre: NDArray[np.int64],
+    is_odd: NDArray[np.bool_],
+    chosen: NDArray[np.bool_],
 ) -> Iterator[NDArray[np.int64]]:
     """Cells of the centre and the triangles of the chosen squares.
 
-    Diagonals of plain squares join the corners whose coordinates have an even sum: on a larger leaf's face they start
-    from its centre, and on the box's sides they alternate.
+    Diagonals of plain squares join the corners whose coordinates have an even sum: on a larger
+    leaf's face they start from its centre, and on the box's sides they alternate.
     """
     has_middle = ring[:, 1::2] >= 0
     for mask in range(16):
@@ -174,8 +200,8 @@ def _on_squares(
 def _triangles(mask: int) -> Iterator[tuple[int, int, int]]:
     """Triangles of a square's ring; `mask` gives the edges with a node in the middle.
 
-    The shortest diagonals come first, which cut off corners rather than middles and wide angles rather than sharp ones,
-    so that no angle is below 26 degrees.
+    The shortest diagonals come first, which cut off corners rather than middles and wide angles
+    rather than sharp ones, so that no angle is below 26 degrees.
     """
     left = [k for k in range(8) if k % 2 == 0 or mask >> (k // 2) & 1]
     while len(left) > 2:

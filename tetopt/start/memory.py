@@ -1,7 +1,7 @@
 """Estimates of the memory of meshing, from sizes that are known before it begins.
 
-The bytes per channel and cell were fitted to the peaks of 60 measured runs; with `BOUND_MARGIN`, they exceed these
-peaks. A run with labels of 7 million voxels has taken 23 % more.
+The bytes per channel and cell were fitted to the peaks of 60 measured runs; with `BOUND_MARGIN`,
+they exceed these peaks. A run with labels of 7 million voxels has taken 23 % more.
 """
 
 from __future__ import annotations
@@ -14,13 +14,16 @@ KERNEL_BYTES = 2.5e8  # numba's compiler, all kernels if not yet loaded, and buf
 CHANNEL_BYTES = 8.266  # per voxel and channel, in the octree, later in prefix sums
 MESHED_CELL_BYTES = 617.8  # with fluxes and sums
 BOUND_MARGIN = 1.5  # so that estimates exceed the peaks of the runs that they were fitted to
-# Of a whole process, besides meshing: Python and libraries, and by voxel the image, its mask, its labels' levels.
+# Of a whole process, besides meshing: Python and libraries, and by voxel the image, its mask, its
+# labels' levels.
 PROCESS_BYTES = 1.6e8
 READ_BYTES, REGION_BYTES, LABEL_BYTES = 12.0, 33.0, 85.0
-# Per voxel of a part's box: values as stored and as an image, their sums, and a field of doubles. Measured were 32 for
-# doubles, 28 for single precision, 20 for 16-bit integers (parts of 8 to 27 million voxels).
+# Per voxel of a part's box: values as stored and as an image, their sums, and a field of doubles.
+# Measured were 32 for doubles, 28 for single precision, 20 for 16-bit integers (parts of 8 to 27
+# million voxels).
 PART_VOXEL_BYTES = 34.0
-NEXT_FRACTION = 0.3  # of the cells' memory: the additional memory of an exchange or the end of a run
+# of the cells' memory: the additional memory of an exchange or the end of a run
+NEXT_FRACTION = 0.3
 CELLS_PER_NODE = {2: 2, 3: 6}  # in large meshes, by dimension
 
 
@@ -36,14 +39,18 @@ def meshing_bytes(n_voxels: int, n_channels: int, n_nodes: int, ndim: int = 3) -
     ndim : int
         Dimension of the image.
     """
-    n_bytes = CHANNEL_BYTES * (n_voxels * n_channels) + MESHED_CELL_BYTES * (CELLS_PER_NODE[ndim] * n_nodes)
+    n_bytes = CHANNEL_BYTES * (n_voxels * n_channels) + MESHED_CELL_BYTES * (
+        CELLS_PER_NODE[ndim] * n_nodes
+    )
     return KERNEL_BYTES + BOUND_MARGIN * n_bytes
 
 
 def bytes_of(content: Content, nodes: int) -> float:
     """Additional memory for meshing a content with `nodes` nodes; see `meshing_bytes`."""
     image = content.image
-    return meshing_bytes(prod(image.shape), content.n_channels + (content.region is not None), nodes, image.ndim)
+    return meshing_bytes(
+        prod(image.shape), content.n_channels + (content.region is not None), nodes, image.ndim
+    )
 
 
 def part_bytes(n_voxels: int, n_cells: int) -> float:

@@ -1,17 +1,20 @@
 """Initial meshes with nodes where the image has detail: an octree of the box (in 2-D a quadtree).
 
-The box is divided into a few equal blocks as near to cubes as possible, and blocks are divided repeatedly into 2^n,
-those with the largest sum of squared deviations from their mean first. This sum is the error E_D of a mesh with one
-value per block, so the remaining error is spread evenly over the leaves. The part of each block's sum that noise of the
-image's strength would cause is subtracted, so that a noisy but uniform region stays coarse. Neighbouring leaves differ
-by at most one division, also across edges and corners (2:1), and nodes lie at their corners and centres: a lattice of
-body-centred cubes that coarsens in steps of two, whose cells are templates (`tetopt.start.leaves`). Sizes
-(`tetopt.Sizes`) take precedence: blocks with edges longer than allowed are divided regardless of their content, and
-those whose halves would be too short are not. Since blocks halve, a target for the usual edge lies between two block
-sizes: as many blocks are divided, here and there, as give the target's number of nodes, and the exchanges of `optimize`
-do the rest.
+The box is divided into a few equal blocks as near to cubes as possible, and blocks are divided
+repeatedly into 2^n, those with the largest sum of squared deviations from their mean first. This
+sum is the error E_D of a mesh with one value per block, so the remaining error is spread evenly
+over the leaves. The part of each block's sum that noise of the image's strength would cause is
+subtracted, so that a noisy but uniform region stays coarse. Neighbouring leaves differ by at most
+one division, also across edges and corners (2:1), and nodes lie at their corners and centres: a
+lattice of body-centred cubes that coarsens in steps of two, whose cells are templates
+(`tetopt.start.leaves`). Sizes (`tetopt.Sizes`) take precedence: blocks with edges longer than
+allowed are divided regardless of their content, and those whose halves would be too short are not.
+Since blocks halve, a target for the usual edge lies between two block sizes: as many blocks are
+divided, here and there, as give the target's number of nodes, and the exchanges of `optimize` do
+the rest.
 
-The depth of a block is the number of divisions that lead to it: 0 for the undivided blocks, the roots.
+The depth of a block is the number of divisions that lead to it: 0 for the undivided blocks, the
+roots.
 """
 
 from __future__ import annotations
@@ -45,7 +48,8 @@ from tetopt.start.sizes import (
 from tetopt.start.sums import BlockSums, Channels, block_starts, block_sums, channels_of, halved
 from tetopt.system.budget import at_most, check_memory
 
-# Ratios of the undivided blocks' nodes to the requested number, tried in turn, the largest blocks first.
+# Ratios of the undivided blocks' nodes to the requested number, tried in turn, the largest blocks
+# first.
 ROOT_FRACTIONS = tuple(1.0 / k for k in (60, 45, 30, 20, 12, 8, 6, 4, 2.5, 1.6, 1))
 # Fractions of the requested number of nodes by which an octree may miss it:
 BISECTION_MISS = 0.002  # within this, no other threshold is tried;
@@ -56,30 +60,44 @@ BISECTION_STEPS = 60  # at most, for the threshold, which is then exact to the l
 TARGET_MISS = 0.25  # excess over the requested nodes at which targets within a mask are enlarged
 LIGHTER_TRIALS = 5  # factors tried on targets that force too many nodes within a mask, by counts
 MASK_TRIALS = 5  # octrees tried for the number of nodes within a mask
-MOST_LOST = 0.007  # of a mask's volume, apart from what flat facets cut off; with .01, walls end with a tenth less
-FINER_STEPS, FINER_RATIO = 5, 1.5  # of nodes, for a mask that loses more: up to 7.6 times, which exchanges remove
-# of a mask's volume, and of the least that octrees lose: if some in a row lose less than the one but more than the
-# other, as of a rough mask, finer cells are no remedy; a single one loses a wall by chance, as coarse ones do
+# of a mask's volume, apart from what flat facets cut off; with .01, walls end with a tenth less
+MOST_LOST = 0.007
+# of nodes, for a mask that loses more: up to 7.6 times, which exchanges remove
+FINER_STEPS, FINER_RATIO = 5, 1.5
+# of a mask's volume, and of the least that octrees lose: if some in a row lose less than the one
+# but more than the other, as of a rough mask, finer cells are no remedy; a single one loses a wall
+# by chance, as coarse ones do
 SMALL_LOSS, STALLED_FRACTION, STALLED_STEPS = 0.1, 0.9, 2
 MOST_WALL_NODES = 300_000  # of an octree in that search, which takes seconds
-WALL_STEPS = 3  # finer steps tried for the number of nodes that keeps all, after a run that lost walls
-LESS_LOST = 0.5  # of what the first octree loses: if a finer one loses no less, it is not worth its nodes
+# finer steps tried for the number of nodes that keeps all, after a run that lost walls
+WALL_STEPS = 3
+# of what the first octree loses: if a finer one loses no less, it is not worth its nodes
+LESS_LOST = 0.5
 ALWAYS_ALLOWED_NODES = 5000  # allowed even on images with fewer voxels
-LEAF_VOXELS = 2.0  # least edge of a leaf along the smallest voxel edge; a quarter of it along the largest
-SPREAD_OF_VARIANCE = 1e-3  # of the image's variance: a base error of each voxel, to reach any number of nodes
-SPREAD_OF_NOISE = 0.03  # the same, of the noise's variance, so that chance does not decide which noise is divided first
+# least edge of a leaf along the smallest voxel edge; a quarter of it along the largest
+LEAF_VOXELS = 2.0
+# of the image's variance: a base error of each voxel, to reach any number of nodes
+SPREAD_OF_VARIANCE = 1e-3
+# the same, of the noise's variance, so that chance does not decide which noise is divided first
+SPREAD_OF_NOISE = 0.03
 NOISE_SIGMAS = 2.0  # standard deviations of a sum of squared noise that do not count as content
-# Ratio to a target's blocks, to the n-th power, up to which larger ones stay whole, as a lattice seldom fits exactly.
+# Ratio to a target's blocks, to the n-th power, up to which larger ones stay whole, as a lattice
+# seldom fits exactly.
 TARGET_SLACK = 0.25
-OCTREE_NODE_BYTES = 1200.0  # six cells of four node numbers, assembled and sorted: 600; as many for clipping
+# six cells of four node numbers, assembled and sorted: 600; as many for clipping
+OCTREE_NODE_BYTES = 1200.0
 BLOCK_FIELD_BYTES = 8.0  # per smallest block and field
-OTHER_FIELDS = 4  # in addition to the sums: targets, the errors of all depths, and half a field during halving
-# Limit for the summed blocks, whose halves are the smallest leaves that content can cause: 0.5 GB. 1024^3 voxels never
-# reach it; with 2048^3 voxels, leaves have at least 4 voxels.
+# in addition to the sums: targets, the errors of all depths, and half a field during halving
+OTHER_FIELDS = 4
+# Limit for the summed blocks, whose halves are the smallest leaves that content can cause: 0.5 GB.
+# 1024^3 voxels never reach it; with 2048^3 voxels, leaves have at least 4 voxels.
 MOST_BLOCKS = 2**24
-LAYER_BLOCKS = 2**16  # processed at a time: half a megabyte per field, which fits into a processor's cache
-UNEVEN_FACTORS = (0.8191725133961645, 0.6710436067037893, 0.5497004779019703)  # the plastic number's powers -1 to -3
-SKIPPED_RATIO = 2.0  # of the requested nodes: if there are more leaves, nodes are not counted one by one
+# processed at a time: half a megabyte per field, which fits into a processor's cache
+LAYER_BLOCKS = 2**16
+# the plastic number's powers -1 to -3
+UNEVEN_FACTORS = (0.8191725133961645, 0.6710436067037893, 0.5497004779019703)
+# of the requested nodes: if there are more leaves, nodes are not counted one by one
+SKIPPED_RATIO = 2.0
 NODES_OF_LEAF = 9  # its corners and its centre, in 3-D
 TIE_SPREAD = 0.05  # of a block's error: decides between blocks that are alike
 
@@ -87,18 +105,20 @@ TIE_SPREAD = 0.05  # of a block's error: decides between blocks that are alike
 def octree_mesh(image: Image | Content, nodes: int, sizes: Sizes | None = None) -> Mesh:
     """Make a graded mesh of the image's box, or of the mask's region.
 
-    Blocks of voxels are divided where that lowers E_D most, and filled with conforming cells (`tetopt.start.octree`).
+    Blocks of voxels are divided where that lowers E_D most, and filled with conforming cells
+    (`tetopt.start.octree`).
 
     Parameters
     ----------
     image : Image or Content
-        The mesh covers its box, index -0.5 to shape - 0.5 along each axis, exactly; with a mask, it covers the mask's
-        region, with nodes on its surface. A stored image is read box by box: once, and once for each size of undivided
-        blocks that is tried, up to eleven (a `Content` with `statistics` saves one pass). The mesh is the same as for
-        the same voxels in memory, to the last bit.
+        The mesh covers its box, index -0.5 to shape - 0.5 along each axis, exactly; with a mask, it
+        covers the mask's region, with nodes on its surface. A stored image is read box by box:
+        once, and once for each size of undivided blocks that is tried, up to eleven (a `Content`
+        with `statistics` saves one pass). The mesh is the same as for the same voxels in memory, to
+        the last bit.
     nodes : int
-        Desired number of nodes. The nearest octree differs by a few per cent, or by a few dozen of a small number; it
-        has up to eight times as many where a mask is thinner than its cells.
+        Desired number of nodes. The nearest octree differs by a few per cent, or by a few dozen of
+        a small number; it has up to eight times as many where a mask is thinner than its cells.
     sizes : Sizes, optional
         Targets and limits for the blocks' edges. Targets require voxels in memory.
 
@@ -110,8 +130,8 @@ def octree_mesh(image: Image | Content, nodes: int, sizes: Sizes | None = None) 
     Raises
     ------
     InputError
-        More nodes than leaves of 2 voxels, or of the smallest size, can have; fewer nodes than the sizes need;
-        intensities whose squares overflow; or targets for a stored image.
+        More nodes than leaves of 2 voxels, or of the smallest size, can have; fewer nodes than the
+        sizes need; intensities whose squares overflow; or targets for a stored image.
 
     See Also
     --------
@@ -135,7 +155,8 @@ def octree_mesh(image: Image | Content, nodes: int, sizes: Sizes | None = None) 
     if is_near(count, nodes) or content.inside is not None or limits.target is not None:
         return mesh
     raise InputError(
-        f"octree: {nodes} nodes are too {'many' if count < nodes else 'few'} for {_given(content, sizes)}; the "
+        f"octree: {nodes} nodes are too {'many' if count < nodes else 'few'} for "
+        f"{_given(content, sizes)}; the "
         f"nearest octree found has {count}: use about as many, or a uniform mesh"
     )
 
@@ -146,16 +167,21 @@ def _check_enough(content: Content, nodes: int, sizes: Sizes | None, limits: _Bl
     if least > (1.0 + LARGEST_MISS) * nodes + LARGEST_MISS_NODES:
         enough = max(_coarsest_nodes(content, nodes, limits), SIZED_OVER_EQUILATERAL * by_target)
         raise InputError(
-            f"octree: {nodes} nodes are too few for {_given(content, sizes)}, which need at least {least:.4g}; "
+            f"octree: {nodes} nodes are too few for {_given(content, sizes)}, which need at "
+            f"least {least:.4g}; "
             f"use {np.ceil(enough):.0f}, or allow longer edges"
         )
 
 
 def _coarsest_nodes(content: Content, nodes: int, limits: _BlockLimits) -> float:
-    """Number of nodes of the coarsest octree within the limits, disregarding targets; in a mask an estimate."""
+    """Number of nodes of the coarsest octree within the limits, disregarding targets; in a mask
+    an estimate.
+    """
     fitting = _fitting_roots(content, nodes, limits)
     blocks = min(([count << depth for count in roots] for roots, depth in fitting), key=prod)
-    return (prod(blocks) + prod(each + 1 for each in blocks)) * (content.volume / content.image.volume)
+    return (prod(blocks) + prod(each + 1 for each in blocks)) * (
+        content.volume / content.image.volume
+    )
 
 
 def _given(content: Content, sizes: Sizes | None) -> str:
@@ -179,24 +205,31 @@ def _block_limits(content: Content, nodes: int, sizes: Sizes | None) -> _BlockLi
     n = image.ndim
     fewest = 2**n + 1
     if not (isinstance(nodes, int | np.integer) and nodes >= fewest):
-        raise InputError(f"octree: expected a whole number of nodes, {fewest} or more in {n}-D, got {nodes!r}")
+        raise InputError(
+            f"octree: expected a whole number of nodes, {fewest} or more in {n}-D, got {nodes!r}"
+        )
     if nodes > (most := max(prod(image.shape), ALWAYS_ALLOWED_NODES)):
         shape = " x ".join(map(str, image.shape))
-        raise InputError(f"octree: {nodes} nodes are too many for {shape} voxels; use at most {most}")
+        raise InputError(
+            f"octree: {nodes} nodes are too many for {shape} voxels; use at most {most}"
+        )
     need = OCTREE_NODE_BYTES * nodes
     check_memory(need, f"octree: {nodes} nodes", lambda room: at_most(room / OCTREE_NODE_BYTES))
     sizes = (Sizes() if sizes is None else sizes).prepared(n)
     longest_side = float((image.spacing * image.shape).max())
     if sizes.smallest > longest_side:
-        raise InputError(f"smallest: {sizes.smallest:g} mm is longer than the box, {longest_side:.4g} mm")
+        raise InputError(
+            f"smallest: {sizes.smallest:g} mm is longer than the box, {longest_side:.4g} mm"
+        )
     smallest = sizes.smallest / SHORTEST_IN_BLOCK[n]
     largest = max(sizes.longest_edge(image, nodes, content.volume) / LONGEST_IN_BLOCK[n], smallest)
     target = None
     if sizes.has_target:
         check_in_memory(
-            image, "sizes: largest and field require the voxels in memory",
+            image,
+            "sizes: largest and field require the voxels in memory",
             "use smallest, longest, coarsest and gradation, or crop it",
-        )  # fmt: skip
+        )
         target = _target(image, sizes)
     return _BlockLimits(largest, target, smallest, int(np.ceil(1.0 / sizes.slope - 1e-9)))
 
@@ -205,12 +238,16 @@ def _target(image: Image, sizes: Sizes) -> NDArray[np.float32]:
     """The target by voxel, mm; raise InputError if a field has none."""
     target = sizes.on_voxels(image)
     if target.min() >= NO_BOUND_MM:
-        raise InputError("field: no voxel above 0 lies in the image's box; do both use the same world coordinates?")
+        raise InputError(
+            "field: no voxel above 0 lies in the image's box; do both use the same world "
+            "coordinates?"
+        )
     return target
 
 
 def nodes_of_sizes(image: Image | Content, sizes: Sizes) -> tuple[int, float]:
-    """Number of nodes that targets take (1.5 times those of equilateral cells), and the fraction of the mesh with one.
+    """Number of nodes that targets take (1.5 times those of equilateral cells), and the fraction of
+    the mesh with one.
 
     With any target the number is at least 2^(n + 2), the fewest nodes of any mesh.
 
@@ -233,7 +270,9 @@ def nodes_of_sizes(image: Image | Content, sizes: Sizes) -> tuple[int, float]:
 
 
 def _fewest_nodes(content: Content, limits: _BlockLimits) -> float:
-    """Lower bound of the nodes that the limits need: two for each block of the largest allowed size."""
+    """Lower bound of the nodes that the limits need: two for each block of the largest allowed
+    size.
+    """
     with np.errstate(over="ignore"):  # a bound of 1e300 mm needs none
         return float(2.0 * content.volume / np.float64(limits.largest) ** content.image.ndim)
 
@@ -249,7 +288,8 @@ def _check_not_below_voxels(image: Image, nodes: float) -> None:
     """Raise InputError if there are more nodes than voxels."""
     if nodes > max(prod(image.shape), ALWAYS_ALLOWED_NODES):
         raise InputError(
-            "sizes: the requested edges are so short that cells are smaller than voxels; allow longer ones"
+            "sizes: the requested edges are so short that cells are smaller than voxels; allow "
+            "longer ones"
         )
 
 
@@ -259,12 +299,16 @@ def is_near(count: int, nodes: int) -> bool:
 
 
 def is_for_walls(count: int, nodes: int) -> bool:
-    """True if an initial mesh within a mask has so many nodes as only walls thinner than the cells cause."""
+    """True if an initial mesh within a mask has so many nodes as only walls thinner than the
+    cells cause.
+    """
     return count > (1.0 - LARGEST_MISS) * FINER_RATIO * nodes + LARGEST_MISS_NODES
 
 
 def nearest_octree(image: Image | Content, nodes: int, sizes: Sizes | None = None) -> Mesh:
-    """Like `octree_mesh`, but accept any number of nodes if the image or the sizes allow no nearer one."""
+    """Like `octree_mesh`, but accept any number of nodes if the image or the sizes allow no
+    nearer one.
+    """
     content = plain(image)
     return _octree_within(content, nodes, _block_limits(content, nodes, sizes))
 
@@ -272,14 +316,17 @@ def nearest_octree(image: Image | Content, nodes: int, sizes: Sizes | None = Non
 def _octree_within(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
     """The octree within the limits with the nearest number of nodes, clipped at the mask's surface.
 
-    Where that would lose walls thinner than its cells, it has more nodes, if these keep them or lose at most half as
-    much; exchanges remove nodes.
+    Where that would lose walls thinner than its cells, it has more nodes, if these keep them or
+    lose at most half as much; exchanges remove nodes.
     """
     if content.region is None:
         return _octree_of_box(content, nodes, limits)
     walled = _walled(content, nodes, limits)
     if walled.shortage:
-        warn(f"{walled.shortage}: the initial mesh has walls of the mask with fewer nodes than it would have")
+        warn(
+            f"{walled.shortage}: the initial mesh has walls of the mask with fewer nodes than it "
+            "would have"
+        )
     return walled.mesh
 
 
@@ -288,7 +335,8 @@ class _Tried(NamedTuple):
 
     mesh: Mesh
     lost: float  # fraction of the mask's volume
-    shortage: str = ""  # what ended the search for one that loses less, if memory or the number of voxels did
+    # what ended the search for one that loses less, if memory or the number of voxels did
+    shortage: str = ""
 
 
 def _walled(content: Content, nodes: int, limits: _BlockLimits) -> _Tried:
@@ -302,18 +350,27 @@ def _walled(content: Content, nodes: int, limits: _BlockLimits) -> _Tried:
     return best._replace(shortage=last.shortage)
 
 
-def _finer_octrees(content: Content, nodes: int, limits: _BlockLimits, region: Region) -> Iterator[_Tried]:
-    """Octrees of ever more nodes, while they lose walls, but less than all before, and memory suffices."""
-    # The leaves that the region touches have about as many nodes, to a few per cent, as the clipped mesh.
+def _finer_octrees(
+    content: Content, nodes: int, limits: _BlockLimits, region: Region
+) -> Iterator[_Tried]:
+    """Octrees of ever more nodes, while they lose walls, but less than all before, and memory
+    suffices.
+    """
+    # The leaves that the region touches have about as many nodes, to a few per cent, as the clipped
+    # mesh.
     limits, least, n_stalled = _lighter(content, nodes, limits), np.inf, 0
     for step in range(FINER_STEPS + 1):
         ratio = FINER_RATIO**step
         largest = max(limits.largest / ratio ** (1.0 / content.image.ndim), limits.smallest)
         try:
-            mesh = _clipped_octree(content, round(nodes * ratio), limits._replace(largest=largest), region)
+            mesh = _clipped_octree(
+                content, round(nodes * ratio), limits._replace(largest=largest), region
+            )
             if step > 0:
                 check_memory(
-                    bytes_of(content, len(mesh.points)), f"octree: {len(mesh.points)} nodes", "use fewer nodes"
+                    bytes_of(content, len(mesh.points)),
+                    f"octree: {len(mesh.points)} nodes",
+                    "use fewer nodes",
                 )
         except InputError as error:
             if step == 0:
@@ -329,11 +386,14 @@ def _finer_octrees(content: Content, nodes: int, limits: _BlockLimits, region: R
 
 
 def nodes_for_walls(content: Content, mesh: Mesh, nodes: int, sizes: Sizes | None) -> int | None:
-    """The number of nodes with which `octree_mesh` keeps the walls of a mask that `mesh`, of fewer nodes, loses.
+    """The number of nodes with which `octree_mesh` keeps the walls of a mask that `mesh`, of fewer
+    nodes, loses.
 
     None if it loses none, or if no number is found.
     """
-    if (region := content.region) is None or lost_fraction(mesh, content.image, region) <= MOST_LOST:
+    if (region := content.region) is None or lost_fraction(
+        mesh, content.image, region
+    ) <= MOST_LOST:
         return None
     for step in range(1, WALL_STEPS + 1):
         enough = round(nodes * FINER_RATIO**step)
@@ -376,7 +436,8 @@ def _clipped_octree(content: Content, nodes: int, limits: _BlockLimits, region: 
 
 
 def _lighter(content: Content, nodes: int, limits: _BlockLimits) -> _BlockLimits:
-    """The limits with larger targets, if these alone divide the region's blocks into far more nodes than requested.
+    """The limits with larger targets, if these alone divide the region's blocks into far more nodes
+    than requested.
 
     A block follows its least target. The factor is found by counts, as meshes take longer.
     """
@@ -386,11 +447,15 @@ def _lighter(content: Content, nodes: int, limits: _BlockLimits) -> _BlockLimits
     channels = channels_of(content)
     for _ in range(LIGHTER_TRIALS):
         blocks = _blocks_by_depth(content, channels, roots, limits)
-        regions = [at_depth.is_in_region for at_depth in blocks if at_depth.is_in_region is not None]
+        regions = [
+            at_depth.is_in_region for at_depth in blocks if at_depth.is_in_region is not None
+        ]
         count = len(leaf_nodes(_divided(blocks, np.inf, limits.n_rings), roots, regions).codes)
         if count <= (1.0 + TARGET_MISS) * nodes:
             break
-        limits = limits._replace(target=limits.target * np.float32((count / nodes) ** (1.0 / content.image.ndim)))
+        limits = limits._replace(
+            target=limits.target * np.float32((count / nodes) ** (1.0 / content.image.ndim))
+        )
     return limits
 
 
@@ -413,8 +478,10 @@ class _Blocks(NamedTuple):
 
 def _blocks_by_depth(
     content: Content, channels: Channels, roots: tuple[int, ...], limits: _BlockLimits
-) -> list[_Blocks]:  # fmt: skip
-    """The blocks of each depth, the coarsest first, with their errors and those that exceed the limits."""
+) -> list[_Blocks]:
+    """The blocks of each depth, the coarsest first, with their errors and those that exceed the
+    limits.
+    """
     image = content.image
     edge = image.spacing * image.shape / np.array(roots)
     depth, n_by_content = _depths(edge, roots, image.spacing, limits)
@@ -426,14 +493,21 @@ def _blocks_by_depth(
     need += content.image.box_bytes
     check_memory(need, f"octree: {n_blocks:.3g} blocks", "allow longer edges, or crop the image")
     sums = block_sums(content, channels, np.array(roots) << summed)
-    spread = SPREAD_OF_VARIANCE * float(sums.second.sum() / content.n_voxels) + SPREAD_OF_NOISE * channels.noise
-    target = None if limits.target is None else _least_targets(limits.target, np.array(roots) << depth)
+    spread = (
+        SPREAD_OF_VARIANCE * float(sums.second.sum() / content.n_voxels)
+        + SPREAD_OF_NOISE * channels.noise
+    )
+    target = (
+        None if limits.target is None else _least_targets(limits.target, np.array(roots) << depth)
+    )
     blocks = []
     for d in range(depth, -1, -1):
         shape = tuple(root << d for root in roots)
         is_too_large = np.broadcast_to(_is_too_large(edge, d, limits), shape)
         if target is not None and d < depth and _may_be_divided(edge, d, limits):
-            is_too_large = is_too_large | _divided_for(target, float(np.prod(edge)) ** (1 / image.ndim) / 2**d)
+            is_too_large = is_too_large | _divided_for(
+                target, float(np.prod(edge)) ** (1 / image.ndim) / 2**d
+            )
         is_in_region = None if sums.inside is None else sums.inside > 0.0
         if is_in_region is not None:
             is_too_large = is_too_large & is_in_region
@@ -446,7 +520,9 @@ def _blocks_by_depth(
 
 
 def _errors(sums: BlockSums, channels: Channels, spread: float) -> NDArray[np.float64]:
-    """Error of each block: its sum of squared deviations minus the noise's, plus the spread; layer by layer."""
+    """Error of each block: its sum of squared deviations minus the noise's, plus the spread;
+    layer by layer.
+    """
     errors = np.empty(sums.second.shape)
     others = tuple(slice(0, size) for size in sums.second.shape[1:])
     step = max(LAYER_BLOCKS // prod(errors.shape[1:]), 1)
@@ -467,24 +543,37 @@ def _errors(sums: BlockSums, channels: Channels, spread: float) -> NDArray[np.fl
 
 
 def _may_be_divided(edge: NDArray[np.float64], depth: int, limits: _BlockLimits) -> bool:
-    """True if halves of blocks of this depth are long enough; `edge` (n,) are the roots' edges, mm."""
+    """True if halves of blocks of this depth are long enough; `edge` (n,) are the roots' edges,
+    mm.
+    """
     return bool(edge.min() / 2 ** (depth + 1) >= limits.smallest)
 
 
 def _is_too_large(edge: NDArray[np.float64], depth: int, limits: _BlockLimits) -> bool:
     """True if all blocks of this depth must be divided."""
-    return bool(limits.largest * (1.0 + 1e-9) < edge.max() / 2**depth) and _may_be_divided(edge, depth, limits)
+    return bool(limits.largest * (1.0 + 1e-9) < edge.max() / 2**depth) and _may_be_divided(
+        edge, depth, limits
+    )
 
 
 def _depths(
-    edge: NDArray[np.float64], roots: tuple[int, ...], spacing: NDArray[np.float64], limits: _BlockLimits
+    edge: NDArray[np.float64],
+    roots: tuple[int, ...],
+    spacing: NDArray[np.float64],
+    limits: _BlockLimits,
 ) -> tuple[int, int]:
-    """Largest depths to which roots with edges (n,), mm, may be divided at all, and for their content."""
+    """Largest depths to which roots with edges (n,), mm, may be divided at all, and for their
+    content.
+    """
     n_by_content = 0
     while True:
         half = edge / 2 ** (n_by_content + 1)
         voxels = half / spacing
-        if voxels.max() < LEAF_VOXELS or voxels.min() < 0.25 * LEAF_VOXELS or half.min() < limits.smallest:
+        if (
+            voxels.max() < LEAF_VOXELS
+            or voxels.min() < 0.25 * LEAF_VOXELS
+            or half.min() < limits.smallest
+        ):
             break
         if prod(roots) * 2 ** (len(roots) * n_by_content) > MOST_BLOCKS:
             break
@@ -500,38 +589,48 @@ def _depths(
 
 def _least_edge(limits: _BlockLimits, n: int) -> float:
     """The least edge, mm, that blocks may need."""
-    return min(limits.largest, np.inf if limits.target is None else float(limits.target.min()) / USUAL_IN_BLOCK[n])
+    return min(
+        limits.largest,
+        np.inf if limits.target is None else float(limits.target.min()) / USUAL_IN_BLOCK[n],
+    )
 
 
 def _divided_for(target: NDArray, edge: float) -> NDArray[np.bool_]:
-    """Mask of the blocks with this edge to divide for their targets for the usual edge of cells, mm.
+    """Mask of the blocks with this edge to divide for their targets for the usual edge of cells,
+    mm.
 
-    A divided block has 2^n times the nodes. For k times as many, one in (2^n - 1) / (k - 1) is divided, selected by
-    `_uneven`.
+    A divided block has 2^n times the nodes. For k times as many, one in (2^n - 1) / (k - 1) is
+    divided, selected by `_uneven`.
     """
     n = target.ndim
     more = (USUAL_IN_BLOCK[n] * edge / target) ** n - 1.0
-    fraction = (_uneven(*np.ogrid[tuple(slice(0, size) for size in target.shape)]) - 1.0) / TIE_SPREAD
+    fraction = (
+        _uneven(*np.ogrid[tuple(slice(0, size) for size in target.shape)]) - 1.0
+    ) / TIE_SPREAD
     return np.asarray(more > np.maximum((2**n - 1) * fraction, TARGET_SLACK))
 
 
 def _uneven(*index: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Distinct factors from 1 to 1 + `TIE_SPREAD`, so that blocks that are alike are not all divided at once.
+    """Distinct factors from 1 to 1 + `TIE_SPREAD`, so that blocks that are alike are not all
+    divided at once.
 
-    `index` holds the blocks' positions along each axis. The fractional parts of multiples of the plastic number's
-    powers fill any region evenly (Roberts 2018).
+    `index` holds the blocks' positions along each axis. The fractional parts of multiples of the
+    plastic number's powers fill any region evenly (Roberts 2018).
     """
     place = sum(factor * along for factor, along in zip(UNEVEN_FACTORS, index, strict=False))
     return 1.0 + TIE_SPREAD * np.mod(place, 1.0)
 
 
 def _least_targets(data: NDArray, counts: NDArray[np.int64]) -> NDArray:
-    """Minima over equal blocks: a voxel belongs to the block of its centre; a block without centres has no target."""
+    """Minima over equal blocks: a voxel belongs to the block of its centre; a block without
+    centres has no target.
+    """
     for axis, count in enumerate(counts):
         size = data.shape[axis]
         start = block_starts(size, count)
         length = np.diff(start, append=size)
-        # The first voxel of each block, then the second of each that has one, ...: five times as fast as `reduceat`.
+        # The first voxel of each block, then the second of each that has one, ...: five times as
+        # fast as `reduceat`.
         data = np.moveaxis(data, axis, 0)
         least = data[np.minimum(start, size - 1)]
         least[length == 0] = NO_BOUND_MM
@@ -545,10 +644,12 @@ def _least_targets(data: NDArray, counts: NDArray[np.int64]) -> NDArray:
 def _best_division(
     content: Content, nodes: int, limits: _BlockLimits
 ) -> tuple[tuple[int, ...], list[NDArray[np.bool_]]]:
-    """Numbers of roots along each axis, and the divided blocks, of the octree with the nearest number of nodes.
+    """Numbers of roots along each axis, and the divided blocks, of the octree with the nearest
+    number of nodes.
 
-    If many blocks are alike, all or none of them are divided, and some numbers cannot be reached from one size of
-    undivided blocks. Then other sizes are tried, finally the lattice that has the number undivided.
+    If many blocks are alike, all or none of them are divided, and some numbers cannot be reached
+    from one size of undivided blocks. Then other sizes are tried, finally the lattice that has the
+    number undivided.
     """
     best: tuple[int, tuple[int, ...], list[NDArray[np.bool_]]] | None = None
     image, channels = content.image, channels_of(content)
@@ -565,17 +666,24 @@ def _best_division(
     return best[1:]
 
 
-def _fitting_roots(content: Content, nodes: int, limits: _BlockLimits) -> list[tuple[tuple[int, ...], int]]:
-    """Numbers of roots to try that can be divided within the limits, each with the least depth of all blocks.
+def _fitting_roots(
+    content: Content, nodes: int, limits: _BlockLimits
+) -> list[tuple[tuple[int, ...], int]]:
+    """Numbers of roots to try that can be divided within the limits, each with the least depth of
+    all blocks.
 
     Raise InputError without any, or for cells below voxels.
     """
     image, fitting = content.image, list[tuple[tuple[int, ...], int]]()
-    _check_not_below_voxels(image, max(_fewest_nodes(content, limits), _target_nodes(content, limits)))
+    _check_not_below_voxels(
+        image, max(_fewest_nodes(content, limits), _target_nodes(content, limits))
+    )
     for roots in _root_counts(content, nodes, limits):
         edge = image.spacing * image.shape / np.array(roots)
         depths = range(_depths(edge, roots, image.spacing, limits)[0] + 1)
-        fitting += [(roots, depth) for depth in depths if not _is_too_large(edge, depth, limits)][:1]
+        fitting += [(roots, depth) for depth in depths if not _is_too_large(edge, depth, limits)][
+            :1
+        ]
     if not fitting:
         least = LONGEST_IN_BLOCK[image.ndim] * _least_edge(limits, image.ndim)
         raise InputError(
@@ -588,13 +696,16 @@ def _fitting_roots(content: Content, nodes: int, limits: _BlockLimits) -> list[t
 def _root_counts(content: Content, nodes: int, limits: _BlockLimits) -> Iterator[tuple[int, ...]]:
     """Numbers of roots along each axis to try, within the limits, the largest blocks first.
 
-    With a region, the last is the lattice that has the nodes within it: if leaves may not be smaller, no coarser one
-    has as many.
+    With a region, the last is the lattice that has the nodes within it: if leaves may not be
+    smaller, no coarser one has as many.
     """
     image, largest, smallest = content.image, limits.largest, limits.smallest
     lengths = image.spacing * image.shape
     kind = "bcc" if image.ndim == 3 else "criss-cross"
-    coarse = [near_cubes(kind, lengths, max(2**image.ndim + 1, int(nodes * fraction))) for fraction in ROOT_FRACTIONS]
+    coarse = [
+        near_cubes(kind, lengths, max(2**image.ndim + 1, int(nodes * fraction)))
+        for fraction in ROOT_FRACTIONS
+    ]
     if content.inside is not None:
         within = near_cubes(kind, lengths, min(int(nodes / content.inside.mean()), MAX_NODES))
         finest = np.maximum(np.array(image.shape) / LEAF_VOXELS, coarse[-1])
@@ -603,18 +714,23 @@ def _root_counts(content: Content, nodes: int, limits: _BlockLimits) -> Iterator
     fit = [e.max() <= largest * (1.0 + 1e-9) and e.min() >= smallest for e in edges]
     if limits.target is not None and (widest := float(limits.target.max())) < NO_BOUND_MM:
         fitting = np.clip(np.rint(lengths * USUAL_IN_BLOCK[image.ndim] / widest), 1, None)
-        if (lengths / fitting).max() <= largest * (1.0 + 1e-9) and (lengths / fitting).min() >= smallest:
+        if (lengths / fitting).max() <= largest * (1.0 + 1e-9) and (
+            lengths / fitting
+        ).min() >= smallest:
             yield tuple(int(c) for c in fitting)
     if not all(fit):
         fewest, finest = np.ceil(lengths / largest - 1e-9), lengths / max(smallest, 1e-300)
-        yield tuple(int(c) for c in np.maximum(np.minimum(fewest, np.floor(finest * (1.0 + 1e-9))), 1))
+        yield tuple(
+            int(c) for c in np.maximum(np.minimum(fewest, np.floor(finest * (1.0 + 1e-9))), 1)
+        )
     yield from (roots for roots, is_fit in zip(coarse, fit, strict=True) if is_fit)
 
 
 def _division(
     blocks: list[_Blocks], roots: tuple[int, ...], nodes: int, n_rings: int
 ) -> tuple[int, list[NDArray[np.bool_]]]:
-    """The number of nodes nearest to `nodes`, and the divided blocks, whose error exceeds a threshold.
+    """The number of nodes nearest to `nodes`, and the divided blocks, whose error exceeds a
+    threshold.
 
     The threshold is found by bisection.
     """
@@ -628,11 +744,17 @@ def _division(
     for _ in range(BISECTION_STEPS):
         middle = np.sqrt(max(low, 1e-300) * high)
         divided = _divided(blocks, middle, n_rings)
-        # For far too many leaves, each with its centre, a bound of the nodes suffices: it is no nearer than any counted
-        # number, and it rises as the threshold falls.
-        n_leaves = prod(roots) + (2 ** len(roots) - 1) * sum(int(np.count_nonzero(each)) for each in divided)
+        # For far too many leaves, each with its centre, a bound of the nodes suffices: it is no
+        # nearer than any counted number, and it rises as the threshold falls.
+        n_leaves = prod(roots) + (2 ** len(roots) - 1) * sum(
+            int(np.count_nonzero(each)) for each in divided
+        )
         is_skipped = not regions and n_leaves > SKIPPED_RATIO * nodes
-        count = NODES_OF_LEAF * n_leaves if is_skipped else len(leaf_nodes(divided, roots, regions).codes)
+        count = (
+            NODES_OF_LEAF * n_leaves
+            if is_skipped
+            else len(leaf_nodes(divided, roots, regions).codes)
+        )
         if best_count < 0 or abs(count - nodes) < abs(best_count - nodes):
             best_count, best, is_bound = count, divided, is_skipped
         if abs(count - nodes) <= BISECTION_MISS * nodes or high <= low * (1.0 + 1e-9):
@@ -642,16 +764,19 @@ def _division(
 
 
 def _divided(blocks: list[_Blocks], threshold: float, n_rings: int) -> list[NDArray[np.bool_]]:
-    """Masks of the blocks to divide at each depth, if those above the threshold or too large are divided.
+    """Masks of the blocks to divide at each depth, if those above the threshold or too large are
+    divided.
 
-    A divided block is surrounded by `n_rings` blocks of its size in every direction: with one, neighbours differ by at
-    most one division.
+    A divided block is surrounded by `n_rings` blocks of its size in every direction: with one,
+    neighbours differ by at most one division.
     """
     divided = [(at_depth.error > threshold) | at_depth.is_too_large for at_depth in blocks[:-1]]
     for depth in range(len(divided) - 1, 0, -1):
         # These blocks must exist:
         near = largest_around(divided[depth], n_rings)
         for axis in range(near.ndim):
-            near = np.asarray(near.reshape(*near.shape[:axis], -1, 2, *near.shape[axis + 1 :]).any(axis=axis + 1))
+            near = np.asarray(
+                near.reshape(*near.shape[:axis], -1, 2, *near.shape[axis + 1 :]).any(axis=axis + 1)
+            )
         divided[depth - 1] |= near
     return divided

@@ -18,64 +18,74 @@ from tetopt.system.kernel_cache import njit
 # Default ratio of a graded mesh's longest edge to that of a uniform mesh with as many nodes
 # (`docs/understand/sizes.md`).
 COARSEST_RATIO = 1.4
-# By dimension, the shortest, mean and longest edge of the cells in a block over the block's edge: from a corner to the
-# centre; over 8 of these and 6 sides (in 2-D 4 and 2); and, in 3-D, the diagonal of a block's side on the box's faces.
+# By dimension, the shortest, mean and longest edge of the cells in a block over the block's edge:
+# from a corner to the centre; over 8 of these and 6 sides (in 2-D 4 and 2); and, in 3-D, the
+# diagonal of a block's side on the box's faces.
 SHORTEST_IN_BLOCK = {2: 0.5**0.5, 3: 0.75**0.5}
 USUAL_IN_BLOCK = {2: (2.0 * 0.5**0.5 + 1.0) / 3.0, 3: (4.0 * 0.75**0.5 + 3.0) / 7.0}
 LONGEST_IN_BLOCK = {2: 1.0, 3: 2.0**0.5}  # in 2-D the longest is the block's side
-# Nodes of equilateral cells by dimension, times edge^n per volume. In 3-D a cell has edge^3 / (6 sqrt 2), and the solid
-# angle 3 arccos(1/3) - pi at each of its corners, of the 4 pi around a node.
+# Nodes of equilateral cells by dimension, times edge^n per volume. In 3-D a cell has edge^3 / (6
+# sqrt 2), and the solid angle 3 arccos(1/3) - pi at each of its corners, of the 4 pi around a node.
 EQUILATERAL_NODES = {
     2: 2.0 / 3.0**0.5,
     3: 6.0 * 2.0**0.5 * (3.0 * np.arccos(1.0 / 3.0) - np.pi) / np.pi,
 }
-STAIRCASE_RATIO = {2: np.pi / 4.0, 3: 2.0 / 3.0}  # mean ratio, over all directions, of a surface to its voxels' sides
-SIZED_OVER_EQUILATERAL = 1.5  # nodes that targets take: cells of an image are neither regular nor uniform
-LONG_EDGE = 2.0**0.5  # ratio to the target above which an edge is split, as in MMG, since its halves are nearer to it
+# mean ratio, over all directions, of a surface to its voxels' sides
+STAIRCASE_RATIO = {2: np.pi / 4.0, 3: 2.0 / 3.0}
+# nodes that targets take: cells of an image are neither regular nor uniform
+SIZED_OVER_EQUILATERAL = 1.5
+# ratio to the target above which an edge is split, as in MMG, since its halves are nearer to it
+LONG_EDGE = 2.0**0.5
 SHORT_EDGE_FRACTION = 0.5**0.5  # ratio to the target below which the image has made an edge
-RATIO_BINS = tuple(0.5 ** (0.25 * k) for k in range(12, -9, -1))  # edge over target: 1/8 to 4, four per doubling
+# edge over target: 1/8 to 4, four per doubling
+RATIO_BINS = tuple(0.5 ** (0.25 * k) for k in range(12, -9, -1))
 NO_BOUND_MM = 1e30  # infinity for float32, to which steps can still be added
-UNEVEN_RATIO = 1.5  # longest edge of a cell over the edge from gradation: edges of a good cell differ by a third
+# longest edge of a cell over the edge from gradation: edges of a good cell differ by a third
+UNEVEN_RATIO = 1.5
 
 
 class Sizes(NamedTuple):
     """Targets and limits for the edges of cells in `octree_mesh` and the exchanges of `optimize`.
 
-    A target (`edge_size`, `field`) is for the usual edge: octrees start near it, edges longer than sqrt 2 times the
-    target are split while nodes are available, and no collapse makes such an edge. Cells are smaller where the image
-    has detail. This takes up to 1.5 times the nodes of equilateral cells (`nodes_of_sizes`). `smallest` and `longest`
-    are bounds. Nodes move afterwards, which makes some edges longer or shorter: in the tests, one in a hundred is more
+    A target (`edge_size`, `field`) is for the usual edge: octrees start near it, edges longer than
+    sqrt 2 times the target are split while nodes are available, and no collapse makes such an edge.
+    Cells are smaller where the image has detail. This takes up to 1.5 times the nodes of
+    equilateral cells (`nodes_of_sizes`). `smallest` and `longest` are bounds. Nodes move
+    afterwards, which makes some edges longer or shorter: in the tests, one in a hundred is more
     than 5 % longer than `longest`. `quality` reports the longest and the shortest.
 
     Parameters
     ----------
     smallest : float
-        No block and no split makes a shorter edge, mm, and no target is below it. It takes precedence over `longest`.
-        Nodes may move nearer afterwards: in one run a tenth of the edges ended shorter.
+        No block and no split makes a shorter edge, mm, and no target is below it. It takes
+        precedence over `longest`. Nodes may move nearer afterwards: in one run a tenth of the edges
+        ended shorter.
     edge_size : float, optional
         Target everywhere, mm, and upper limit of `field`; `inf` for none.
     gradation : float, optional
-        Rate at which sizes may change, 0.05 (gentle) to 1, the default. Between the next smaller and the next larger
-        size, each size of the octree is at least 1 / gradation blocks wide. Targets grow by at most gradation x
-        distance, and collapses make no edge longer than 1.5 times the size that grows from its surroundings at this
-        rate. It has little effect if there are hardly two sizes.
+        Rate at which sizes may change, 0.05 (gentle) to 1, the default. Between the next smaller
+        and the next larger size, each size of the octree is at least 1 / gradation blocks wide.
+        Targets grow by at most gradation x distance, and collapses make no edge longer than 1.5
+        times the size that grows from its surroundings at this rate. It has little effect if there
+        are hardly two sizes.
     field : Image, optional
-        Target by place, mm: an image that need not share the voxels of the meshed image. Outside its box, and where it
-        is 0 or below, only `edge_size` applies.
+        Target by place, mm: an image that need not share the voxels of the meshed image. Outside
+        its box, and where it is 0 or below, only `edge_size` applies.
     coarsest : float, optional
-        Ratio of the longest edge to that of a uniform mesh with as many nodes, used without `edge_size` and `longest`;
-        by default 1.4.
+        Ratio of the longest edge to that of a uniform mesh with as many nodes, used without
+        `edge_size` and `longest`; by default 1.4.
     longest : float, optional
-        No block and no collapse makes a longer edge, mm; `inf` for no limit. By default, without `edge_size`,
-        `coarsest` times the longest edge of a uniform mesh with as many nodes: smaller cells in uniform regions improve
-        the displacement, not the image. Most edges are 0.6 times the longest, which are diagonals of blocks on the
-        box's faces.
+        No block and no collapse makes a longer edge, mm; `inf` for no limit. By default, without
+        `edge_size`, `coarsest` times the longest edge of a uniform mesh with as many nodes: smaller
+        cells in uniform regions improve the displacement, not the image. Most edges are 0.6 times
+        the longest, which are diagonals of blocks on the box's faces.
     cells_across : float, optional
-        Number of cells across a label where it is thin: the target is its local thickness divided by this number
-        (`sizes_by_label`), not below `smallest` or a voxel. Label 0 is background and has no such target.
+        Number of cells across a label where it is thin: the target is its local thickness divided
+        by this number (`sizes_by_label`), not below `smallest` or a voxel. Label 0 is background
+        and has no such target.
     by_label : mapping of int to float, str or LabelSize, optional
-        Targets by label, with "*" for all others including 0: mm, or a fraction of the local thickness t, such as
-        "0.6t", or "0.6t[1:10]" with bounds in mm.
+        Targets by label, with "*" for all others including 0: mm, or a fraction of the local
+        thickness t, such as "0.6t", or "0.6t[1:10]" with bounds in mm.
 
     Raises
     ------
@@ -142,13 +152,19 @@ class Sizes(NamedTuple):
             if value is not None and not value > 0.0:
                 raise InputError(f"{name}: expected a length above 0 mm, got {value}")
             if value is not None and value < self.smallest:
-                raise InputError(f"{name}: {value:g} mm is below the smallest size, {self.smallest:g} mm")
+                raise InputError(
+                    f"{name}: {value:g} mm is below the smallest size, {self.smallest:g} mm"
+                )
         if not 0.05 <= self.slope <= 1.0:
             raise InputError(f"gradation: expected 0.05 (gentle) to 1, got {self.gradation}")
         if self.cells_across is not None or self.by_label:
-            raise InputError("sizes: cells_across and by_label depend on labels; call `sizes_by_label` first")
+            raise InputError(
+                "sizes: cells_across and by_label depend on labels; call `sizes_by_label` first"
+            )
         if self.field is not None and self.field.ndim != n:
-            raise InputError(f"field: expected a {n}-D field like the image, got a {self.field.ndim}-D one")
+            raise InputError(
+                f"field: expected a {n}-D field like the image, got a {self.field.ndim}-D one"
+            )
         if self.field is not None and not (self.field.data > 0.0).any():
             raise InputError("field: expected lengths above 0 mm, got none")
         return self if self.field is None else self._replace(field=_graded(self.field, self.slope))
@@ -185,9 +201,13 @@ class Sizes(NamedTuple):
         kind, fewest = ("bcc", 9) if image.ndim == 3 else ("criss-cross", 5)
         if volume is not None:  # nodes for a lattice of the whole box
             nodes = int(nodes * image.volume / volume)
-        uniform = float((lengths / near_cubes(kind, lengths, min(max(nodes, fewest), MAX_NODES))).max())
+        uniform = float(
+            (lengths / near_cubes(kind, lengths, min(max(nodes, fewest), MAX_NODES))).max()
+        )
         coarsest = COARSEST_RATIO if self.coarsest is None else self.coarsest
-        return LONGEST_IN_BLOCK[image.ndim] * max(coarsest * uniform, self.smallest / SHORTEST_IN_BLOCK[image.ndim])
+        return LONGEST_IN_BLOCK[image.ndim] * max(
+            coarsest * uniform, self.smallest / SHORTEST_IN_BLOCK[image.ndim]
+        )
 
     def on_voxels(self, image: Image) -> NDArray[np.float32]:
         """The target at each voxel's centre.
@@ -210,7 +230,9 @@ class Sizes(NamedTuple):
         >>> targets.shape, float(targets.max())
         ((16, 16, 16), 12.0)
         """
-        largest = np.float32(NO_BOUND_MM if self.edge_size is None else np.clip(self.edge_size, 1e-30, NO_BOUND_MM))
+        largest = np.float32(
+            NO_BOUND_MM if self.edge_size is None else np.clip(self.edge_size, 1e-30, NO_BOUND_MM)
+        )
         smallest = np.float32(self.smallest)
         if self.field is None:
             return np.broadcast_to(np.maximum(largest, smallest), image.shape)
@@ -220,7 +242,9 @@ class Sizes(NamedTuple):
             by_place = scipy.ndimage.affine_transform(
                 by_place, to_field, output_shape=image.shape, order=0, mode="grid-constant"
             )
-        return np.asarray(np.clip(np.where(by_place > 0.0, by_place, NO_BOUND_MM), smallest, largest))
+        return np.asarray(
+            np.clip(np.where(by_place > 0.0, by_place, NO_BOUND_MM), smallest, largest)
+        )
 
     def at(self, points: NDArray) -> NDArray[np.float64]:
         """The target at points.
@@ -246,14 +270,21 @@ class Sizes(NamedTuple):
         target = np.full(len(points), np.inf if self.edge_size is None else self.edge_size)
         if self.field is not None:
             index, (low, high) = self.field.to_index(points), box_sides(self.field.shape).T
-            is_in_field = ((index >= low - ON_SIDE_VOXELS) & (index <= high + ON_SIDE_VOXELS)).all(axis=1)
-            voxel = np.clip(np.rint(index[is_in_field]).astype(np.int64), 0, np.array(self.field.shape) - 1)
+            is_in_field = ((index >= low - ON_SIDE_VOXELS) & (index <= high + ON_SIDE_VOXELS)).all(
+                axis=1
+            )
+            voxel = np.clip(
+                np.rint(index[is_in_field]).astype(np.int64), 0, np.array(self.field.shape) - 1
+            )
             by_place = self.field.data[tuple(voxel.T)]
-            target[is_in_field] = np.minimum(target[is_in_field], np.where(by_place > 0.0, by_place, np.inf))
+            target[is_in_field] = np.minimum(
+                target[is_in_field], np.where(by_place > 0.0, by_place, np.inf)
+            )
         return np.maximum(target, self.smallest)
 
     def around(self, points: NDArray, cells: NDArray) -> NDArray[np.float64]:
-        """The target at nodes; without one, the size that grows from other targets at the gradation.
+        """The target at nodes; without one, the size that grows from other targets at the
+        gradation.
 
         Parameters
         ----------
@@ -282,9 +313,15 @@ class Sizes(NamedTuple):
         return np.minimum(target, _around(target, points, cells, self.slope))
 
     def longest_edges(
-        self, image: Image, nodes: int, points: NDArray, cells: NDArray, own: NDArray, target: NDArray,
+        self,
+        image: Image,
+        nodes: int,
+        points: NDArray,
+        cells: NDArray,
+        own: NDArray,
+        target: NDArray,
         volume: float | None = None,
-    ) -> NDArray[np.float64]:  # fmt: skip
+    ) -> NDArray[np.float64]:
         """Longest edge allowed for a cell at each node.
 
         Parameters
@@ -321,12 +358,14 @@ class Sizes(NamedTuple):
         return np.minimum(bound, UNEVEN_RATIO * _around(own, points, cells, self.slope))
 
 
-def equilateral_nodes(target: NDArray, image: Image, inside: NDArray[np.bool_] | None = None) -> float:
+def equilateral_nodes(
+    target: NDArray, image: Image, inside: NDArray[np.bool_] | None = None
+) -> float:
     """Number of nodes of a mesh of equilateral cells whose edges are the targets at voxels, mm.
 
-    `target` has the image's shape and counts up to `NO_BOUND_MM`; `inside` is the mask of the voxels to mesh. Nodes on
-    the boundary have only half of their space inside, so nodes are added in proportion to its area over that of a
-    triangle (in 2-D its length over that of an edge).
+    `target` has the image's shape and counts up to `NO_BOUND_MM`; `inside` is the mask of the
+    voxels to mesh. Nodes on the boundary have only half of their space inside, so nodes are added
+    in proportion to its area over that of a triangle (in 2-D its length over that of an edge).
     """
     n = image.ndim
     is_in = target < NO_BOUND_MM if inside is None else inside & (target < NO_BOUND_MM)
@@ -335,7 +374,8 @@ def equilateral_nodes(target: NDArray, image: Image, inside: NDArray[np.bool_] |
     density = np.power(edge, -n, where=is_in, out=np.zeros(edge.shape))
     nodes = EQUILATERAL_NODES[n] * image.voxel_volume * float(density.sum())
     of_facet = 0.5 * (EQUILATERAL_NODES[2] if n == 3 else 1.0)
-    across = np.linalg.norm(np.linalg.inv(image.affine[:n, :n]), axis=1)  # ratio of a voxel's sides to its volume
+    # ratio of a voxel's sides to its volume
+    across = np.linalg.norm(np.linalg.inv(image.affine[:n, :n]), axis=1)
     for axis in range(n):
         area = of_facet * (image.voxel_volume * float(across[axis]))
         along = np.moveaxis(edge, axis, 0)
@@ -354,7 +394,8 @@ class EdgeRatios(NamedTuple):
     mean: float
     above: float  # fraction of edges over sqrt 2 times their target, for which nodes were lacking
     below: float  # fraction of edges under 1 / sqrt 2 times their target, which the image has made
-    edges_of_bins: tuple[float, ...]  # bounds of edge over target, B + 1, ascending; end bins include values beyond
+    # bounds of edge over target, B + 1, ascending; end bins include values beyond
+    edges_of_bins: tuple[float, ...]
     fraction: list[float]  # (B,) fraction of the edges in each bin
 
 
@@ -375,7 +416,8 @@ def edge_ratios(points: NDArray, cells: NDArray, sizes: Sizes) -> EdgeRatios | N
 
 
 def _graded(field: Image, gradation: float) -> Image:
-    """Limit the field so that no value exceeds a face neighbour's by more than gradation x distance.
+    """Limit the field so that no value exceeds a face neighbour's by more than gradation x
+    distance.
 
     Sizes grow across voxels of 0 or less, which stay without a size.
     """
@@ -389,7 +431,8 @@ def _graded(field: Image, gradation: float) -> Image:
 
 @njit(cache=True, error_model="numpy")
 def _lower(data: NDArray, steps: NDArray) -> None:
-    """Lower each voxel to its neighbours' least value plus a step, in a forward and a backward pass.
+    """Lower each voxel to its neighbours' least value plus a step, in a forward and a backward
+    pass.
 
     A shortest way may take all its forward steps first, hence both passes.
     """

@@ -1,8 +1,9 @@
 """Sums of an image's voxels over blocks, from one pass over boxes of them, in memory or stored.
 
-Sums are taken of the channels h' = (h - mean) / scale, at most 1, so that numbers of nodes do not depend on the unit of
-intensity, and of their squares. Each row is added to its block voxel by voxel, rows to their planes and planes to their
-blocks in order: the sums are the same to the last bit however the volume is divided into boxes.
+Sums are taken of the channels h' = (h - mean) / scale, at most 1, so that numbers of nodes do not
+depend on the unit of intensity, and of their squares. Each row is added to its block voxel by
+voxel, rows to their planes and planes to their blocks in order: the sums are the same to the last
+bit however the volume is divided into boxes.
 """
 
 from __future__ import annotations
@@ -45,9 +46,11 @@ def channels_of(content: Content) -> Channels:
     Raises
     ------
     InputError
-        Deviations whose squares overflow, or a stored image with voxels that are invalid for an `Image`.
+        Deviations whose squares overflow, or a stored image with voxels that are invalid for an
+        `Image`.
     """
-    is_known = content.statistics is not None or content.image.in_memory is None  # otherwise half of them suffice
+    # otherwise half of them suffice
+    is_known = content.statistics is not None or content.image.in_memory is None
     if content.is_plain and content.region is None and content.image.ndim == 3 and is_known:
         known = statistics(content.image) if content.statistics is None else content.statistics
         _check_squares(known.scale, content.n_voxels)
@@ -61,8 +64,11 @@ def channels_of(content: Content) -> Channels:
         scale = max(scale, *(abs(float(end) - means[-1]) for end in (values.min(), values.max())))
     _check_squares(scale, size)
     scale = scale or 1.0
-    result = Channels(means, scale, 0.0, 0.0 if content.region is None else content.wrong_side / scale**2)
-    # The noise is estimated on scaled values, too, as the estimate would round differently otherwise.
+    result = Channels(
+        means, scale, 0.0, 0.0 if content.region is None else content.wrong_side / scale**2
+    )
+    # The noise is estimated on scaled values, too, as the estimate would round differently
+    # otherwise.
     inside = None if content.inside is None else undivided(content, content.inside)
     planes = None if inside is None else noise_planes(inside)
     within, noise = None if inside is None else noise_sample(inside, planes), 0.0
@@ -77,13 +83,16 @@ def channels_of(content: Content) -> Channels:
 def _check_squares(scale: float, n_voxels: int) -> None:
     """Raise InputError if sums of squares of deviations up to this one may overflow."""
     if not np.isfinite(scale * scale * n_voxels):
-        raise InputError(f"image: squares of deviations up to {scale:.3g} overflow; rescale the image first")
+        raise InputError(
+            f"image: squares of deviations up to {scale:.3g} overflow; rescale the image first"
+        )
 
 
 class BlockSums(NamedTuple):
     """Sums over equal blocks, each in the blocks' shape."""
 
-    lengths: list[NDArray[np.float64]]  # voxels along each axis, for the blocks at each position on it
+    # voxels along each axis, for the blocks at each position on it
+    lengths: list[NDArray[np.float64]]
     inside: NDArray[np.float64] | None  # voxels inside the mask; None without a mask
     second: NDArray[np.float64]  # sums of all channels' squares
     firsts: list[NDArray[np.float64]]  # sums of each channel
@@ -114,9 +123,11 @@ def halved(totals: NDArray, total_of: np.ufunc) -> NDArray:
 
 
 def block_starts(size: int, count: int) -> NDArray[np.int64]:
-    """The first voxel of each of `count` equal blocks along an axis; a voxel belongs to the block of its centre.
+    """The first voxel of each of `count` equal blocks along an axis; a voxel belongs to the block
+    of its centre.
 
-    If blocks are smaller than voxels, a block without centres starts where the next one does, or at the end.
+    If blocks are smaller than voxels, a block without centres starts where the next one does, or at
+    the end.
     """
     return np.ceil(np.arange(count) * (size / count) - 0.5).astype(np.int64)
 
@@ -125,11 +136,15 @@ def block_sums(content: Content, channels: Channels, counts: NDArray[np.int64]) 
     """Sums over `counts` equal blocks along the axes, from one pass over the voxels."""
     shape = content.image.shape
     starts = [block_starts(size, count) for size, count in zip(shape, counts, strict=True)]
-    lengths = [np.diff(start, append=size).astype(np.float64) for start, size in zip(starts, shape, strict=True)]
+    lengths = [
+        np.diff(start, append=size).astype(np.float64)
+        for start, size in zip(starts, shape, strict=True)
+    ]
     starts = [np.zeros(1, dtype=np.int64)] * (3 - len(shape)) + starts
     n_rows = shape[-2]
     of_plane, of_row = (
-        np.repeat(np.arange(len(length)), length.astype(np.int64)) for length in [np.ones(1), *lengths][-3:-1]
+        np.repeat(np.arange(len(length)), length.astype(np.int64))
+        for length in [np.ones(1), *lengths][-3:-1]
     )
     n_fields = 1 + len(channels.means) + (content.inside is not None)
     totals = np.zeros((n_fields, *(len(start) for start in starts)))
@@ -149,26 +164,39 @@ def block_sums(content: Content, channels: Channels, counts: NDArray[np.int64]) 
         for plane, block in enumerate(of_plane[box[0]]):
             totals[:, block, first : first + n_done] += sums[:, plane, :n_done]
     totals = totals.reshape(n_fields, *counts)
-    inside, firsts = None if content.inside is None else totals[-1], list(totals[1 : 1 + len(channels.means)])
+    inside, firsts = (
+        None if content.inside is None else totals[-1],
+        list(totals[1 : 1 + len(channels.means)]),
+    )
     return BlockSums(lengths, inside, totals[0], firsts)
 
 
 def _boxes_of(content: Content) -> Iterator[tuple[Box, NDArray, NDArray[np.bool_] | None]]:
-    """Boxes of whole rows, plane by plane, with their voxels (C, P, R, K) and the mask of those inside (P, R, K)."""
+    """Boxes of whole rows, plane by plane, with their voxels (C, P, R, K) and the mask of those
+    inside (P, R, K).
+    """
     image, inside = content.image, content.inside
     for box in image.boxes():
         own, shape = box[3 - image.ndim :], tuple(each.stop - each.start for each in box)
         if content.is_plain:
             values = image.read([each.start for each in own], [each.stop for each in own])
         else:
-            values = np.stack([content.channel(number, own) for number in range(content.n_channels)])
-        yield box, values.reshape(-1, *shape), None if inside is None else inside[own].reshape(shape)
+            values = np.stack(
+                [content.channel(number, own) for number in range(content.n_channels)]
+            )
+        yield (
+            box,
+            values.reshape(-1, *shape),
+            None if inside is None else inside[own].reshape(shape),
+        )
 
 
 def _fields(
     values: NDArray, inside: NDArray[np.bool_] | None, channels: Channels, piece: Box
 ) -> Iterator[NDArray[np.float64]]:
-    """The fields to sum over a piece of voxels: squares, each channel, and with a mask 1 inside it."""
+    """The fields to sum over a piece of voxels: squares, each channel, and with a mask 1 inside
+    it.
+    """
     within = None if inside is None else inside[piece]
     scaled = [channels.scaled(part[piece], channel, within) for channel, part in enumerate(values)]
     square = scaled[0] * scaled[0]
@@ -184,7 +212,8 @@ def _fields(
 def _add_rows(field: NDArray, block_of_row: NDArray, ends: NDArray, totals: NDArray) -> None:
     """Add each row of voxels (P, R, K) to its plane's sums over blocks (P, B, C), voxel by voxel.
 
-    `block_of_row` (R,) is each row's block; block c has voxels ends[c] to ends[c + 1] - 1, (C + 1,).
+    `block_of_row` (R,) is each row's block; block c has voxels ends[c] to ends[c + 1] - 1, (C +
+    1,).
     """
     for p in range(field.shape[0]):
         for r in range(field.shape[1]):

@@ -1,8 +1,10 @@
-"""A pipeline in a separate process: its memory is separate, and a crash or runaway ends only the process.
+"""A pipeline in a separate process: its memory is separate, and a crash or runaway ends only the
+process.
 
-The child is ``python -m tetopt.study.child FOLDER``; job and result are files in a temporary folder. The
-parent watches the resident memory of the child and its processes instead of setting RLIMIT_AS: numba, VTK and the
-allocators reserve far more address space than they use, so such a limit would end runs that need little memory.
+The child is ``python -m tetopt.study.child FOLDER``; job and result are files in a temporary
+folder. The parent watches the resident memory of the child and its processes instead of setting
+RLIMIT_AS: numba, VTK and the allocators reserve far more address space than they use, so such a
+limit would end runs that need little memory.
 """
 
 from __future__ import annotations
@@ -53,29 +55,33 @@ def run_in_child(
     max_seconds: float = float("inf"),
     max_bytes: int | None = None,
 ) -> Outcome:
-    """Run a pipeline in a child process, within limits; the mesh has the same bits as in this process.
+    """Run a pipeline in a child process, within limits; the mesh has the same bits as in this
+    process.
 
-    A run ended by a foreign signal (a crash, or the system short of memory) is repeated once, with smoother surfaces,
-    as fTetWild crashes at random and on rough ones.
+    A run ended by a foreign signal (a crash, or the system short of memory) is repeated once, with
+    smoother surfaces, as fTetWild crashes at random and on rough ones.
 
     Parameters
     ----------
     pipeline : callable
-        The function of a `tetopt.study.pipelines.Pipeline`, or any other that can be pickled. Its temporary files, and
-        those of the programs it runs, are in a folder that is always removed with the child.
+        The function of a `tetopt.study.pipelines.Pipeline`, or any other that can be pickled. Its
+        temporary files, and those of the programs it runs, are in a folder that is always removed
+        with the child.
     job : PipelineInput
     title : str
         Name of the pipeline in notes.
     max_seconds : float
-        Wall time of one run, including the child's start, after which it is killed with all its processes.
+        Wall time of one run, including the child's start, after which it is killed with all its
+        processes.
     max_bytes : int, optional
-        Resident memory at which it is killed. It is checked twenty times a second, so a fast run may exceed it
-        slightly.
+        Resident memory at which it is killed. It is checked twenty times a second, so a fast run
+        may exceed it slightly.
 
     Returns
     -------
     Outcome
-        Crashes, the time and memory limits, exceptions and missing packages are a `failure`, not an exception.
+        Crashes, the time and memory limits, exceptions and missing packages are a `failure`, not an
+        exception.
     """
     first = _run_once(pipeline, job, max_seconds, max_bytes)
     if not first.is_crash:
@@ -85,22 +91,32 @@ def run_in_child(
     again = _run_once(pipeline, job._replace(smoothing=SMOOTHING_FACTOR), max_seconds, max_bytes)
     again = again._replace(peak_bytes=max(first.peak_bytes, again.peak_bytes))
     if again.failure is None:
-        words = f"the first run {crash}; this is the second, with surfaces {SMOOTHING_FACTOR:g} times as smooth"
+        words = (
+            f"the first run {crash}; this is the second, with surfaces {SMOOTHING_FACTOR:g} "
+            "times as smooth"
+        )
         return again._replace(notes=[words, *again.notes])
     failure = f"twice {crash}" if again.failure == crash else f"{crash}; then {again.failure}"
     return again._replace(failure=f"{failure}; {AFTER_CRASHES}" if again.is_crash else failure)
 
 
 def _run_once(
-    pipeline: Callable[[PipelineInput], Produced], job: PipelineInput, max_seconds: float, max_bytes: int | None
+    pipeline: Callable[[PipelineInput], Produced],
+    job: PipelineInput,
+    max_seconds: float,
+    max_bytes: int | None,
 ) -> Outcome:
     deadline = time.monotonic() + max_seconds
 
     def passed(peak: int) -> str | None:
         """Return the message of a limit that the run exceeds; None without one."""
         if max_bytes is not None and peak > max_bytes:
-            return f"too much memory: {peak / 1e6:.0f} MB resident, {max_bytes / 1e6:.0f} MB allowed"
-        return f"out of time: killed after {max_seconds:g} s" if time.monotonic() >= deadline else None
+            return (
+                f"too much memory: {peak / 1e6:.0f} MB resident, {max_bytes / 1e6:.0f} MB allowed"
+            )
+        return (
+            f"out of time: killed after {max_seconds:g} s" if time.monotonic() >= deadline else None
+        )
 
     with tempfile.TemporaryDirectory(prefix="tetopt-") as name:
         folder = Path(name)
@@ -108,7 +124,9 @@ def _run_once(
         command = python_command("-m", "tetopt.study.child", str(folder))
         with open(folder / "stderr.txt", "wb") as errors:
             environment = python_environment(TMPDIR=name)
-            with started(command, environment, folder, stdout=subprocess.DEVNULL, stderr=errors) as child:
+            with started(
+                command, environment, folder, stdout=subprocess.DEVNULL, stderr=errors
+            ) as child:
                 peak, limit = watched(child, POLL_SECONDS, family_bytes, passed)
         return _outcome(folder, child.returncode, peak, limit)
 
@@ -125,7 +143,14 @@ def _outcome(folder: Path, code: int, peak: int, limit: str | None) -> Outcome:
     is_crash, text = False, (folder / "stderr.txt").read_text(encoding="utf-8", errors="replace")
     if own_failure.is_file():
         is_crash, text = json.loads(own_failure.read_text(encoding="ascii"))
-    return Outcome(None, {}, peak, [], last_line(text) or f"ended with exit code {code} and no message", is_crash)
+    return Outcome(
+        None,
+        {},
+        peak,
+        [],
+        last_line(text) or f"ended with exit code {code} and no message",
+        is_crash,
+    )
 
 
 def main(folder: Path) -> None:

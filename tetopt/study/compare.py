@@ -1,7 +1,8 @@
 """Comparison of tetopt with the conventional pipelines, with the same measures for all.
 
-Every pipeline runs in a separate process on the same image for the same number of nodes, and the same functions
-measure every mesh: the sampler, the shape measures, and the compression test against a voxel grid's solution.
+Every pipeline runs in a separate process on the same image for the same number of nodes, and the
+same functions measure every mesh: the sampler, the shape measures, and the compression test against
+a voxel grid's solution.
 """
 
 from __future__ import annotations
@@ -21,7 +22,15 @@ from tetopt.errors import InputError
 from tetopt.fem.conditioning import conditioning
 from tetopt.fem.elasticity import box_faces, check_fills_box, compression, push_of
 from tetopt.fem.hexahedra import DOF_BYTES
-from tetopt.fem.reference import Reference, averaged, compare, nearest, reference, reference_shape, refined
+from tetopt.fem.reference import (
+    Reference,
+    averaged,
+    compare,
+    nearest,
+    reference,
+    reference_shape,
+    refined,
+)
 from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import dihedral_angles
 from tetopt.image import Image
@@ -78,7 +87,9 @@ class Standard(NamedTuple):
 
 
 def default_mapping(image: Image) -> tuple[ModulusMapping, str]:
-    """Return a modulus mapping for any image, 1 to 10 kPa from its 0.5th to 99.5th percentile, and its description."""
+    """Return a modulus mapping for any image, 1 to 10 kPa from its 0.5th to 99.5th percentile,
+    and its description.
+    """
     low, high = (float(p) for p in np.percentile(image.data, [0.5, 99.5]))
     if high <= low:
         raise InputError("image: too little contrast between its percentiles; pass `young`")
@@ -114,11 +125,18 @@ def prepared(image: Image, labels: Image, mapping: ModulusMapping, settings: Set
 
 
 def default_dofs() -> int:
-    """Return the size of the reference if none is set: less than the default only if too little memory is free."""
+    """Return the size of the reference if none is set: less than the default only if too little
+    memory is free.
+    """
     free = available_bytes()
-    dofs = max(LEAST_REFERENCE_DOFS, min(DEFAULT_REFERENCE_DOFS, int(FREE_FRACTION * free / DOF_BYTES)))
+    dofs = max(
+        LEAST_REFERENCE_DOFS, min(DEFAULT_REFERENCE_DOFS, int(FREE_FRACTION * free / DOF_BYTES))
+    )
     if dofs < DEFAULT_REFERENCE_DOFS:
-        note(f"reference: {dofs} instead of {DEFAULT_REFERENCE_DOFS} unknowns, as only {memory_words(free)} is free")
+        note(
+            f"reference: {dofs} instead of {DEFAULT_REFERENCE_DOFS} unknowns, as only "
+            f"{memory_words(free)} is free"
+        )
     return dofs
 
 
@@ -126,16 +144,23 @@ def default_dofs() -> int:
 
 
 def measured(
-    standard: Standard, mesh: Mesh, percent: float, order: int = 1, own: NDArray[np.int64] | None = None
+    standard: Standard,
+    mesh: Mesh,
+    percent: float,
+    order: int = 1,
+    own: NDArray[np.int64] | None = None,
 ) -> Measurement:
-    """Measure everything that is compared of a mesh with cells of this order, compressed by `percent` of its height.
+    """Measure everything that is compared of a mesh with cells of this order, compressed by
+    `percent` of its height.
 
     `own` (M,) are the labels that its pipeline gives the cells; -1 is a cell without.
     """
     image, labels = standard.image, standard.labels
     moments = cell_moments(image, mesh)
     fraction, edges = rho_histogram(mesh.points, mesh.cells, bins=20)
-    angles, angle_edges = np.histogram(dihedral_angles(mesh.points, mesh.cells), bins=36, range=(0.0, 180.0))
+    angles, angle_edges = np.histogram(
+        dihedral_angles(mesh.points, mesh.cells), bins=36, range=(0.0, 180.0)
+    )
     try:
         check_fills_box(image, mesh)
         not_compressed = None
@@ -155,15 +180,21 @@ def measured(
         n_empty_cells=int((moments.n_voxels == 0).sum()),
         quality=quality(mesh.points, mesh.cells, mesh.midpoints),
         rho_histogram=records.Histogram(edges.tolist(), fraction.tolist()),
-        dihedral_histogram=records.Histogram(angle_edges.tolist(), (angles / angles.sum()).tolist()),
+        dihedral_histogram=records.Histogram(
+            angle_edges.tolist(), (angles / angles.sum()).tolist()
+        ),
         labels=label_fidelity(labels, mesh, majority),
         own_labels=[] if own is None else label_fidelity(labels, mesh, own),
-        fem={nu: _simulation(standard, mesh, order, each, percent) for nu, each in references.items()},
+        fem={
+            nu: _simulation(standard, mesh, order, each, percent) for nu, each in references.items()
+        },
         not_compressed=not_compressed,
     )
 
 
-def _simulation(standard: Standard, mesh: Mesh, order: int, against: Reference, percent: float) -> records.Simulation:
+def _simulation(
+    standard: Standard, mesh: Mesh, order: int, against: Reference, percent: float
+) -> records.Simulation:
     """Run the compression test on a mesh, and measure its errors against the reference."""
     bottom, top = box_faces(standard.image, mesh)
     push = push_of(standard.image, percent)
@@ -171,7 +202,14 @@ def _simulation(standard: Standard, mesh: Mesh, order: int, against: Reference, 
     begin = time.thread_time()
     # By multigrid for any size, so that all times are of one solver.
     pressed = compression(
-        mesh, young, against.nu, fixed_nodes=top, pushed_nodes=bottom, displacement=push, order=order, method="amg"
+        mesh,
+        young,
+        against.nu,
+        fixed_nodes=top,
+        pushed_nodes=bottom,
+        displacement=push,
+        order=order,
+        method="amg",
     )
     seconds = time.thread_time() - begin
     errors = compare(against, mesh, pressed.u, pressed.strain_energy, standard.coarse_labels)
@@ -218,7 +256,9 @@ def run(comparison: Comparison, classes: Image) -> tuple[Report, dict[int, dict[
     image = comparison.image
     report = Report(
         command=comparison.command,
-        image=records.ImageFacts(comparison.image_source, image.shape, image.spacing.tolist(), image.variance),
+        image=records.ImageFacts(
+            comparison.image_source, image.shape, image.spacing.tolist(), image.variance
+        ),
         labels=comparison.label_source,
         mapping=comparison.mapping_words,
         versions=versions() | _peers(),
@@ -236,7 +276,9 @@ def run(comparison: Comparison, classes: Image) -> tuple[Report, dict[int, dict[
 def _result(
     comparison: Comparison, standard: Standard, name: str, pipeline: Pipeline, order: int
 ) -> tuple[records.PipelineResult, MadeMesh | None]:
-    """Run a pipeline, several times if its result varies, until the first failure; return the median run's mesh."""
+    """Run a pipeline, several times if its result varies, until the first failure; return the
+    median run's mesh.
+    """
     outcomes: list[Outcome] = []
     done: list[tuple[records.PipelineRun, MadeMesh]] = []
     while len(outcomes) < (comparison.settings.repeats if pipeline.is_random else 1):
@@ -246,7 +288,11 @@ def _result(
             break
         done.append(made)
     # The lower of the two in the middle, so that the numbers are those of one mesh.
-    median = sorted(done, key=lambda each: each[0].measurement.E_D)[(len(done) - 1) // 2] if done else (None, None)
+    median = (
+        sorted(done, key=lambda each: each[0].measurement.E_D)[(len(done) - 1) // 2]
+        if done
+        else (None, None)
+    )
     result = records.PipelineResult(
         name,
         pipeline.title,
@@ -263,17 +309,37 @@ def _result(
 def _attempt(
     comparison: Comparison, standard: Standard, pipeline: Pipeline, order: int
 ) -> tuple[Outcome, tuple[records.PipelineRun, MadeMesh] | None]:
-    """Run a pipeline once and measure its mesh; return the outcome, and the run unless it failed."""
+    """Run a pipeline once and measure its mesh; return the outcome, and the run unless it
+    failed.
+    """
     settings, title = comparison.settings, pipeline.title + records.MESH_WORDS[order]
     note(f"{title}, {settings.nodes} nodes")
     job = PipelineInput(
-        comparison.image, comparison.labels, settings.nodes, settings.classes, settings.k_D, settings.iterations, order
-    )  # fmt: skip
-    made = run_in_child(pipeline.function, job, title, max_seconds=settings.max_seconds, max_bytes=settings.max_bytes)
+        comparison.image,
+        comparison.labels,
+        settings.nodes,
+        settings.classes,
+        settings.k_D,
+        settings.iterations,
+        order,
+    )
+    made = run_in_child(
+        pipeline.function,
+        job,
+        title,
+        max_seconds=settings.max_seconds,
+        max_bytes=settings.max_bytes,
+    )
     if made.mesh is not None:
         try:
             measurement = measured(standard, made.mesh, settings.percent, order, made.labels)
-        except (InputError, RuntimeError, ArithmeticError, MemoryError, np.linalg.LinAlgError) as error:
+        except (
+            InputError,
+            RuntimeError,
+            ArithmeticError,
+            MemoryError,
+            np.linalg.LinAlgError,
+        ) as error:
             made = made._replace(mesh=None, failure=f"its mesh cannot be measured: {error}")
     if made.mesh is None:
         made = made._replace(failure=(made.failure or "").removeprefix(f"{pipeline.title}: "))
@@ -286,12 +352,16 @@ def _attempt(
 
 
 def _machine() -> dict[str, int | str | None]:
-    """Describe the machine and its load: times are unreliable if the load exceeds the number of cores."""
+    """Describe the machine and its load: times are unreliable if the load exceeds the number of
+    cores.
+    """
     load = f"{os.getloadavg()[2]:.1f}" if hasattr(os, "getloadavg") else None
     return {
-        "cores": os.cpu_count(), "load, mean of 15 minutes": load, "system": platform.platform(),
+        "cores": os.cpu_count(),
+        "load, mean of 15 minutes": load,
+        "system": platform.platform(),
         "processor": platform.processor() or platform.machine(),
-    }  # fmt: skip
+    }
 
 
 def _peers() -> dict[str, str]:
@@ -303,7 +373,11 @@ def _peers() -> dict[str, str]:
 def _reference_grid(standard: Standard) -> records.ReferenceGrid:
     first = next(iter(standard.references.values()))
     is_same = standard.modulus.shape == standard.image.shape
-    note = "one hexahedron per voxel" if is_same else "the modulus averaged over a coarser grid, also for meshes"
+    note = (
+        "one hexahedron per voxel"
+        if is_same
+        else "the modulus averaged over a coarser grid, also for meshes"
+    )
     by_nu = {
         nu: records.ReferenceEnergy(each.strain_energy, each.own_error, each.n_iterations)
         for nu, each in standard.references.items()

@@ -1,4 +1,6 @@
-"""Pictures of a comparison of pipelines: slices through every mesh, cutaways, labels, histograms, times."""
+"""Pictures of a comparison of pipelines: slices through every mesh, cutaways, labels,
+histograms, times.
+"""
 
 from __future__ import annotations
 
@@ -21,15 +23,19 @@ from tetopt.report.scene import cutaway, save_scenes, view_of
 from tetopt.study.compare_report import PipelineResult, PipelineRun, Report
 from tetopt.study.pipelines import UNTIMED_STEPS
 
-# Okabe and Ito's palette, safe for colour blindness, without its yellow, which is invisible on white.
+# Okabe and Ito's palette, safe for colour blindness, without its yellow, which is invisible on
+# white.
 LINE_COLOURS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
 LINE_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 LINE_DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)), (0, (1, 2)))
 BAR_HATCHES = ("", "//", "..", "xx", "\\\\", "oo", "--")
 
 
-def slices_figure(image: Image, meshes: Sequence[tuple[str, Mesh]], means: Sequence[NDArray[np.float64]]) -> Figure:
-    """The image's middle axial slice and, next to it, each mesh in that slice: its edges, its means, its E_D.
+def slices_figure(
+    image: Image, meshes: Sequence[tuple[str, Mesh]], means: Sequence[NDArray[np.float64]]
+) -> Figure:
+    """The image's middle axial slice and, next to it, each mesh in that slice: its edges, its
+    means, its E_D.
 
     Parameters
     ----------
@@ -42,13 +48,15 @@ def slices_figure(image: Image, meshes: Sequence[tuple[str, Mesh]], means: Seque
     Returns
     -------
     Figure
-        Three rows: edges over the image; cells filled with their means; E_D per mm^3 of each cell (the variance of
-        the image inside it) on a common scale, so that a dark map is a good fit for any cell size. Where a mesh does
-        not cover the image, the lower rows are light blue.
+        Three rows: edges over the image; cells filled with their means; E_D per mm^3 of each cell
+        (the variance of the image inside it) on a common scale, so that a dark map is a good fit
+        for any cell size. Where a mesh does not cover the image, the lower rows are light blue.
     """
     view = SliceView(image, None, None)
     width = 3.3 if len(meshes) > 2 else 4.6
-    figure = Figure(figsize=(width * (len(meshes) + 1), 3.0 * width * view.aspect + 1.0), layout="constrained")
+    figure = Figure(
+        figsize=(width * (len(meshes) + 1), 3.0 * width * view.aspect + 1.0), layout="constrained"
+    )
     grid = figure.subplots(3, len(meshes) + 1, squeeze=False)
     limits = grey_limits([np.asarray(view.pixels, dtype=np.float64)])
     cuts = [view.section(mesh) for _, mesh in meshes]
@@ -59,7 +67,9 @@ def slices_figure(image: Image, meshes: Sequence[tuple[str, Mesh]], means: Seque
         view.show_pixels(grid[row, 0], limits)
         view.frame(grid[row, 0])
         grid[row, 0].set_title("image", fontsize=11)
-    for drawn, (title, _), (polygons, cells), mean, loss in zip(grid.T[1:], meshes, cuts, means, losses, strict=True):
+    for drawn, (title, _), (polygons, cells), mean, loss in zip(
+        grid.T[1:], meshes, cuts, means, losses, strict=True
+    ):
         over, filled, mapped = drawn
         view.show_pixels(over, limits)
         draw_edges(over, polygons)
@@ -78,25 +88,46 @@ def slices_figure(image: Image, meshes: Sequence[tuple[str, Mesh]], means: Seque
     return figure
 
 
-def cutaways(meshes: Sequence[tuple[str, Mesh]], means: Sequence[NDArray[np.float64]], path: str | Path) -> None:
-    """Write a PNG of every mesh without its right, front, upper octant, with edges, cells in the grey of their means.
+def cutaways(
+    meshes: Sequence[tuple[str, Mesh]], means: Sequence[NDArray[np.float64]], path: str | Path
+) -> None:
+    """Write a PNG of every mesh without its right, front, upper octant, with edges, cells in the
+    grey of their means.
 
-    All are cut at the middle of the first mesh's box, up to three in a row. `means` as in `slices_figure`.
+    All are cut at the middle of the first mesh's box, up to three in a row. `means` as in
+    `slices_figure`.
     """
     points = meshes[0][1].points
     centre = (points.min(axis=0) + points.max(axis=0)) / 2.0
-    views = [view_of(mesh, mean, title, centre) for (title, mesh), mean in zip(meshes, means, strict=True)]
+    views = [
+        view_of(mesh, mean, title, centre)
+        for (title, mesh), mean in zip(meshes, means, strict=True)
+    ]
     limits = grey_limits([view.values for view in views])
-    save_scenes(path, [(view.title, cutaway(view, limits)) for view in views], columns=3 if len(views) != 4 else 2)
+    save_scenes(
+        path,
+        [(view.title, cutaway(view, limits)) for view in views],
+        columns=3 if len(views) != 4 else 2,
+    )
 
 
 def histograms_figure(report: Report) -> Figure:
-    """Plot fractions of cells by rho (left) and of dihedral angles (right) for the pipelines' median runs."""
+    """Plot fractions of cells by rho (left) and of dihedral angles (right) for the pipelines'
+    median runs.
+    """
     figure = Figure(figsize=(11.0, 4.4), layout="constrained")
     panels = figure.subplots(1, 2)
     names = (
-        ("rho_histogram", "rho = inradius / circumradius (1/3 for a regular cell)", "fraction of cells"),
-        ("dihedral_histogram", "dihedral angle, degrees (70.5 in a regular cell)", "fraction of angles"),
+        (
+            "rho_histogram",
+            "rho = inradius / circumradius (1/3 for a regular cell)",
+            "fraction of cells",
+        ),
+        (
+            "dihedral_histogram",
+            "dihedral angle, degrees (70.5 in a regular cell)",
+            "fraction of angles",
+        ),
     )
     for axes, (name, across, up) in zip(panels, names, strict=True):
         for number, pipeline, run in _finished(report):
@@ -116,10 +147,11 @@ def histograms_figure(report: Report) -> Figure:
 
 
 def labels_figure(report: Report) -> Figure:
-    """Plot Dice (top) and mean surface distance in mm (bottom) of each label, the largest on the left, by pipeline.
+    """Plot Dice (top) and mean surface distance in mm (bottom) of each label, the largest on the
+    left, by pipeline.
 
-    Filled marks are of labels of most voxels, open ones of the mesh's own. A lost label has Dice 0 and no
-    distance. Grey bars separate labels.
+    Filled marks are of labels of most voxels, open ones of the mesh's own. A lost label has Dice 0
+    and no distance. Grey bars separate labels.
     """
     finished = _finished(report)
     voxels = {row.label: row.voxels for _, _, run in finished for row in run.measurement.labels}
@@ -130,25 +162,42 @@ def labels_figure(report: Report) -> Figure:
         for k in range(0, len(order), 2):
             axes.axvspan(k - 0.5, k + 0.5, color="#f1f1f1", zorder=0)
         for place, (number, pipeline, run) in enumerate(finished):
-            aside = 0.8 * ((place + 0.5) / len(finished) - 0.5)  # of a column, so that marks do not overlap
+            # of a column, so that marks do not overlap
+            aside = 0.8 * ((place + 0.5) / len(finished) - 0.5)
             colour = _style(number)["color"]
-            for rows, face in ((run.measurement.own_labels, "none"), (run.measurement.labels, colour)):
+            for rows, face in (
+                (run.measurement.own_labels, "none"),
+                (run.measurement.labels, colour),
+            ):
                 values = {row.label: getattr(row, name) for row in rows}
-                points = [(k + aside, values[label]) for k, label in enumerate(order) if label in values]
+                points = [
+                    (k + aside, values[label]) for k, label in enumerate(order) if label in values
+                ]
                 axes.plot(
-                    [x for x, _ in points], [y for _, y in points], linestyle="none", markersize=5, color=colour,
-                    marker=LINE_MARKERS[number % len(LINE_MARKERS)], markerfacecolor=face,
+                    [x for x, _ in points],
+                    [y for _, y in points],
+                    linestyle="none",
+                    markersize=5,
+                    color=colour,
+                    marker=LINE_MARKERS[number % len(LINE_MARKERS)],
+                    markerfacecolor=face,
                     label=pipeline.title if rows is run.measurement.labels else None,
-                )  # fmt: skip
+                )
         axes.grid(axis="y", color="#dddddd", linewidth=0.6)
     panels[0].set_ylabel("Dice")
     panels[0].set_ylim(-0.03, 1.03)
     panels[1].set_ylabel("mean surface distance, mm")
     panels[1].set_ylim(bottom=0.0)
     panels[1].set_xlim(-0.5, len(order) - 0.5)
-    words = {label: plain_text(report.labels.words(label)) if report.labels else f"{label:.0f}" for label in order}
+    words = {
+        label: plain_text(report.labels.words(label)) if report.labels else f"{label:.0f}"
+        for label in order
+    }
     panels[1].set_xticks(
-        range(len(order)), [f"{words[label]} ({voxels[label]:.0f})" for label in order], rotation=90, fontsize=8
+        range(len(order)),
+        [f"{words[label]} ({voxels[label]:.0f})" for label in order],
+        rotation=90,
+        fontsize=8,
     )
     panels[1].set_xlabel("label (voxels)")
     _legend(figure, panels)
@@ -156,9 +205,13 @@ def labels_figure(report: Report) -> Figure:
 
 
 def timing_figure(report: Report) -> Figure:
-    """Plot wall seconds of each pipeline's median run as a bar, stacked by step; failed pipelines have a text."""
+    """Plot wall seconds of each pipeline's median run as a bar, stacked by step; failed
+    pipelines have a text.
+    """
     timed = [
-        {} if pipeline.median is None else {k: v for k, v in pipeline.median.seconds.items() if k not in UNTIMED_STEPS}
+        {}
+        if pipeline.median is None
+        else {k: v for k, v in pipeline.median.seconds.items() if k not in UNTIMED_STEPS}
         for pipeline in report.pipelines
     ]
     steps = list(dict.fromkeys(step for seconds in timed for step in seconds))
@@ -172,9 +225,15 @@ def timing_figure(report: Report) -> Figure:
         for step, seconds in seconds_by_step.items():
             number = steps.index(step)
             axes.barh(
-                row, seconds, 0.62, left=left, color=LINE_COLOURS[(number + 1) % len(LINE_COLOURS)], edgecolor="white",
-                hatch=BAR_HATCHES[number % len(BAR_HATCHES)], label=step,
-            )  # fmt: skip
+                row,
+                seconds,
+                0.62,
+                left=left,
+                color=LINE_COLOURS[(number + 1) % len(LINE_COLOURS)],
+                edgecolor="white",
+                hatch=BAR_HATCHES[number % len(BAR_HATCHES)],
+                label=step,
+            )
             left += seconds
         axes.text(left, row, f" {pipeline.median.seconds_total:.3g} s", va="center", fontsize=10)
     axes.set_yticks(range(len(timed)), [pipeline.title for pipeline in report.pipelines])
@@ -188,20 +247,35 @@ def timing_figure(report: Report) -> Figure:
 
 
 def _finished(report: Report) -> list[tuple[int, PipelineResult, PipelineRun]]:
-    """Return the pipelines with a mesh: their places in the list, which select colours, and their median runs."""
-    return [(number, each, each.median) for number, each in enumerate(report.pipelines) if each.median is not None]
+    """Return the pipelines with a mesh: their places in the list, which select colours, and
+    their median runs.
+    """
+    return [
+        (number, each, each.median)
+        for number, each in enumerate(report.pipelines)
+        if each.median is not None
+    ]
 
 
 def _style(number: int) -> dict[str, Any]:
-    return {"color": LINE_COLOURS[number % len(LINE_COLOURS)], "linestyle": LINE_DASHES[number % len(LINE_DASHES)]}
+    return {
+        "color": LINE_COLOURS[number % len(LINE_COLOURS)],
+        "linestyle": LINE_DASHES[number % len(LINE_DASHES)],
+    }
 
 
 def _legend(figure: Figure, panels: Iterable[Axes]) -> None:
     """Add one legend above all panels, with each label once."""
     handles = {
-        label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+        label: handle
+        for axes in panels
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
     }
     if handles:
         figure.legend(
-            list(handles.values()), list(handles), loc="outside upper center", ncols=min(len(handles), 6), frameon=False
+            list(handles.values()),
+            list(handles),
+            loc="outside upper center",
+            ncols=min(len(handles), 6),
+            frameon=False,
         )

@@ -1,4 +1,6 @@
-"""The page of `tetopt compare`: the table, the pictures, notes and provenance. Its text is in `compare.html`."""
+"""The page of `tetopt compare`: the table, the pictures, notes and provenance. Its text is in
+`compare.html`.
+"""
 
 from __future__ import annotations
 
@@ -19,21 +21,34 @@ def save_compare_page(path: Path, report: Report, pictures: Sequence[tuple[Path,
     ----------
     path : Path
     report : Report
-        Content of `report.json`, of which the page shows numbers, rounded to four digits, and means over labels.
+        Content of `report.json`, of which the page shows numbers, rounded to four digits, and means
+        over labels.
     pictures : sequence of (PNG path, caption)
     """
     columns = columns_of(report)
-    groups = [(name, len(list(members))) for name, members in groupby(columns, key=lambda column: column.group)]
+    groups = [
+        (name, len(list(members)))
+        for name, members in groupby(columns, key=lambda column: column.group)
+    ]
     content = rendered(
-        "study/compare.html", report=report, columns=columns, groups=groups, rows=rows_of(report, columns),
-        remarks=remarks(report), pictures=pictures, number_text=number_text, text=_text,
-    )  # fmt: skip
+        "study/compare.html",
+        report=report,
+        columns=columns,
+        groups=groups,
+        rows=rows_of(report, columns),
+        remarks=remarks(report),
+        pictures=pictures,
+        number_text=number_text,
+        text=_text,
+    )
     title = f"tetopt compared on {report.image.source.name}"
     write_page(path, title, content, package_text("study/compare.css"))
 
 
 def remarks(report: Report) -> list[str]:
-    """Return lines on runs that failed or crashed, on meshes that were not compressed, and the notes of the runs."""
+    """Return lines on runs that failed or crashed, on meshes that were not compressed, and the
+    notes of the runs.
+    """
     lines = []
     for title, each in report.meshes():
         if each.failure is not None and each.median is not None:

@@ -13,7 +13,8 @@ from tetopt.study.interfaces import OTSU_CLASSES
 from tetopt.study.pipelines import PIPELINES
 from tetopt.study.program import Program
 
-# The file is flatter than the records: the keys of these fields' values are among those of the record itself.
+# The file is flatter than the records: the keys of these fields' values are among those of the
+# record itself.
 INLINE_FIELDS = ("measurement", "source", "by_nu")
 ORDER_WORDS = {1: "linear", 2: "quadratic"}
 MESH_WORDS = {1: "", 2: ", quadratic"}  # after the title of a pipeline, by order
@@ -32,7 +33,8 @@ class Settings(NamedTuple):
     nus: tuple[float, ...] = (0.3, 0.45)
     percent: float = 1.0  # of compression, of the box's height
     average: str = DEFAULT_AVERAGE  # of a cell's moduli
-    reference_dofs: int | None = None  # maximum of the averaged voxel grid; in a report the chosen size
+    # maximum of the averaged voxel grid; in a report the chosen size
+    reference_dofs: int | None = None
     max_seconds: float = 3600.0  # of one run of a pipeline
     max_bytes: int | None = None  # of one run, resident
 
@@ -66,7 +68,9 @@ class Histogram(NamedTuple):
 
 
 class Simulation(NamedTuple):
-    """The compression test on a mesh for one Poisson's ratio, and its errors against the reference."""
+    """The compression test on a mesh for one Poisson's ratio, and its errors against the
+    reference.
+    """
 
     lambda_max: float
     cond: float
@@ -115,7 +119,8 @@ class PipelineResult(NamedTuple):
     failure: str | None  # the first, if a run failed
     notes: list[str]
     runs: list[PipelineRun]
-    median: PipelineRun | None  # the run of the median E_D, the lower of two; None if no run gave a mesh
+    # the run of the median E_D, the lower of two; None if no run gave a mesh
+    median: PipelineRun | None
 
 
 class ImageFacts(NamedTuple):
@@ -157,13 +162,18 @@ class Report(NamedTuple):
     options: Settings
     reference: ReferenceGrid
     pipelines: list[PipelineResult]  # meshes of the requested number of nodes, with linear cells
-    quadratic: list[PipelineResult]  # the same pipelines' coarser meshes with quadratic cells, as many nodes in total
+    # the same pipelines' coarser meshes with quadratic cells, as many nodes in total
+    quadratic: list[PipelineResult]
     seconds: float
 
     def meshes(self) -> list[tuple[str, PipelineResult]]:
         """Return the title and the result of each mesh, those of linear cells first."""
         of_order = {1: self.pipelines, 2: self.quadratic}
-        return [(each.title + MESH_WORDS[order], each) for order, results in of_order.items() for each in results]
+        return [
+            (each.title + MESH_WORDS[order], each)
+            for order, results in of_order.items()
+            for each in results
+        ]
 
 
 def as_json(value: Any) -> Any:

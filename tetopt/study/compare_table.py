@@ -1,4 +1,6 @@
-"""The table of a comparison: a row for each mesh; columns of fidelity, shape, labels, simulation and cost."""
+"""The table of a comparison: a row for each mesh; columns of fidelity, shape, labels, simulation
+and cost.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,8 @@ from tetopt.study.compare_report import Measurement, PipelineResult, PipelineRun
 
 JUDGED_VOXELS = 500  # labels with more are judged; a mesh of few nodes keeps only some smaller ones
 MEBI_BYTES = 1e-6  # megabytes in a byte
-FULL_DIGITS = (1e4, 1e9)  # numbers from the first are printed without a fraction, below the second in full
+# numbers from the first are printed without a fraction, below the second in full
+FULL_DIGITS = (1e4, 1e9)
 COMPRESSION_ERRORS = (  # of the compression, and the fields of `tetopt.fem.reference.Errors`
     ("energy", "strain_energy"),
     ("displacement", "displacement"),
@@ -52,14 +55,25 @@ def columns_of(report: Report) -> list[Column]:
     runs = [run for _, each in report.meshes() for run in each.runs]
     ratios = sorted({nu for run in runs for nu in run.measurement.fem}, key=float)
     columns = [
-        _measure("Fidelity", "E_D, of the variance", lambda mesh: mesh.E_D_fraction, -1, is_short=True),
+        _measure(
+            "Fidelity", "E_D, of the variance", lambda mesh: mesh.E_D_fraction, -1, is_short=True
+        ),
         _measure("Fidelity", "voxels outside", lambda mesh: mesh.n_missed_voxels, -1),
         _measure("Shape", "mean rho", lambda mesh: mesh.quality.mean_rho, 1, is_short=True),
         _measure("Shape", "p1 rho", lambda mesh: mesh.quality.p1_rho, 1),
-        _measure("Shape", "smallest angle, °", lambda mesh: mesh.quality.min_dihedral, 1, is_short=True),
-        _measure("Shape", "bad cells, %", lambda mesh: 100.0 * sum(mesh.quality.kinds.values()) / mesh.n_cells, -1),
+        _measure(
+            "Shape", "smallest angle, °", lambda mesh: mesh.quality.min_dihedral, 1, is_short=True
+        ),
+        _measure(
+            "Shape",
+            "bad cells, %",
+            lambda mesh: 100.0 * sum(mesh.quality.kinds.values()) / mesh.n_cells,
+            -1,
+        ),
         *_label_columns(report, "Labels of most voxels", lambda mesh: mesh.labels, is_short=True),
-        *_label_columns(report, "Labels of the mesh itself", lambda mesh: mesh.own_labels, is_short=False),
+        *_label_columns(
+            report, "Labels of the mesh itself", lambda mesh: mesh.own_labels, is_short=False
+        ),
         *(
             Column(
                 f"Error of the compression, ν = {nu}",
@@ -76,19 +90,32 @@ def columns_of(report: Report) -> list[Column]:
         _measure("Cost", "nodes", lambda mesh: mesh.n_nodes, 0, is_short=True),
         _measure("Cost", "cells", lambda mesh: mesh.n_cells, 0),
     ]
-    return [column for column in columns if any(_known(column.value(run)) is not None for run in runs)]
+    return [
+        column for column in columns if any(_known(column.value(run)) is not None for run in runs)
+    ]
 
 
 def _measure(
-    group: str, title: str, value: Callable[[Measurement], float | None], better: int, *, is_short: bool = False
+    group: str,
+    title: str,
+    value: Callable[[Measurement], float | None],
+    better: int,
+    *,
+    is_short: bool = False,
 ) -> Column:
     return Column(group, title, lambda run: value(run.measurement), better, is_short)
 
 
 def _label_columns(
-    report: Report, group: str, rows_of: Callable[[Measurement], list[LabelFidelity]], *, is_short: bool
+    report: Report,
+    group: str,
+    rows_of: Callable[[Measurement], list[LabelFidelity]],
+    *,
+    is_short: bool,
 ) -> list[Column]:
-    """Return columns over the judged labels. A lost label has no surface, so that their mean has no number."""
+    """Return columns over the judged labels. A lost label has no surface, so that their mean has
+    no number.
+    """
     judged = judged_labels(report)
 
     def over(
@@ -111,15 +138,22 @@ def _label_columns(
         _measure(group, "smallest Dice", over(min, lambda row: row.dice), 1),
         _measure(group, "surface distance, mm", over(mean, lambda row: row.distance_mean), -1),
         _measure(
-            group, "largest volume error, %", over(max, lambda row: 100.0 * abs(row.mesh_volume / row.volume - 1.0)), -1
+            group,
+            "largest volume error, %",
+            over(max, lambda row: 100.0 * abs(row.mesh_volume / row.volume - 1.0)),
+            -1,
         ),
         _measure(group, "labels lost", n_lost, -1),
     ]
 
 
 def judged_labels(report: Report) -> set[int]:
-    """Return the labels of the table: the large ones if any, without a given segmentation's background."""
-    rows = [row for each in report.pipelines for run in each.runs[:1] for row in run.measurement.labels]
+    """Return the labels of the table: the large ones if any, without a given segmentation's
+    background.
+    """
+    rows = [
+        row for each in report.pipelines for run in each.runs[:1] for row in run.measurement.labels
+    ]
     voxels = {row.label: row.voxels for row in rows}
     if report.labels is not None and len(voxels) > 1:
         voxels.pop(0, None)
@@ -142,11 +176,15 @@ def rows_of(report: Report, columns: list[Column]) -> list[TableRow]:
 def _row(pipeline: PipelineResult, title: str, columns: list[Column]) -> TableRow:
     if pipeline.median is None:
         return TableRow(title, pipeline.kind, pipeline.failure, [])
-    return TableRow(title, pipeline.kind, None, [_cell(pipeline, column.value) for column in columns])
+    return TableRow(
+        title, pipeline.kind, None, [_cell(pipeline, column.value) for column in columns]
+    )
 
 
 def _cell(pipeline: PipelineResult, value: Value) -> tuple[str, str]:
-    """Return the number of the pipeline's median run, and the range of all its runs if it is one."""
+    """Return the number of the pipeline's median run, and the range of all its runs if it is
+    one.
+    """
     known = sorted(each for run in pipeline.runs if (each := _known(value(run))) is not None)
     ends = [number_text(each) for each in (known[:1] + known[-1:])]
     text = "–" if pipeline.median is None else number_text(value(pipeline.median))
@@ -158,7 +196,9 @@ def _known(value: float | None) -> float | None:
 
 
 def number_text(value: float | None) -> str:
-    """Format a number: whole numbers in full, others to four digits; "–" without a finite number."""
+    """Format a number: whole numbers in full, others to four digits; "–" without a finite
+    number.
+    """
     if value is None or not math.isfinite(value):
         return "–"
     rounded, full = FULL_DIGITS

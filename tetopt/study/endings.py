@@ -16,7 +16,9 @@ class Crashed(InputError):
 
 
 def imported(package: str) -> Any:
-    """Return the module of a peer; raise InputError if it is not installed or cannot be imported."""
+    """Return the module of a peer; raise InputError if it is not installed or cannot be
+    imported.
+    """
     try:
         return importlib.import_module(package)
     except ImportError as error:

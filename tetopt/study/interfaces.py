@@ -1,8 +1,10 @@
-"""Interfaces between the classes of an image, cleaned for a surface mesher, in the closed box of the image.
+"""Interfaces between the classes of an image, cleaned for a surface mesher, in the closed box of
+the image.
 
-All coordinates are in the *box frame*: x = index * spacing, in mm, in which the box is axis-aligned, from
--spacing/2 to (shape - 1/2) * spacing. Without shear in the affine, lengths and angles are those of the world. A
-sheared image is treated in the same frame and mapped by its affine afterwards, so its cells are sheared along.
+All coordinates are in the *box frame*: x = index * spacing, in mm, in which the box is
+axis-aligned, from -spacing/2 to (shape - 1/2) * spacing. Without shear in the affine, lengths and
+angles are those of the world. A sheared image is treated in the same frame and mapped by its affine
+afterwards, so its cells are sheared along.
 """
 
 from __future__ import annotations
@@ -18,17 +20,24 @@ from tetopt.contents.otsu import class_thresholds
 from tetopt.geometry.box import box_sides
 from tetopt.image import Image
 
-OTSU_CLASSES = 4  # of the segmentation without labels: fewer lose interfaces (see `tetopt.study.tetwild`)
-SIGMA_VOXELS = 0.75  # of the Gaussian before thresholding: removes noise, moves no interface wider than a voxel
-SPECK_AREA = 3.0  # pieces of surface below this many size^2 are dropped: cells of that size cannot represent them
-EDGE_FRACTION = 0.7  # of a surface triangle over `size`; coarser ones round off folds, finer ones only take time
+# of the segmentation without labels: fewer lose interfaces (see `tetopt.study.tetwild`)
+OTSU_CLASSES = 4
+# of the Gaussian before thresholding: removes noise, moves no interface wider than a voxel
+SIGMA_VOXELS = 0.75
+# pieces of surface below this many size^2 are dropped: cells of that size cannot represent them
+SPECK_AREA = 3.0
+# of a surface triangle over `size`; coarser ones round off folds, finer ones only take time
+EDGE_FRACTION = 0.7
 SINC_ITERATIONS = 30  # of the smoothing; VTK's default is 20, and a narrower pass band needs more
 PASS_BAND = 0.05  # of the smoothing; VTK's default is 0.1, and less is smoother
-PAD_VOXELS = 4  # padding of the volume, so that smoothing and decimation do not fray at the box's faces
+# padding of the volume, so that smoothing and decimation do not fray at the box's faces
+PAD_VOXELS = 4
 
 
 class Surfaces(NamedTuple):
-    """A soup of triangles in the box frame: the interfaces, cut off at the box, and the box's own 12 triangles."""
+    """A soup of triangles in the box frame: the interfaces, cut off at the box, and the box's
+    own 12 triangles.
+    """
 
     points: NDArray[np.float64]  # (P, 3) mm
     triangles: NDArray[np.int64]  # (T, 3), the box's last
@@ -39,14 +48,21 @@ class Surfaces(NamedTuple):
 
 
 def interfaces(
-    image: Image, size: float, *, classes: int = OTSU_CLASSES, labels: Image | None = None, smoothing: float = 1.0
+    image: Image,
+    size: float,
+    *,
+    classes: int = OTSU_CLASSES,
+    labels: Image | None = None,
+    smoothing: float = 1.0,
 ) -> Surfaces:
-    """Extract all interfaces between the classes of an image, or between given labels, and the box around them.
+    """Extract all interfaces between the classes of an image, or between given labels, and the box
+    around them.
 
-    Without labels: the volume is smoothed by a Gaussian of 0.75 voxel, exact multi-Otsu gives the thresholds of the
-    classes, and each threshold's isosurface is an interface. They are level sets of one field, so they nest. With
-    labels: one conforming surface on which three or more labels may meet (surface nets). Then small pieces are dropped,
-    and the surface is smoothed by a windowed sinc and decimated by quadrics to triangles of about 0.7 `size`.
+    Without labels: the volume is smoothed by a Gaussian of 0.75 voxel, exact multi-Otsu gives the
+    thresholds of the classes, and each threshold's isosurface is an interface. They are level sets
+    of one field, so they nest. With labels: one conforming surface on which three or more labels
+    may meet (surface nets). Then small pieces are dropped, and the surface is smoothed by a
+    windowed sinc and decimated by quadrics to triangles of about 0.7 `size`.
 
     Parameters
     ----------
@@ -95,23 +111,31 @@ def class_labels(image: Image, classes: int) -> Image:
     return Image(np.digitize(smooth, thresholds), image.affine)
 
 
-def _classes(image: Image, classes: int, smoothing: float = 1.0) -> tuple[NDArray[np.floating], NDArray[np.float64]]:
+def _classes(
+    image: Image, classes: int, smoothing: float = 1.0
+) -> tuple[NDArray[np.floating], NDArray[np.float64]]:
     """Return the smoothed volume and the thresholds between its classes."""
     smooth = gaussian_filter(image.data, smoothing * SIGMA_VOXELS, mode="nearest")
     return smooth, class_thresholds(smooth.ravel(), classes)
 
 
-def _isosurfaces(image: Image, size: float, classes: int, smoothing: float) -> tuple[list[pyvista.PolyData], list[str]]:
+def _isosurfaces(
+    image: Image, size: float, classes: int, smoothing: float
+) -> tuple[list[pyvista.PolyData], list[str]]:
     smooth, thresholds = _classes(image, classes, smoothing)
     grid = _padded_grid(smooth, image.spacing, size)
     pieces, notes = [], []
     for threshold in thresholds:
-        surface = grid.contour([threshold], method="flying_edges", compute_normals=False, compute_gradients=False)
+        surface = grid.contour(
+            [threshold], method="flying_edges", compute_normals=False, compute_gradients=False
+        )
         large, n_dropped = _without_specks(surface, size)
         if n_dropped:
             notes.append(f"threshold {threshold:.4g}: dropped {n_dropped} specks of surface")
         if large.n_cells == 0:
-            notes.append(f"threshold {threshold:.4g}: dropped the whole surface, as every piece is a speck")
+            notes.append(
+                f"threshold {threshold:.4g}: dropped the whole surface, as every piece is a speck"
+            )
             continue
         pieces.append(_smoothed(large, smoothing))
     return pieces, notes
@@ -126,11 +150,17 @@ def _label_surface(
     # Numbers from 1: 0 would be the filter's background, where it extracts no internal boundary.
     grid = _padded_grid((numbered.reshape(data.shape) + 1).astype(np.int16), spacing, size)
     surface = grid.contour_labels(
-        "internal", background_value=0, pad_background=False, smoothing=True, output_mesh_type="triangles"
+        "internal",
+        background_value=0,
+        pad_background=False,
+        smoothing=True,
+        output_mesh_type="triangles",
     )
     large, n_dropped = _without_specks(surface, size)
     notes = [f"labels: dropped {n_dropped} specks of surface"] if n_dropped else []
-    seen = np.unique(large.cell_data["boundary_labels"]) if large.n_cells else np.array([], dtype=int)
+    seen = (
+        np.unique(large.cell_data["boundary_labels"]) if large.n_cells else np.array([], dtype=int)
+    )
     lost = [f"{value:g}" for number, value in enumerate(values, 1) if number not in seen]
     if lost and n_dropped:
         notes.append(f"lost labels, as every piece of their surface is a speck: {', '.join(lost)}")
@@ -138,7 +168,9 @@ def _label_surface(
 
 
 def _padded_grid(volume: NDArray, spacing: NDArray[np.float64], size: float) -> pyvista.ImageData:
-    """Return the volume on its voxel centres, continued by its border values beyond the box's faces."""
+    """Return the volume on its voxel centres, continued by its border values beyond the box's
+    faces.
+    """
     pad = np.maximum(PAD_VOXELS, np.ceil(size / spacing)).astype(int)
     padded = np.pad(volume, [(p, p) for p in pad], mode="edge")
     grid = pyvista.ImageData(dimensions=padded.shape, spacing=spacing, origin=-pad * spacing)
@@ -165,7 +197,10 @@ def _without_specks(surface: pyvista.PolyData, size: float) -> tuple[pyvista.Pol
 
 def _smoothed(surface: pyvista.PolyData, smoothing: float) -> pyvista.PolyData:
     return surface.smooth_taubin(
-        n_iter=SINC_ITERATIONS, pass_band=PASS_BAND / smoothing, boundary_smoothing=False, non_manifold_smoothing=True
+        n_iter=SINC_ITERATIONS,
+        pass_band=PASS_BAND / smoothing,
+        boundary_smoothing=False,
+        non_manifold_smoothing=True,
     )
 
 
@@ -180,7 +215,9 @@ def _cut_by_box(
     surface: pyvista.PolyData, low: NDArray[np.float64], high: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return the part of a surface inside the box; its rim lies exactly on the box's faces."""
-    surface = pyvista.PolyData.from_regular_faces(np.asarray(surface.points, dtype=np.float64), surface.regular_faces)
+    surface = pyvista.PolyData.from_regular_faces(
+        np.asarray(surface.points, dtype=np.float64), surface.regular_faces
+    )
     for axis in range(3):
         for place, sign in ((low, 1.0), (high, -1.0)):
             if surface.n_cells:
@@ -188,17 +225,24 @@ def _cut_by_box(
                 surface = surface.clip(normal, origin=place, invert=False).triangulate()
     if surface.n_cells == 0:
         return np.empty((0, 3)), np.empty((0, 3), dtype=np.int64)
-    points, triangles = compacted(np.asarray(surface.points, dtype=np.float64), surface.regular_faces)
+    points, triangles = compacted(
+        np.asarray(surface.points, dtype=np.float64), surface.regular_faces
+    )
     near = 1e-6 * (high - low)
     for face in (low, high):
         points = np.where(np.abs(points - face) < near, face, points)
     return points, triangles
 
 
-def _box(low: NDArray[np.float64], high: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _box(
+    low: NDArray[np.float64], high: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     box = pyvista.Box(np.stack([low, high], axis=1).ravel(), quads=False)
-    corners, triangles = np.unique(np.asarray(box.points, dtype=np.float64), axis=0, return_inverse=True)
-    # pyvista's points are single precision: each coordinate is moved to the nearer of the two faces.
+    corners, triangles = np.unique(
+        np.asarray(box.points, dtype=np.float64), axis=0, return_inverse=True
+    )
+    # pyvista's points are single precision: each coordinate is moved to the nearer of the two
+    # faces.
     corners = np.where(corners < 0.5 * (low + high), low, high)
     return corners, triangles.reshape(-1)[box.regular_faces].astype(np.int64)
 
@@ -208,7 +252,9 @@ def _stacked(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     offsets = np.cumsum([0] + [len(points) for points, _ in parts])
     points = np.vstack([points for points, _ in parts])
-    return points, np.vstack([triangles + offset for (_, triangles), offset in zip(parts, offsets, strict=False)])
+    return points, np.vstack(
+        [triangles + offset for (_, triangles), offset in zip(parts, offsets, strict=False)]
+    )
 
 
 def compacted(points: NDArray, cells: NDArray) -> tuple[NDArray, NDArray[np.int64]]:

@@ -24,15 +24,19 @@ class ComparedOptions:
     """The compared pipelines, and their inputs."""
 
     panel: ClassVar[str] = "Comparison"
-    nodes: Annotated[int, Option("N", "Target number of nodes of every mesh.", least=20)] = DEFAULT_SETTINGS.nodes
-    labels: Annotated[Path | None, Option("LABELS", "Label image, for tetopt and the pipelines that segment.")] = None
+    nodes: Annotated[int, Option("N", "Target number of nodes of every mesh.", least=20)] = (
+        DEFAULT_SETTINGS.nodes
+    )
+    labels: Annotated[
+        Path | None, Option("LABELS", "Label image, for tetopt and the pipelines that segment.")
+    ] = None
     label_names: LabelNamesOption = None
-    repeats: Annotated[int, Option("R", "Number of runs for meshers whose result varies.", least=1)] = (
-        DEFAULT_SETTINGS.repeats
-    )
-    pipelines: Annotated[str, Option("A,B,...", f"Pipelines, in order: some of {', '.join(PIPELINES)}.")] = ",".join(
-        PIPELINES
-    )
+    repeats: Annotated[
+        int, Option("R", "Number of runs for meshers whose result varies.", least=1)
+    ] = DEFAULT_SETTINGS.repeats
+    pipelines: Annotated[
+        str, Option("A,B,...", f"Pipelines, in order: some of {', '.join(PIPELINES)}.")
+    ] = ",".join(PIPELINES)
     programs: Annotated[
         list[str] | None,
         Option(
@@ -41,7 +45,9 @@ class ComparedOptions:
             "pipeline",
         ),
     ] = None
-    k_D: Annotated[float, Option("K", "Weight of the image on uniform meshes.", "k-d")] = DEFAULT_SETTINGS.k_D
+    k_D: Annotated[float, Option("K", "Weight of the image on uniform meshes.", "k-d")] = (
+        DEFAULT_SETTINGS.k_D
+    )
     classes: ClassesOption = DEFAULT_SETTINGS.classes
     part: BoxPart = WHOLE_BOX
 
@@ -53,14 +59,18 @@ class SimulationOptions:
     panel: ClassVar[str] = "Simulation"
     young: Annotated[
         str | None,
-        Option("MAPPING", "Modulus by intensity, as for `fem`. Default: 1 to 10 kPa over the image's range."),
+        Option(
+            "MAPPING",
+            "Modulus by intensity, as for `fem`. Default: 1 to 10 kPa over the image's range.",
+        ),
     ] = None
     average: Annotated[str, AVERAGE_OPTION] = DEFAULT_SETTINGS.average
     reference_dofs: Annotated[
         int | None,
         Option(
             "D",
-            "Most unknowns of the voxel reference: 0.5 GB and a minute per 100,000. Default: 300,000, or what fits.",
+            "Most unknowns of the voxel reference: 0.5 GB and a minute per 100,000. Default: "
+            "300,000, or what fits.",
             least=1000,
         ),
     ] = DEFAULT_SETTINGS.reference_dofs
@@ -71,7 +81,9 @@ class LimitOptions:
     """Limits of one run of a pipeline."""
 
     panel: ClassVar[str] = "Limits"
-    max_seconds: Annotated[float, Option("S", "Time limit of one run of a pipeline.")] = DEFAULT_SETTINGS.max_seconds
+    max_seconds: Annotated[float, Option("S", "Time limit of one run of a pipeline.")] = (
+        DEFAULT_SETTINGS.max_seconds
+    )
     max_gb: Annotated[float | None, Option("GB", "Memory limit of one run of a pipeline.")] = None
 
 
@@ -90,20 +102,30 @@ class CompareOptions(LimitOptions, SimulationOptions, ComparedOptions):
         names = [name.strip() for name in self.pipelines.split(",")]
         names += [each.name for each in programs if each.name not in names]
         return Settings(
-            nodes=self.nodes, pipelines=tuple(names), programs=programs,
-            repeats=self.repeats, classes=self.classes, k_D=self.k_D, reference_dofs=self.reference_dofs,
-            average=self.average, max_seconds=self.max_seconds,
+            nodes=self.nodes,
+            pipelines=tuple(names),
+            programs=programs,
+            repeats=self.repeats,
+            classes=self.classes,
+            k_D=self.k_D,
+            reference_dofs=self.reference_dofs,
+            average=self.average,
+            max_seconds=self.max_seconds,
             max_bytes=None if self.max_gb is None else int(self.max_gb * BYTES_PER_GB),
-        )  # fmt: skip
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
 class BaselineOptions:
     """Options of a conventional mesh."""
 
-    pipeline: Annotated[Literal["pytetwild"], Option(None, "The mesher of the conventional pipeline.")] = "pytetwild"
+    pipeline: Annotated[
+        Literal["pytetwild"], Option(None, "The mesher of the conventional pipeline.")
+    ] = "pytetwild"
     nodes: Annotated[int, Option("N", "Target number of nodes.", least=20)] = DEFAULT_NODES[3]
-    labels: Annotated[Path | None, Option("LABELS", "Label image instead of a segmentation of IMAGE.")] = None
+    labels: Annotated[
+        Path | None, Option("LABELS", "Label image instead of a segmentation of IMAGE.")
+    ] = None
     classes: ClassesOption = DEFAULT_SETTINGS.classes
     part: BoxPart = WHOLE_BOX
 
@@ -114,9 +136,13 @@ def _check_limit(name: str, limit: float | None) -> None:
 
 
 def _programs(texts: list[str]) -> tuple[Program, ...]:
-    """Parse the user's own pipelines; raise InputError for one that cannot be run, or a duplicate name."""
+    """Parse the user's own pipelines; raise InputError for one that cannot be run, or a
+    duplicate name.
+    """
     programs = tuple(map(parse_program, texts))
     names = [*PIPELINES, *(each.name for each in programs)]
     if twice := [name for number, name in enumerate(names) if name in names[:number]]:
-        raise InputError(f'`pipeline`: expected unique names, got "{twice[0]}" again; use another name')
+        raise InputError(
+            f'`pipeline`: expected unique names, got "{twice[0]}" again; use another name'
+        )
     return programs

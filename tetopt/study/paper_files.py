@@ -1,4 +1,6 @@
-"""All of the paper's experiments in one run: `paper.json`, a picture per figure, and `paper.html`."""
+"""All of the paper's experiments in one run: `paper.json`, a picture per figure, and
+`paper.html`.
+"""
 
 from __future__ import annotations
 
@@ -37,27 +39,40 @@ from tetopt.study import paper
 from tetopt.study.paper_figures import landscape_figure, relaxation_figure
 from tetopt.system.files import results_folder, save_json
 
-PAPER_PICTURES = ("fig1.png", "fig2.png", "fig2b.png", "fig3ab.png", "fig3cd.png", "fig3e.png", "fig3f.png")
+PAPER_PICTURES = (
+    "fig1.png",
+    "fig2.png",
+    "fig2b.png",
+    "fig3ab.png",
+    "fig3cd.png",
+    "fig3e.png",
+    "fig3f.png",
+)
 PAPER_FILES = ("paper.json", "paper.html", *PAPER_PICTURES)
 SNR_DB = (None, 30.0, 20.0)  # of the strain in Fig. 3(c, d); None: without noise
 CHANGE_WORDS = {  # of quantities compared before and after, by name in paper.json
-    "lambda_max": "largest eigenvalue", "cond": "condition number", "cg_iterations": "CG iterations",
+    "lambda_max": "largest eigenvalue",
+    "cond": "condition number",
+    "cg_iterations": "CG iterations",
     "strain_energy": "strain energy",
-}  # fmt: skip
+}
 
 
 def reproduce(
     output: Path, image_path: Path | None, labels_path: Path | None, seeds: int, force: bool = False
 ) -> tuple[Path, float]:
-    """Run every experiment, and write the files `PAPER_FILES` into a folder; return the page and the seconds taken.
+    """Run every experiment, and write the files `PAPER_FILES` into a folder; return the page and
+    the seconds taken.
 
     Parameters
     ----------
     output : Path
     image_path : Path or None
-        A brain MR volume with dark CSF, for Fig. 3(a, b, e, f) and the segmentation; None: nilearn's MNI152.
+        A brain MR volume with dark CSF, for Fig. 3(a, b, e, f) and the segmentation; None:
+        nilearn's MNI152.
     labels_path : Path or None
-        Its tissue labels, on the same voxels; None: those of the MNI152, or no section on segmentation.
+        Its tissue labels, on the same voxels; None: those of the MNI152, or no section on
+        segmentation.
     seeds : int
         Number of random meshes for Fig. 1.
     force : bool
@@ -76,7 +91,10 @@ def reproduce(
     if image_path is None and labels_path is None:
         tissue, labels_name = mni_tissue(), "MNI152 tissue"
     if min(volume.shape) < 16 or volume.range[0] == volume.range[1]:
-        raise InputError(f"paper: expected a brain volume of 16 voxels or more along each axis, got {volume.shape}")
+        raise InputError(
+            "paper: expected a brain volume of 16 voxels or more along each axis, got "
+            f"{volume.shape}"
+        )
     if tissue is None:
         note("the section on approximate segmentation is left out, as there are no `labels`")
     else:
@@ -85,10 +103,13 @@ def reproduce(
     about = {"image": source.name, "image_sha256": sha256(source), "labels": labels_name}
     begin = time.perf_counter()
     steps: dict[str, Callable[[], dict[str, Any]]] = {
-        "fig1": lambda: _figure_1(paths, seeds), "fig2": lambda: _figure_2(paths), "fig2b": lambda: _figure_2b(paths),
-        "fig3ab": lambda: _figure_3ab(paths, volume), "fig3cd": lambda: _figure_3cd(paths),
+        "fig1": lambda: _figure_1(paths, seeds),
+        "fig2": lambda: _figure_2(paths),
+        "fig2b": lambda: _figure_2b(paths),
+        "fig3ab": lambda: _figure_3ab(paths, volume),
+        "fig3cd": lambda: _figure_3cd(paths),
         "fig3ef": lambda: _figure_3ef(paths, volume),
-    }  # fmt: skip
+    }
     if tissue is not None:
         steps["segmentation"] = lambda: _segmentation(volume, tissue)
     sections = []
@@ -96,7 +117,12 @@ def reproduce(
         note(paper.printed()["sections"][name]["title"])
         sections.append(step())
     seconds = time.perf_counter() - begin
-    results = about | {"seeds": seeds, "versions": versions(), "seconds": seconds, "sections": sections}
+    results = about | {
+        "seeds": seeds,
+        "versions": versions(),
+        "seconds": seconds,
+        "sections": sections,
+    }
     save_json(paths["paper.json"], results)
     _write_page(paths, results)
     return paths["paper.html"], seconds
@@ -110,7 +136,12 @@ def _section(name: str, **values: float) -> dict[str, Any]:
 
 def _row(name: str, ours: Any, geometric_mean: float) -> dict[str, Any]:
     """Return a row of Table 1: printed and reproduced numbers."""
-    return {"name": name, **paper.printed()["table1"][name], "ours": list(ours), "geometric_mean": geometric_mean}
+    return {
+        "name": name,
+        **paper.printed()["table1"][name],
+        "ours": list(ours),
+        "geometric_mean": geometric_mean,
+    }
 
 
 def _row_of(name: str, mesh: Mesh) -> dict[str, Any]:
@@ -118,7 +149,11 @@ def _row_of(name: str, mesh: Mesh) -> dict[str, Any]:
 
 
 def _mesh_row(name: str, mesh: Mesh) -> dict[str, Any]:
-    return {"name": name, "paper": paper.printed()["meshes"][name], "ours": [len(mesh.points), len(mesh.cells)]}
+    return {
+        "name": name,
+        "paper": paper.printed()["meshes"][name],
+        "ours": [len(mesh.points), len(mesh.cells)],
+    }
 
 
 def _figure_1(paths: dict[str, Path], seeds: int) -> dict[str, Any]:
@@ -129,7 +164,10 @@ def _figure_1(paths: dict[str, Path], seeds: int) -> dict[str, Any]:
     for name, errors in spread.items():
         low, middle, high = np.percentile(errors, [5, 50, 95], axis=0)
         rows.append(_row(name, middle[:4], middle[4]) | {"p5": low, "p95": high})
-    return _section("fig1", seeds=seeds) | {"errors": rows, "pictures": [["fig1.png", "Fig. 1, seed 0"]]}
+    return _section("fig1", seeds=seeds) | {
+        "errors": rows,
+        "pictures": [["fig1.png", "Fig. 1, seed 0"]],
+    }
 
 
 def _figure_2(paths: dict[str, Path]) -> dict[str, Any]:
@@ -138,7 +176,9 @@ def _figure_2(paths: dict[str, Path]) -> dict[str, Any]:
     meshes = [("initial", initial)] + [(case.title, case.result.mesh) for case in cases]
     save_figure(slice_figure(cases[0].image, meshes), paths["fig2.png"])
     rows = [_row_of("fig2a", initial)]
-    rows += [_row_of(name, c.result.mesh) for name, c in zip(("fig2c", "fig2d"), cases, strict=True)]
+    rows += [
+        _row_of(name, c.result.mesh) for name, c in zip(("fig2c", "fig2d"), cases, strict=True)
+    ]
     truth = load_phantom("fig2_2d").label_image()
     overlaps = {
         "voxels": dice(thresholded(cases[1].image, 4), truth),
@@ -148,10 +188,14 @@ def _figure_2(paths: dict[str, Path]) -> dict[str, Any]:
     worst = cases[1].result.mesh
     flat = np.sort((0.5 - rho(worst.points, worst.cells)) ** 2)[-2:]
     return _section("fig2", flat=flat.sum()) | {
-        "errors": rows, "meshes": [_mesh_row("fig2a", initial)], "dice": overlaps,
+        "errors": rows,
+        "meshes": [_mesh_row("fig2a", initial)],
+        "dice": overlaps,
         "E_D_relative": {case.title: _E_D_relative(case) for case in cases},
-        "pictures": [["fig2.png", "Fig. 2(a, c, d): mesh over the phantom, and the mean in each cell"]],
-    }  # fmt: skip
+        "pictures": [
+            ["fig2.png", "Fig. 2(a, c, d): mesh over the phantom, and the mean in each cell"]
+        ],
+    }
 
 
 def _simulated(image: Image, mesh: Mesh) -> dict[str, float]:
@@ -166,26 +210,34 @@ def _E_D_relative(case: paper.Case) -> float:
 def _figure_2b(paths: dict[str, Path]) -> dict[str, Any]:
     landscapes = [paper.figure_2b(k_D) for k_D in (0.05, 0.3, 0.8)]
     save_figure(landscape_figure(landscapes), paths["fig2b.png"])
-    minima = [{"k_D": each.k_D, "lowest": each.E.min(), "found": each.E_minimum} for each in landscapes]
-    return _section("fig2b") | {"minima": minima, "pictures": [["fig2b.png", "Fig. 2(b), the descent's end in red"]]}
+    minima = [
+        {"k_D": each.k_D, "lowest": each.E.min(), "found": each.E_minimum} for each in landscapes
+    ]
+    return _section("fig2b") | {
+        "minima": minima,
+        "pictures": [["fig2b.png", "Fig. 2(b), the descent's end in red"]],
+    }
 
 
 def _figure_3ab(paths: dict[str, Path], volume: Image) -> dict[str, Any]:
     case = paper.figure_3ab(volume)
     save_figure(
-        slice_figure(case.image, [("initial", case.initial), ("k_D = 0.2", case.result.mesh)]), paths["fig3ab.png"]
+        slice_figure(case.image, [("initial", case.initial), ("k_D = 0.2", case.result.mesh)]),
+        paths["fig3ab.png"],
     )
     return _section("fig3ab") | {
-        "meshes": [_mesh_row("fig3a", case.initial)], "E_D_relative": {"k_D = 0.2": _E_D_relative(case)},
+        "meshes": [_mesh_row("fig3a", case.initial)],
+        "E_D_relative": {"k_D = 0.2": _E_D_relative(case)},
         "pictures": [["fig3ab.png", "Fig. 3(a, b): 128 nodes, before and after 20 iterations"]],
-    }  # fmt: skip
+    }
 
 
 def _figure_3cd(paths: dict[str, Path]) -> dict[str, Any]:
     cases = [paper.figure_3cd(snr) for snr in SNR_DB]
     shown = cases[1]
     save_figure(
-        slice_figure(shown.image, [("initial", shown.initial), (shown.title, shown.result.mesh)]), paths["fig3cd.png"]
+        slice_figure(shown.image, [("initial", shown.initial), (shown.title, shown.result.mesh)]),
+        paths["fig3cd.png"],
     )
     rows = [_row_of("fig3c", shown.initial)]
     rows += [_row_of("fig3d", case.result.mesh) | {"case": case.title} for case in cases]
@@ -195,30 +247,53 @@ def _figure_3cd(paths: dict[str, Path]) -> dict[str, Any]:
         change = {name: after[name] / before[name] - 1.0 for name in after}
         changes.append({"case": case.title, "before": before, "after": after, "change": change})
     return _section("fig3cd") | {
-        "errors": rows, "meshes": [_mesh_row("fig3c", shown.initial)], "simulation": changes,
+        "errors": rows,
+        "meshes": [_mesh_row("fig3c", shown.initial)],
+        "simulation": changes,
         "printed_change": paper.printed()["change"],
-        "pictures": [["fig3cd.png", "Fig. 3(c, d): approximate modulus, SNR 30 dB, before and after 15 iterations"]],
-    }  # fmt: skip
+        "pictures": [
+            [
+                "fig3cd.png",
+                "Fig. 3(c, d): approximate modulus, SNR 30 dB, before and after 15 iterations",
+            ]
+        ],
+    }
 
 
 def _figure_3ef(paths: dict[str, Path], volume: Image) -> dict[str, Any]:
     case = paper.figure_3ef(volume)
     image, initial, mesh = case.image, case.initial, case.result.mesh
     below = 0.6 * float(np.median(image.data[image.data > image.data.mean()]))
-    before, after = (largest_component(m.cells, cell_moments(image, m).mean < below) for m in (initial, mesh))
+    before, after = (
+        largest_component(m.cells, cell_moments(image, m).mean < below) for m in (initial, mesh)
+    )
     surface = dark_structure_surface(image, below, np.isin(cell_of_voxel(image, mesh), after))
     scenes = [("slices and part of the initial mesh", slices_in_mesh(image, initial))]
-    save_scenes(paths["fig3e.png"], [*scenes, ("surface from the voxels", isosurface_before_slices(image, surface))])
+    save_scenes(
+        paths["fig3e.png"],
+        [*scenes, ("surface from the voxels", isosurface_before_slices(image, surface))],
+    )
     shown = [("initial mesh", initial, before), ("optimised mesh", mesh, after)]
-    save_scenes(paths["fig3f.png"], [(title, structure_before_slices(image, m, cells)) for title, m, cells in shown])
+    save_scenes(
+        paths["fig3f.png"],
+        [(title, structure_before_slices(image, m, cells)) for title, m, cells in shown],
+    )
     return _section("fig3ef", below=below) | {
-        "meshes": [_mesh_row("fig3e", initial)], "E_D_relative": {"k_D = 0.3": _E_D_relative(case)},
+        "meshes": [_mesh_row("fig3e", initial)],
+        "E_D_relative": {"k_D = 0.3": _E_D_relative(case)},
         "structure": {"below": below, "n_cells_initial": len(before), "n_cells": len(after)},
         "pictures": [
-            ["fig3e.png", "Fig. 3(e): slices embedded in the initial mesh, of which the lower part is drawn; surface"],
-            ["fig3f.png", "Fig. 3(f): largest set of tetrahedra below the threshold, before and after"],
+            [
+                "fig3e.png",
+                "Fig. 3(e): slices embedded in the initial mesh, of which the lower part is "
+                "drawn; surface",
+            ],
+            [
+                "fig3f.png",
+                "Fig. 3(f): largest set of tetrahedra below the threshold, before and after",
+            ],
         ],
-    }  # fmt: skip
+    }
 
 
 def _segmentation(volume: Image, tissue: Image) -> dict[str, Any]:
@@ -234,8 +309,9 @@ def _segmentation(volume: Image, tissue: Image) -> dict[str, Any]:
     }
     ratio = volume.data.size / len(case.initial.cells)
     return _section("segmentation", ratio=ratio, nodes=len(case.initial.points)) | {
-        "dice": overlaps, "E_D_relative": {"k_D = 0.3": _E_D_relative(case)},
-    }  # fmt: skip
+        "dice": overlaps,
+        "E_D_relative": {"k_D = 0.3": _E_D_relative(case)},
+    }
 
 
 def _write_page(paths: dict[str, Path], results: dict[str, Any]) -> None:
@@ -244,6 +320,10 @@ def _write_page(paths: dict[str, Path], results: dict[str, Any]) -> None:
     if not any("dice" in section and "Section 5" in section["title"] for section in sections):
         intro += words["no_labels"]
     content = rendered(
-        "study/paper.html", intro=intro, sections=sections, change_words=CHANGE_WORDS, folder=paths["paper.html"].parent
+        "study/paper.html",
+        intro=intro,
+        sections=sections,
+        change_words=CHANGE_WORDS,
+        folder=paths["paper.html"].parent,
     )
     write_page(paths["paper.html"], "The paper's figures and table, reproduced", content)

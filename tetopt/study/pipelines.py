@@ -1,4 +1,6 @@
-"""Seven pipelines from an image to a mesh of its box with a requested number of nodes, with one signature."""
+"""Seven pipelines from an image to a mesh of its box with a requested number of nodes, with one
+signature.
+"""
 
 from __future__ import annotations
 
@@ -27,14 +29,16 @@ from tetopt.study.search import LEAST_REQUEST, REQUEST_RESPONSE, corners_for, tr
 from tetopt.study.tetwild import Filled, filled, node_spacing
 from tetopt.system.extras import install_hint
 
-LATTICE_RUNS = 4  # of the search for a lattice of order 2, at most; few are so coarse, and a run takes milliseconds
+# of the search for a lattice of order 2, at most; few are so coarse, and a run takes milliseconds
+LATTICE_RUNS = 4
 
 
 class PipelineInput(NamedTuple):
     """Input of every pipeline."""
 
     image: Image  # 3-D
-    labels: Image | None  # a given segmentation, on the image's voxels; without it, pipelines segment themselves
+    # a given segmentation, on the image's voxels; without it, pipelines segment themselves
+    labels: Image | None
     nodes: int  # requested, in all
     classes: int = OTSU_CLASSES
     k_D: float = UNIFORM_K_D  # of uniform meshes; the graded one has its own
@@ -49,7 +53,8 @@ class Produced(NamedTuple):
     mesh: Mesh  # fills the image's box, unless a note says otherwise
     seconds: dict[str, float]  # by step, in their order
     notes: list[str]
-    labels: NDArray[np.int64] | None = None  # (M,) of each cell, from the job's; -1, or None: those of most voxels
+    # (M,) of each cell, from the job's; -1, or None: those of most voxels
+    labels: NDArray[np.int64] | None = None
 
 
 UNTIMED_STEPS = {  # steps that a run's total leaves out, and why
@@ -78,15 +83,21 @@ def bcc(job: PipelineInput) -> Produced:
     with _timed(seconds, "lattice"):
         first = corners_for(job.nodes, job.order) / job.nodes
         runs = tries(
-            lambda factor: lattice_mesh(job.image, nodes=max(round(factor * job.nodes), LEAST_REQUEST)),
+            lambda factor: lattice_mesh(
+                job.image, nodes=max(round(factor * job.nodes), LEAST_REQUEST)
+            ),
             lambda mesh: node_count(mesh.points, mesh.cells, job.order),
-            job.nodes, REQUEST_RESPONSE, first=first, most=1 if job.order == 1 else LATTICE_RUNS,
-        )  # fmt: skip
+            job.nodes,
+            REQUEST_RESPONSE,
+            first=first,
+            most=1 if job.order == 1 else LATTICE_RUNS,
+        )
     return Produced(runs[0].result, seconds, [])
 
 
 def ours(job: PipelineInput, mode: Mode) -> Produced:
-    """Run `tetopt.mesh_image`: graded with its defaults, else by the job; the paper's scheme uses only the image.
+    """Run `tetopt.mesh_image`: graded with its defaults, else by the job; the paper's scheme uses
+    only the image.
 
     Raises
     ------
@@ -97,8 +108,12 @@ def ours(job: PipelineInput, mode: Mode) -> Produced:
     k_D, iterations = MODE_DEFAULTS[mode][:2] if mode == "graded" else (job.k_D, job.iterations)
     content, notes = (job.image, list[str]()) if mode == "paper" else _content(job, seconds)
     with _timed(seconds, "kernels"):
-        prepare_kernels(content, k_D, "paper" if mode == "paper" else "fast", is_graded=mode == "graded")
-    result = mesh_image(content, job.nodes, mode=mode, k_D=k_D, iterations=iterations, order=job.order)
+        prepare_kernels(
+            content, k_D, "paper" if mode == "paper" else "fast", is_graded=mode == "graded"
+        )
+    result = mesh_image(
+        content, job.nodes, mode=mode, k_D=k_D, iterations=iterations, order=job.order
+    )
     seconds["octree" if mode == "graded" else "lattice"] = result.seconds_start
     seconds["optimize"] = result.seconds_run
     # The reference supports only straight edges, which the other pipelines' meshes have.
@@ -112,13 +127,19 @@ def _content(job: PipelineInput, seconds: dict[str, float]) -> tuple[Image | Con
         return job.image, []
     with _timed(seconds, "labels"):
         if np.array_equal(job.image.data, job.labels.data):
-            # Label numbers are meaningless as intensities: label 9 is no farther from 1 than label 2.
-            return content(job.image, labels=job.labels, weights=[0.0]), ["the image is a label map: meshed as labels"]
-        return content(job.image, labels=job.labels), ["meshed from the image and the given labels, equally weighted"]
+            # Label numbers are meaningless as intensities: label 9 is no farther from 1 than label
+            # 2.
+            return content(job.image, labels=job.labels, weights=[0.0]), [
+                "the image is a label map: meshed as labels"
+            ]
+        return content(job.image, labels=job.labels), [
+            "meshed from the image and the given labels, equally weighted"
+        ]
 
 
 def pytetwild(job: PipelineInput) -> Produced:
-    """Extract interfaces of classes or labels, and run fTetWild with a sizing field around them; see `tetwild`.
+    """Extract interfaces of classes or labels, and run fTetWild with a sizing field around them;
+    see `tetwild`.
 
     Raises
     ------
@@ -128,14 +149,17 @@ def pytetwild(job: PipelineInput) -> Produced:
     seconds: dict[str, float] = {}
     size = node_spacing(job.image, corners_for(job.nodes, job.order))
     with _timed(seconds, "surfaces"):
-        surfaces = interfaces(job.image, size, classes=job.classes, labels=job.labels, smoothing=job.smoothing)
+        surfaces = interfaces(
+            job.image, size, classes=job.classes, labels=job.labels, smoothing=job.smoothing
+        )
     with _timed(seconds, "tetrahedra"):
         result = filled(job.image, surfaces, job.nodes, job.order)
     return _searched(result, seconds, surfaces.notes)
 
 
 def mmg(job: PipelineInput) -> Produced:
-    """Label a fine lattice by classes or labels, and coarsen it by Mmg, which keeps them; see `mmg`.
+    """Label a fine lattice by classes or labels, and coarsen it by Mmg, which keeps them; see
+    `mmg`.
 
     Raises
     ------
@@ -157,7 +181,9 @@ def _searched(result: Filled, seconds: dict[str, float], notes: list[str]) -> Pr
 
 
 class Pipeline(NamedTuple):
-    """A pipeline: its title and description, its function, and whether its result varies between runs."""
+    """A pipeline: its title and description, its function, and whether its result varies between
+    runs.
+    """
 
     title: str
     kind: str  # "tetopt", "peer" or "control"
@@ -170,30 +196,49 @@ class Pipeline(NamedTuple):
     @property
     def missing(self) -> str | None:
         """How to install what the pipeline needs and this machine lacks, in words."""
-        return None if all(map(find_spec, self.packages)) else f"{self.title}: not installed; {self.hint}"
+        return (
+            None
+            if all(map(find_spec, self.packages))
+            else f"{self.title}: not installed; {self.hint}"
+        )
 
 
 PIPELINES = {
     "tetopt": Pipeline(
-        "tetopt", "tetopt", "tetopt mesh with its defaults: nodes where the image, or given labels, have detail",
+        "tetopt",
+        "tetopt",
+        "tetopt mesh with its defaults: nodes where the image, or given labels, have detail",
         partial(ours, mode="graded"),
     ),
     "tetopt-uniform": Pipeline(
-        "tetopt, uniform", "tetopt", "tetopt mesh --uniform: BCC lattice, fast engine, with given labels",
+        "tetopt, uniform",
+        "tetopt",
+        "tetopt mesh --uniform: BCC lattice, fast engine, with given labels",
         partial(ours, mode="uniform"),
     ),
     "tetopt-paper": Pipeline(
-        "tetopt, paper's scheme", "tetopt", "tetopt mesh --method paper, from the image alone",
+        "tetopt, paper's scheme",
+        "tetopt",
+        "tetopt mesh --method paper, from the image alone",
         partial(ours, mode="paper"),
     ),
     "pytetwild": Pipeline(
-        "pytetwild", "peer", "surfaces of multi-Otsu classes or of given labels, meshed by fTetWild",
-        pytetwild, is_random=True, packages=("pytetwild",),
+        "pytetwild",
+        "peer",
+        "surfaces of multi-Otsu classes or of given labels, meshed by fTetWild",
+        pytetwild,
+        is_random=True,
+        packages=("pytetwild",),
         hint=f"install it with: {install_hint('pytetwild')}",
     ),
     "mmg": Pipeline(
-        "Mmg", "peer", "a lattice labelled by multi-Otsu classes or given labels, coarsened by Mmg, which keeps labels",
-        mmg, packages=("mmgpy",), hint=f"install it with: {install_hint('mmgpy')}",
+        "Mmg",
+        "peer",
+        "a lattice labelled by multi-Otsu classes or given labels, coarsened by Mmg, which keeps "
+        "labels",
+        mmg,
+        packages=("mmgpy",),
+        hint=f"install it with: {install_hint('mmgpy')}",
     ),
     "bcc": Pipeline("BCC lattice", "control", "the uniform lattice, not optimised", bcc),
-}  # fmt: skip
+}

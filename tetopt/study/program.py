@@ -1,7 +1,8 @@
 """The user's own mesher in the comparison: a program that reads NIfTI files and writes a mesh.
 
-Its command line is split into arguments as by a shell, and their placeholders are replaced; no shell is involved. It
-runs in the current folder of `tetopt`; image, labels and mesh are in a temporary folder.
+Its command line is split into arguments as by a shell, and their placeholders are replaced; no
+shell is involved. It runs in the current folder of `tetopt`; image, labels and mesh are in a
+temporary folder.
 """
 
 from __future__ import annotations
@@ -38,9 +39,12 @@ from tetopt.study.tetwild import node_spacing, put_on_box
 from tetopt.system.child import signal_words
 from tetopt.system.interpreter import others_environment
 
-PROGRAM_RUNS = 5  # of one search, at most; the first requests the target, and the second is usually close
-NEAR_BOX_VOXELS = 1.0  # distance from the box's sides below which a mesh's boundary is moved onto them
-ROUGH_SIDE_VOXELS = 1e-3  # a node this near to a side is on it: CGAL finds the points of a surface to 1e-4 voxel
+# of one search, at most; the first requests the target, and the second is usually close
+PROGRAM_RUNS = 5
+# distance from the box's sides below which a mesh's boundary is moved onto them
+NEAR_BOX_VOXELS = 1.0
+# a node this near to a side is on it: CGAL finds the points of a surface to 1e-4 voxel
+ROUGH_SIDE_VOXELS = 1e-3
 PLACEHOLDERS = ("image", "labels", "nodes", "size", "output")
 PROGRAM_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,39}")
 
@@ -55,21 +59,23 @@ class Program(NamedTuple):
 def parse_program(text: str) -> Program:
     """Parse and check a program such as "cgal=cgal_mesh {labels} --size {size} -o {output}".
 
-    Placeholders: ``{image}`` and ``{labels}``, paths of NIfTI files (without labels, of multi-Otsu classes);
-    ``{nodes}``, the requested number of nodes; ``{size}``, the edge length, mm, at which regular tetrahedra fill the
-    box with that many; ``{output}``, the path of the mesh to write, which ends in .vtu unless a suffix follows, as in
-    ``{output}.msh``.
+    Placeholders: ``{image}`` and ``{labels}``, paths of NIfTI files (without labels, of multi-Otsu
+    classes); ``{nodes}``, the requested number of nodes; ``{size}``, the edge length, mm, at which
+    regular tetrahedra fill the box with that many; ``{output}``, the path of the mesh to write,
+    which ends in .vtu unless a suffix follows, as in ``{output}.msh``.
 
     Raises
     ------
     InputError
-        The name is missing or not a plain word; the command cannot be split, has an unknown placeholder, lacks
-        ``{output}``, or has neither ``{image}`` nor ``{labels}``; the program does not exist, or cannot be run.
+        The name is missing or not a plain word; the command cannot be split, has an unknown
+        placeholder, lacks ``{output}``, or has neither ``{image}`` nor ``{labels}``; the program
+        does not exist, or cannot be run.
     """
     name, equals, command = text.partition("=")
     if not equals or not PROGRAM_NAME.fullmatch(name):
         raise InputError(
-            f"`pipeline`: expected NAME='program {{image}} {{nodes}} {{output}}' with a name of letters, digits, - and "
+            f"`pipeline`: expected NAME='program {{image}} {{nodes}} {{output}}' with a name of "
+            "letters, digits, - and "
             f'_, got "{text}"'
         )
     where = f"`pipeline` {name}"
@@ -79,15 +85,25 @@ def parse_program(text: str) -> Program:
         raise InputError(f"{where}: unbalanced quotes ({error}): {command}") from error
     used = {key for word in words for key in re.findall(r"\{(\w*)\}", word)}
     if unknown := sorted(used - set(PLACEHOLDERS)):
-        raise InputError(f"{where}: unknown placeholder {{{unknown[0]}}}; use {_braced(PLACEHOLDERS)}")
+        raise InputError(
+            f"{where}: unknown placeholder {{{unknown[0]}}}; use {_braced(PLACEHOLDERS)}"
+        )
     if "output" not in used or not used & {"image", "labels"}:
-        raise InputError(f"{where}: expected {{output}}, and {{image}} or {{labels}} or both, got: {command}")
+        raise InputError(
+            f"{where}: expected {{output}}, and {{image}} or {{labels}} or both, got: {command}"
+        )
     for word in words:
         suffix = _suffix(word)
         if suffix is not None and suffix not in MESH_SUFFIXES:
-            raise InputError(f"{where}: the mesh's name must end in {', '.join(MESH_SUFFIXES)}, got {{output}}{suffix}")
+            raise InputError(
+                f"{where}: the mesh's name must end in {', '.join(MESH_SUFFIXES)}, got "
+                f"{{output}}{suffix}"
+            )
     if shutil.which(words[0]) is None:
-        raise InputError(f'{where}: found no executable program "{words[0]}"; give its path, or add its folder to PATH')
+        raise InputError(
+            f'{where}: found no executable program "{words[0]}"; give its path, or add its '
+            "folder to PATH"
+        )
     return Program(name, command)
 
 
@@ -102,15 +118,16 @@ def _suffix(word: str) -> str | None:
 
 
 def by_program(job: PipelineInput, program: Program) -> Produced:
-    """Return the program's mesh with about the job's number of nodes, its boundary on the box if it lies close.
+    """Return the program's mesh with about the job's number of nodes, its boundary on the box if it
+    lies close.
 
     The request is corrected up to four times until the number of nodes is within 5 %.
 
     Raises
     ------
     InputError
-        The program's exit code is not 0, or it wrote no readable mesh; the message has the last line of its standard
-        error.
+        The program's exit code is not 0, or it wrote no readable mesh; the message has the last
+        line of its standard error.
     """
     words = shlex.split(program.command)
     suffix = next(suffix for word in words if (suffix := _suffix(word)) is not None)
@@ -122,9 +139,16 @@ def by_program(job: PipelineInput, program: Program) -> Produced:
 
         def run(factor: float) -> MeshFile | None:
             request = max(round(factor * job.nodes), LEAST_REQUEST)
-            values = paths | {"nodes": str(request), "size": f"{node_spacing(job.image, request):.6g}"}
+            values = paths | {
+                "nodes": str(request),
+                "size": f"{node_spacing(job.image, request):.6g}",
+            }
             try:
-                loaded = _run(program.name, [_filled(word, values) for word in words], Path(values["output"] + suffix))
+                loaded = _run(
+                    program.name,
+                    [_filled(word, values) for word in words],
+                    Path(values["output"] + suffix),
+                )
             except InputError as error:
                 if not sizes:
                     raise
@@ -152,12 +176,17 @@ def _inputs(folder: Path, job: PipelineInput, command: str) -> dict[str, str]:
     if "{image}" in command:
         save_image(paths["image"], job.image)
     if "{labels}" in command:
-        save_image(paths["labels"], class_labels(job.image, job.classes) if job.labels is None else job.labels)
+        save_image(
+            paths["labels"],
+            class_labels(job.image, job.classes) if job.labels is None else job.labels,
+        )
     return paths | {"output": str(folder / "mesh")}
 
 
 def _filled(word: str, values: dict[str, str]) -> str:
-    """Replace the placeholders in an argument; the mesh is a VTU file unless a suffix follows its placeholder."""
+    """Replace the placeholders in an argument; the mesh is a VTU file unless a suffix follows
+    its placeholder.
+    """
     word = re.sub(r"\{output\}(?!\.\w)", "{output}.vtu", word)
     return re.sub(r"\{(\w+)\}", lambda match: values[match[1]], word)
 
@@ -165,7 +194,8 @@ def _filled(word: str, values: dict[str, str]) -> str:
 def _own_labels(
     loaded: MeshFile, kept: NDArray[np.int64], job: PipelineInput
 ) -> tuple[NDArray[np.int64] | None, list[str]]:
-    """Return the labels of the kept cells from the field "label" of a program's file; -1 for labels not in the image.
+    """Return the labels of the kept cells from the field "label" of a program's file; -1 for labels
+    not in the image.
 
     A label that all cells share is the number of a file's only part.
     """
@@ -182,9 +212,13 @@ def _run(name: str, command: list[str], output: Path) -> MeshFile:
     output.unlink(missing_ok=True)
     try:
         done = subprocess.run(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, check=False,
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            check=False,
             env=others_environment(),
-        )  # fmt: skip
+        )
     except OSError as error:
         raise InputError(f"{name}: cannot be run ({error})") from error
     line = last_line(done.stderr.decode(errors="replace"))
@@ -202,20 +236,28 @@ def _run(name: str, command: list[str], output: Path) -> MeshFile:
 
 
 def boxed(image: Image, mesh: Mesh) -> tuple[Mesh, NDArray[np.int64], list[str]]:
-    """Move a mesh's boundary onto the sides of the image's box if close; return the mesh, its cells, and notes.
+    """Move a mesh's boundary onto the sides of the image's box if close; return the mesh, its
+    cells, and notes.
 
-    A mesh whose boundary is farther away than `NEAR_BOX_VOXELS`, or which would not fill the box, is unchanged.
+    A mesh whose boundary is farther away than `NEAR_BOX_VOXELS`, or which would not fill the box,
+    is unchanged.
     """
     sides, every = box_sides(image.shape), np.arange(len(mesh.cells))
     index = image.to_index(mesh.points)
     facets = boundary_facets(mesh.cells)
-    off = np.abs(index[facets][..., None] - sides).max(axis=1).reshape(len(facets), -1)  # of each of the six sides
+    # of each of the six sides
+    off = np.abs(index[facets][..., None] - sides).max(axis=1).reshape(len(facets), -1)
     distance = float(off.min(axis=1).max())
     if distance <= ON_SIDE_VOXELS:
         return mesh, every, []
     if distance > NEAR_BOX_VOXELS:
-        return mesh, every, [f"its boundary lies up to {distance:.3g} voxels from the sides of the image's box"]
-    # Stretched onto the box first, which inverts no cell: a mesh of padded labels is half a voxel too wide.
+        return (
+            mesh,
+            every,
+            [f"its boundary lies up to {distance:.3g} voxels from the sides of the image's box"],
+        )
+    # Stretched onto the box first, which inverts no cell: a mesh of padded labels is half a voxel
+    # too wide.
     low, high = index.min(axis=0), index.max(axis=0)
     index = sides[:, 0] + (index - low) * (sides[:, 1] - sides[:, 0]) / (high - low)
     # Nodes that belong on a side may lie under flat cells, where `put_on_box` does not find them.
@@ -223,17 +265,23 @@ def boxed(image: Image, mesh: Mesh) -> tuple[Mesh, NDArray[np.int64], list[str]]
         index = np.where(np.abs(index - sides[:, side]) <= ROUGH_SIDE_VOXELS, sides[:, side], index)
     is_flat = np.any(np.all(is_on_sides(index, sides, 0.0)[mesh.cells], axis=1), axis=(1, 2))
     try:
-        points, cells, kept = put_on_box(index * image.spacing, mesh.cells[~is_flat], *(sides.T * image.spacing))
+        points, cells, kept = put_on_box(
+            index * image.spacing, mesh.cells[~is_flat], *(sides.T * image.spacing)
+        )
     except InputError as error:
         return mesh, every, [f"its boundary is not on the box's faces: {error}"]
     world = image.to_world(points / image.spacing)
-    note = f"its boundary was moved by up to {distance:.2g} voxels onto the sides of the image's box"
+    note = (
+        f"its boundary was moved by up to {distance:.2g} voxels onto the sides of the image's box"
+    )
     return Mesh(world, oriented(world, cells)), every[~is_flat][kept], [note]
 
 
 def pipelines_with(programs: Sequence[Program]) -> dict[str, Pipeline]:
     """Return all pipelines by name, the user's programs last."""
     return PIPELINES | {
-        each.name: Pipeline(each.name, "peer", f"a program: {each.command}", partial(by_program, program=each))
+        each.name: Pipeline(
+            each.name, "peer", f"a program: {each.command}", partial(by_program, program=each)
+        )
         for each in programs
     }

@@ -1,4 +1,5 @@
-"""Search for a requested number of nodes with meshers that do not accept one: repeated runs with other factors.
+"""Search for a requested number of nodes with meshers that do not accept one: repeated runs with
+other factors.
 
 Nodes are counted by the cells' order: quadratic cells also have mid-edge nodes.
 """
@@ -19,7 +20,9 @@ NODE_TOLERANCE = 0.05  # of the requested number of nodes: the tolerance that en
 
 
 class Response(NamedTuple):
-    """Response of the number of nodes to a mesher's factor: d log nodes / d log factor, and the step limits."""
+    """Response of the number of nodes to a mesher's factor: d log nodes / d log factor, and the
+    step limits.
+    """
 
     guess: float  # before two runs measure it
     low: float  # limits of the measured slope
@@ -28,7 +31,8 @@ class Response(NamedTuple):
     after_failure: float  # multiplier of the factor after a run without a mesh
 
 
-# Response to the requested number: about proportional. Failed runs are more often too coarse than too fine.
+# Response to the requested number: about proportional. Failed runs are more often too coarse than
+# too fine.
 REQUEST_RESPONSE = Response(1.0, 0.3, 3.0, step=4.0, after_failure=1.25)
 LEAST_REQUEST = 8  # nodes: the corners of a box
 
@@ -51,7 +55,8 @@ def tries(
     first: float = 1.0,
     most: int,
 ) -> list[Try[Result]]:
-    """Run with successive factors until the number of nodes is within 5 % of `nodes`; return the closest run first.
+    """Run with successive factors until the number of nodes is within 5 % of `nodes`; return the
+    closest run first.
 
     Parameters
     ----------
@@ -82,7 +87,9 @@ def tries(
 
 
 def corners_for(nodes: int, order: int) -> int:
-    """Estimate the number of corners of a mesh whose cells of this order have `nodes` nodes in total."""
+    """Estimate the number of corners of a mesh whose cells of this order have `nodes` nodes in
+    total.
+    """
     return max(nodes if order == 1 else round(nodes / QUADRATIC_NODES[3]), LEAST_REQUEST)
 
 
@@ -92,7 +99,9 @@ def is_near(count: int, nodes: int) -> bool:
 
 
 def next_factor(tried: list[tuple[float, int]], nodes: int, response: Response) -> float:
-    """Return the factor at which the secant of log nodes over log factor reaches `nodes`, at most one step away."""
+    """Return the factor at which the secant of log nodes over log factor reaches `nodes`, at
+    most one step away.
+    """
     x, y = np.log(np.array(tried, dtype=np.float64)).T
     goal = np.log(nodes)
     slope = response.guess

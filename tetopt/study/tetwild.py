@@ -1,17 +1,20 @@
-"""fTetWild (Hu, Schneider, Wang, Zorin, Panozzo 2020) through pytetwild, on the soup of interfaces and box.
+"""fTetWild (Hu, Schneider, Wang, Zorin, Panozzo 2020) through pytetwild, on the soup of interfaces
+and box.
 
-One factor scales the sizing field and, with its 8th power, the envelope: if the interfaces alone need more nodes than
-requested, only a wider envelope helps. Measurements behind the choices, with E_D as a fraction of the image's variance:
+One factor scales the sizing field and, with its 8th power, the envelope: if the interfaces alone
+need more nodes than requested, only a wider envelope helps. Measurements behind the choices, with
+E_D as a fraction of the image's variance:
 
-- MNI T1, 4 classes, 5000 nodes. With an envelope of 1.35 mm, edges of 13, 25 and 49 mm give 16,755, 15,951 and 15,635
-  nodes; with 3 mm and triangles of 16 mm, 4694 nodes: 0.0342 (`coarsen`: 3793 nodes, 0.0391); currently (3.2 mm,
-  triangles of 9.4 mm), 5090 nodes: 0.0312, mean rho 0.248, smallest angle 12.9 degrees, 173 s for 3 runs on a busy
-  two-core machine.
-- Sphere phantom, 1500 nodes, fixed envelope: 0.0093 uniform and 0.0092 with the sizing field at 0.13 mm, 0.0149 and
-  0.0131 at 0.63 mm; coarser triangles 0.0137 and 0.0119. Currently: 0.0103, which tuning by hand can reduce by a
-  tenth. Two spheres, currently: 0.0715 for 2 classes (too few), 0.0170 for 3, 0.0081 for 4.
-- The soup, not `tetrahedralize_csg`, which accepts no sizing field, and needs 5566 nodes for the sphere at 0.0100,
-  where the soup has 0.0103 with 1499.
+- MNI T1, 4 classes, 5000 nodes. With an envelope of 1.35 mm, edges of 13, 25 and 49 mm give 16,755,
+  15,951 and 15,635 nodes; with 3 mm and triangles of 16 mm, 4694 nodes: 0.0342 (`coarsen`: 3793
+  nodes, 0.0391); currently (3.2 mm, triangles of 9.4 mm), 5090 nodes: 0.0312, mean rho 0.248,
+  smallest angle 12.9 degrees, 173 s for 3 runs on a busy two-core machine.
+- Sphere phantom, 1500 nodes, fixed envelope: 0.0093 uniform and 0.0092 with the sizing field at
+  0.13 mm, 0.0149 and 0.0131 at 0.63 mm; coarser triangles 0.0137 and 0.0119. Currently: 0.0103,
+  which tuning by hand can reduce by a tenth. Two spheres, currently: 0.0715 for 2 classes (too
+  few), 0.0170 for 3, 0.0081 for 4.
+- The soup, not `tetrahedralize_csg`, which accepts no sizing field, and needs 5566 nodes for the
+  sphere at 0.0100, where the soup has 0.0103 with 1499.
 """
 
 from __future__ import annotations
@@ -35,14 +38,19 @@ from tetopt.study.interfaces import Surfaces, compacted
 from tetopt.study.search import Response, corners_for, is_near, tries
 
 TETWILD_RUNS = 6  # of one search, at most; each takes about as long as the result's
-TETWILD_RESPONSE = Response(-5.0, -12.0, -2.0, step=1.5, after_failure=0.83)  # measured slopes are -3 to -9
-ENVELOPE_FRACTION = 0.2  # distance that fTetWild may move a surface, over the edge of regular cells, at factor 1
-ENVELOPE_EXPONENT = 8.0  # of the factor in the envelope: simple shapes, with small factors, are met closely
+# measured slopes are -3 to -9
+TETWILD_RESPONSE = Response(-5.0, -12.0, -2.0, step=1.5, after_failure=0.83)
+# distance that fTetWild may move a surface, over the edge of regular cells, at factor 1
+ENVELOPE_FRACTION = 0.2
+# of the factor in the envelope: simple shapes, with small factors, are met closely
+ENVELOPE_EXPONENT = 8.0
 EDGE_GROWTH = 0.6  # mm by which edges lengthen per mm of distance from the interfaces
 EDGE_RATIO = 3.0  # edge far away over edge at the interfaces
 STOP_ENERGY = 10.0  # of fTetWild's cells (AMIPS; regular: 3), at which it stops: its default
-LEAST_SHAPE = 2e-3  # volume over the longest edge's cube (regular: 0.118) below which a cell is repaired
-UNTANGLING_ROUNDS = 60  # after the boundary is on the box; cells still inverted then cannot be repaired this way
+# volume over the longest edge's cube (regular: 0.118) below which a cell is repaired
+LEAST_SHAPE = 2e-3
+# after the boundary is on the box; cells still inverted then cannot be repaired this way
+UNTANGLING_ROUNDS = 60
 
 
 class Filled(NamedTuple):
@@ -55,15 +63,19 @@ class Filled(NamedTuple):
 
 
 def node_spacing(image: Image, nodes: int) -> float:
-    """Return the edge length, mm, at which regular tetrahedra fill the image's box with this many nodes."""
+    """Return the edge length, mm, at which regular tetrahedra fill the image's box with this
+    many nodes.
+    """
     return float((np.sqrt(2.0) * image.volume / nodes) ** (1.0 / 3.0))
 
 
 def filled(image: Image, surfaces: Surfaces, nodes: int, order: int = 1) -> Filled:
-    """Fill the image's box with tetrahedra that have facets along the surfaces, and about `nodes` nodes.
+    """Fill the image's box with tetrahedra that have facets along the surfaces, and about `nodes`
+    nodes.
 
-    The factor on the sizing field and the envelope is searched, by secants of log nodes over log factor, until the
-    number of nodes is within 5 % of the requested one, in at most 6 runs; the closest is used.
+    The factor on the sizing field and the envelope is searched, by secants of log nodes over log
+    factor, until the number of nodes is within 5 % of the requested one, in at most 6 runs; the
+    closest is used.
 
     Parameters
     ----------
@@ -79,8 +91,8 @@ def filled(image: Image, surfaces: Surfaces, nodes: int, order: int = 1) -> Fill
     Returns
     -------
     Filled
-        Mesh in the world with positively oriented cells and its boundary on the box's faces; a note if the number of
-        nodes was missed.
+        Mesh in the world with positively oriented cells and its boundary on the box's faces; a note
+        if the number of nodes was missed.
 
     Raises
     ------
@@ -95,7 +107,9 @@ def filled(image: Image, surfaces: Surfaces, nodes: int, order: int = 1) -> Fill
         envelope = ENVELOPE_FRACTION * spacing * factor**ENVELOPE_EXPONENT
         return _run(tetrahedralize, surfaces, factor * spacing, envelope)
 
-    runs = tries(run, lambda made: node_count(*made, order), nodes, TETWILD_RESPONSE, most=TETWILD_RUNS)
+    runs = tries(
+        run, lambda made: node_count(*made, order), nodes, TETWILD_RESPONSE, most=TETWILD_RUNS
+    )
     notes: list[str] = []
     for each in runs:
         try:
@@ -109,11 +123,16 @@ def filled(image: Image, surfaces: Surfaces, nodes: int, order: int = 1) -> Fill
             notes.append(f"{n_nodes} nodes after {len(runs)} runs of fTetWild; requested: {nodes}")
         search = sum(other.seconds for other in runs) - each.seconds
         return Filled(Mesh(world, oriented(world, cells)), len(runs), search, notes)
-    raise InputError(f"pytetwild: none of {len(runs)} meshes could be fitted to the box; request more nodes")
+    raise InputError(
+        f"pytetwild: none of {len(runs)} meshes could be fitted to the box; request more nodes"
+    )
 
 
 def _run(
-    tetrahedralize: Callable[..., tuple[NDArray, NDArray]], surfaces: Surfaces, edge: float, envelope: float
+    tetrahedralize: Callable[..., tuple[NDArray, NDArray]],
+    surfaces: Surfaces,
+    edge: float,
+    envelope: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Run fTetWild once, in the box frame; return the cells inside the box and their nodes."""
     diagonal = float(np.linalg.norm(surfaces.high - surfaces.low))
@@ -124,20 +143,25 @@ def _run(
         edge_length_abs=float(field[2].max()),
         epsilon=envelope / diagonal,
         stop_energy=STOP_ENERGY,
-        # Unfiltered: winding numbers would drop the inside of nested or open interfaces. Cells outside the box
-        # are dropped here.
+        # Unfiltered: winding numbers would drop the inside of nested or open interfaces. Cells
+        # outside the box are dropped here.
         disable_filtering=True,
         quiet=True,
         bg_vertices=field[0],
         bg_tets=field[1],
         bg_values=field[2],
     )
-    points, cells = inside_box(np.asarray(points, dtype=np.float64), cells, surfaces.low, surfaces.high)
+    points, cells = inside_box(
+        np.asarray(points, dtype=np.float64), cells, surfaces.low, surfaces.high
+    )
     return points, oriented(points, cells)
 
 
 def inside_box(
-    points: NDArray[np.float64], cells: NDArray[np.integer], low: NDArray[np.float64], high: NDArray[np.float64]
+    points: NDArray[np.float64],
+    cells: NDArray[np.integer],
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return the cells with their centroid in the box, and their nodes."""
     middles = points[cells].mean(axis=1)
@@ -145,27 +169,37 @@ def inside_box(
 
 
 def _sizing_field(surfaces: Surfaces, edge: float) -> tuple[NDArray, NDArray, NDArray]:
-    """Return lattice points, tetrahedra and target edges: `edge` at the interfaces, growing with the distance."""
+    """Return lattice points, tetrahedra and target edges: `edge` at the interfaces, growing with
+    the distance.
+    """
     size = surfaces.high - surfaces.low
     blocks = tuple(int(b) for b in np.clip(np.ceil(size / (0.75 * edge)), 2, 40))
     unit = lattice_mesh(Image(np.zeros((2, 2, 2))), "five-tet", blocks=blocks)
     middle = 0.5 * (surfaces.low + surfaces.high)
-    points = middle + 1.01 * ((unit.points + 0.5) / 2.0 - 0.5) * size  # slightly larger than the box, for all nodes
+    # slightly larger than the box, for all nodes
+    points = middle + 1.01 * ((unit.points + 0.5) / 2.0 - 0.5) * size
     facets = surfaces.points[surfaces.triangles[: -surfaces.n_box]]
     if len(facets) == 0:
         return points, unit.cells.astype(np.int32), np.full(len(points), edge)
     distance = cKDTree(np.vstack([facets.mean(axis=1), facets.reshape(-1, 3)])).query(points)[0]
-    values = edge * np.minimum(1.0 + EDGE_GROWTH * np.maximum(distance - edge, 0.0) / edge, EDGE_RATIO)
+    values = edge * np.minimum(
+        1.0 + EDGE_GROWTH * np.maximum(distance - edge, 0.0) / edge, EDGE_RATIO
+    )
     return points, unit.cells.astype(np.int32), values
 
 
 def put_on_box(
-    points: NDArray[np.float64], cells: NDArray[np.int64], low: NDArray[np.float64], high: NDArray[np.float64]
+    points: NDArray[np.float64],
+    cells: NDArray[np.int64],
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
-    """Move a mesh's boundary, which runs along the box's faces within the envelope, exactly onto them.
+    """Move a mesh's boundary, which runs along the box's faces within the envelope, exactly onto
+    them.
 
-    Each boundary facet moves to its nearest face. Cells that become flat (all four nodes on one face) are dropped;
-    inverted cells are repaired by moving the nodes around them, those on a face within it.
+    Each boundary facet moves to its nearest face. Cells that become flat (all four nodes on one
+    face) are dropped; inverted cells are repaired by moving the nodes around them, those on a face
+    within it.
 
     Parameters
     ----------
@@ -212,7 +246,9 @@ def put_on_box(
 def _box_faces_of_nodes(
     points: NDArray[np.float64], cells: NDArray[np.int64], faces: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Mark the faces of the box that each node belongs on, (N, 2, 3) bool: the nearest to its boundary facets."""
+    """Mark the faces of the box that each node belongs on, (N, 2, 3) bool: the nearest to its
+    boundary facets.
+    """
     outer = boundary_facets(cells)
     off = np.abs(points[outer][:, :, None, :] - faces).max(axis=1).reshape(len(outer), 6)
     nearest = off.argmin(axis=1)
@@ -224,10 +260,11 @@ def _box_faces_of_nodes(
 def _untangled(
     points: NDArray[np.float64], cells: NDArray[np.int64], is_fixed: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Move nodes of inverted and nearly flat cells until all volumes are positive, for at most `UNTANGLING_ROUNDS`.
+    """Move nodes of inverted and nearly flat cells until all volumes are positive, for at most
+    `UNTANGLING_ROUNDS`.
 
-    `is_fixed` (N, 3) marks fixed coordinates. A node moves part of the way to its neighbours' middle if the smallest
-    relative volume around it (volume over its longest edge's cube) grows.
+    `is_fixed` (N, 3) marks fixed coordinates. A node moves part of the way to its neighbours'
+    middle if the smallest relative volume around it (volume over its longest edge's cube) grows.
     """
     points = points.copy()
     around = [np.flatnonzero(False)] * len(points)
@@ -248,7 +285,9 @@ def _untangled(
     return points
 
 
-def _improve(points: NDArray[np.float64], star: NDArray[np.int64], node: int, is_free: NDArray[np.bool_]) -> bool:
+def _improve(
+    points: NDArray[np.float64], star: NDArray[np.int64], node: int, is_free: NDArray[np.bool_]
+) -> bool:
     """Move one node to the best of a few nearby places; return whether it moved."""
     corners = points[star]
     is_node = star == node
@@ -257,7 +296,12 @@ def _improve(points: NDArray[np.float64], star: NDArray[np.int64], node: int, is
     radius = float(np.linalg.norm(others - start, axis=1).mean())
     middle = others.mean(axis=0)
     moves = [t * (middle - start) for t in (1.0, 0.5, 0.25, 0.1)]
-    moves += [s * t * radius * np.eye(3)[axis] for t in (0.2, 0.05, 0.01) for axis in range(3) for s in (1.0, -1.0)]
+    moves += [
+        s * t * radius * np.eye(3)[axis]
+        for t in (0.2, 0.05, 0.01)
+        for axis in range(3)
+        for s in (1.0, -1.0)
+    ]
     best, best_shape = start, float(_relative_volumes(corners).min())
     for move in moves:
         place = start + np.where(is_free, move, 0.0)
@@ -270,7 +314,9 @@ def _improve(points: NDArray[np.float64], star: NDArray[np.int64], node: int, is
 
 
 def _relative_volumes(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return volume over the cube of the longest edge, (M,), for corners (M, 4, 3); negative if inverted."""
+    """Return volume over the cube of the longest edge, (M,), for corners (M, 4, 3); negative if
+    inverted.
+    """
     frames = corners[:, 1:] - corners[:, :1]
     a, b, c = frames[:, 0], frames[:, 1], frames[:, 2]
     volume = (np.cross(a, b) * c).sum(axis=1) / 6.0

@@ -1,7 +1,8 @@
 """Available memory, and checks that reject work that needs more, before it starts.
 
-The limits of a control group (containers, clusters) and of the machine kill a process without a message, so they must
-be checked in advance. Those of a process (`ulimit -v`) make an allocation fail, which is reported when it happens.
+The limits of a control group (containers, clusters) and of the machine kill a process without a
+message, so they must be checked in advance. Those of a process (`ulimit -v`) make an allocation
+fail, which is reported when it happens.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 
 BYTES_PER_GB = 1e9  # decimal, as for files
-MAXRSS_UNIT_BYTES = 1 if sys.platform == "darwin" else 1024  # the unit of ru_maxrss, see getrusage(2)
+# the unit of ru_maxrss, see getrusage(2)
+MAXRSS_UNIT_BYTES = 1 if sys.platform == "darwin" else 1024
 PROC_FOLDER = Path("/proc")
 GROUP_FOLDER = Path("/sys/fs/cgroup")
 UNLIMITED_BYTES = 1 << 60  # control groups write "no limit" as a number near 2^63
@@ -36,13 +38,18 @@ def memory_words(n_bytes: float) -> str:
 
 
 def at_most(count: float, noun: str = "") -> str:
-    """Advise a number that is within a limit, rounded down to two digits: "use at most 120000 nodes"."""
+    """Advise a number that is within a limit, rounded down to two digits: "use at most 120000
+    nodes".
+    """
     step = 10 ** max(floor(log10(max(count, 1.0))) - 1, 0)
     return f"use at most {max(floor(count / step), 0) * step} {noun}".rstrip()
 
 
-def check_memory(n_bytes: float, what: str, advice: str | Callable[[float], str], limit: float | None = None) -> None:
-    """Raise InputError if the next step needs more memory than is available, or than `limit`, bytes.
+def check_memory(
+    n_bytes: float, what: str, advice: str | Callable[[float], str], limit: float | None = None
+) -> None:
+    """Raise InputError if the next step needs more memory than is available, or than `limit`,
+    bytes.
 
     Parameters
     ----------
@@ -59,7 +66,8 @@ def check_memory(n_bytes: float, what: str, advice: str | Callable[[float], str]
     remedy = advice(min(free, room)) if callable(advice) else advice
     if n_bytes > free:
         raise InputError(
-            f"{what}: needs about {memory_words(n_bytes)} of memory, but only {memory_words(free)} is free; {remedy}"
+            f"{what}: needs about {memory_words(n_bytes)} of memory, but only "
+            f"{memory_words(free)} is free; {remedy}"
         )
     if limit is not None and n_bytes > room:
         raise InputError(
@@ -97,7 +105,8 @@ def resident_bytes() -> int:
 def address_bytes() -> int:
     """Return the address space in use by this process; 0 where the system does not report it.
 
-    Children that read a file call this, so it does without psutil, whose import would take a tenth of their time.
+    Children that read a file call this, so it does without psutil, whose import would take a tenth
+    of their time.
     """
     try:
         pages = (PROC_FOLDER / "self" / "statm").read_text(encoding="ascii").split()[0]
@@ -109,7 +118,8 @@ def address_bytes() -> int:
 def peak_bytes() -> int:
     """Return the peak memory of this process; 0 if the system does not report it.
 
-    On Linux this is VmHWM, not ru_maxrss, which starts at the memory of the parent that started the process.
+    On Linux this is VmHWM, not ru_maxrss, which starts at the memory of the parent that started the
+    process.
     """
     try:
         status = (PROC_FOLDER / "self" / "status").read_text(encoding="ascii", errors="replace")
@@ -121,8 +131,13 @@ def peak_bytes() -> int:
 
 
 def return_freed() -> None:
-    """Return freed memory to the system, of which glibc keeps arrays of up to 32 MB; other C libraries do without."""
-    if sys.platform == "linux" and (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:
+    """Return freed memory to the system, of which glibc keeps arrays of up to 32 MB; other C
+    libraries do without.
+    """
+    if (
+        sys.platform == "linux"
+        and (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None
+    ):
         trim(0)
 
 
@@ -142,7 +157,9 @@ def _maxrss(who: int) -> int:
 
 
 def _group_bytes() -> int | None:
-    """Return what the control groups (version 2 or 1) of this process leave; the file cache counts as free."""
+    """Return what the control groups (version 2 or 1) of this process leave; the file cache
+    counts as free.
+    """
     try:
         rows = (PROC_FOLDER / "self" / "cgroup").read_text(encoding="utf-8").splitlines()
     except OSError:
@@ -158,8 +175,12 @@ def _group_bytes() -> int | None:
         else:
             continue
         folder = root / path.lstrip("/")
-        # A container sees its own group as the root, whatever its path is outside; the limits of parents apply too.
-        for at in {root, *(part for part in (folder, *folder.parents) if part.is_relative_to(root))}:
+        # A container sees its own group as the root, whatever its path is outside; the limits of
+        # parents apply too.
+        for at in {
+            root,
+            *(part for part in (folder, *folder.parents) if part.is_relative_to(root)),
+        }:
             room = _group_room(at, *names)
             if room is not None:
                 rooms.append(room)
@@ -170,7 +191,9 @@ def _group_room(folder: Path, limit_name: str, used_name: str, cached_name: str)
     try:
         limit = (folder / limit_name).read_text(encoding="ascii").strip()
         used = int((folder / used_name).read_text(encoding="ascii"))
-        cached = re.search(rf"^{cached_name} (\d+)", (folder / "memory.stat").read_text(encoding="ascii"), re.M)
+        cached = re.search(
+            rf"^{cached_name} (\d+)", (folder / "memory.stat").read_text(encoding="ascii"), re.M
+        )
     except OSError:
         return None
     if not limit.isdigit() or int(limit) > UNLIMITED_BYTES:

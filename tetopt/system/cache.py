@@ -1,7 +1,8 @@
-"""The folder of compiled kernels: next to the package, else the user's cache, else a temporary one for this process.
+"""The folder of compiled kernels: next to the package, else the user's cache, else a temporary one
+for this process.
 
-numba runs the code that it reads there. World-writable folders are therefore not used, whoever owns them, and the code
-is in subfolders that nobody but their owner can write to.
+numba runs the code that it reads there. World-writable folders are therefore not used, whoever owns
+them, and the code is in subfolders that nobody but their owner can write to.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ class Place(NamedTuple):
 
 @cache
 def place_cache() -> Place:
-    """Return the first of these folders that can be written: NUMBA_CACHE_DIR alone, or `BESIDE` and the user's cache.
+    """Return the first of these folders that can be written: NUMBA_CACHE_DIR alone, or `BESIDE` and
+    the user's cache.
 
     Otherwise there is a temporary one, which processes started by this one use as well.
     """
@@ -46,16 +48,19 @@ def place_cache() -> Place:
         os.environ["NUMBA_CACHE_DIR"] = str(temporary)
     return Place(
         temporary,
-        f"each run recompiles the kernels, which takes {'half a minute' if temporary else 'a minute'}: "
+        "each run recompiles the kernels, which takes "
+        f"{'half a minute' if temporary else 'a minute'}: "
         f"{' and '.join(f'{folder} {refusal}' for folder, refusal in refusals)}; "
         "set NUMBA_CACHE_DIR to a folder that only you can write",
     )
 
 
 def own_folder(name: str) -> Path | None:
-    """Return the subfolder of this name, created if missing, as a copy of the one in `BESIDE` if there is one.
+    """Return the subfolder of this name, created if missing, as a copy of the one in `BESIDE` if
+    there is one.
 
-    The latter has the kernels that `tetopt warm-up` compiled for all users, or for a read-only container.
+    The latter has the kernels that `tetopt warm-up` compiled for all users, or for a read-only
+    container.
 
     Raises
     ------
@@ -68,7 +73,8 @@ def own_folder(name: str) -> Path | None:
     if not folder.exists():
         new = Path(tempfile.mkdtemp(prefix="tetopt-", dir=place))
         if shipped.is_dir():
-            with contextlib.suppress(OSError):  # it may not be read, or not be trusted: kernels are compiled again
+            # it may not be read, or not be trusted: kernels are compiled again
+            with contextlib.suppress(OSError):
                 _check_trusted(shipped)
                 shutil.copytree(shipped, new, dirs_exist_ok=True)
             new.chmod(0o700)
@@ -87,18 +93,22 @@ def share_with_all(folder: Path) -> None:
 
 
 def _check_trusted(folder: Path) -> None:
-    """Raise PermissionError if another user could have written to a folder that others can enter, or to its files."""
+    """Raise PermissionError if another user could have written to a folder that others can
+    enter, or to its files.
+    """
     is_closed = os.lstat(folder).st_mode & 0o077 == 0
     for path in [folder, *(() if is_closed else folder.rglob("*"))]:
         if (words := _distrust(os.lstat(path))) is not None:
-            raise PermissionError(f"another user could have written those in {folder} ({path.name} {words})")
+            raise PermissionError(
+                f"another user could have written those in {folder} ({path.name} {words})"
+            )
 
 
 def _distrust(status: os.stat_result) -> str | None:
     """Return why a file or folder is not trusted, in words; None if it is.
 
-    Trusted owners are this user, root and the owner of the package: they may run code in this process anyway. The
-    status comes from `os.lstat`, because links are not followed.
+    Trusted owners are this user, root and the owner of the package: they may run code in this
+    process anyway. The status comes from `os.lstat`, because links are not followed.
     """
     if os.name != "posix":
         return None
@@ -122,7 +132,9 @@ def _user_cache() -> Path:
 
 
 def _refusal(folder: Path) -> str | None:
-    """Return why a folder cannot hold the cache; create it if missing and write to it: permissions do not suffice."""
+    """Return why a folder cannot hold the cache; create it if missing and write to it:
+    permissions do not suffice.
+    """
     try:
         for part in [*reversed(folder.parents), folder]:
             if not part.exists():

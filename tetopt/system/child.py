@@ -1,9 +1,9 @@
 """Child processes within limits: starting, watching and ending them, and describing how they ended.
 
-A child with its own folder ends together with every process that it starts, whatever process group or session those
-create for themselves; they also count towards the limits. If the parent is killed, a shell that waits for its end
-cleans up. Windows has neither sessions nor that shell: there a child ends together with its descendants, and survives a
-parent that is killed.
+A child with its own folder ends together with every process that it starts, whatever process group
+or session those create for themselves; they also count towards the limits. If the parent is killed,
+a shell that waits for its end cleans up. Windows has neither sessions nor that shell: there a child
+ends together with its descendants, and survives a parent that is killed.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    import psutil  # imported where it is used: many processes only look up a signal or set their own limits
+    # imported where it is used: many processes only look up a signal or set their own limits
+    import psutil
 
 try:
     import resource
@@ -27,8 +28,10 @@ except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 
 POLL_SECONDS = 0.05  # between two polls of a child: a fraction of even a short run
-KILL_ROUNDS = 40  # searches for remaining processes, `POLL_SECONDS` apart: a killed process may have forked before
-MARK_NAME = "TETOPT_CHILD"  # names the child's folder in the environment of every process that a child starts
+# searches for remaining processes, `POLL_SECONDS` apart: a killed process may have forked before
+KILL_ROUNDS = 40
+# names the child's folder in the environment of every process that a child starts
+MARK_NAME = "TETOPT_CHILD"
 # Waits until its standard input closes, which happens when the parent ends for any reason.
 WATCHDOG = 'read -r _; kill -9 -"$1"; sleep 0.2; rm -rf "$2"'
 # Signals of a crash; a shell that ran the program then exits with 128 more.
@@ -40,22 +43,25 @@ SHELL_OFFSET = 128  # what a shell adds to a signal's number
 def started(
     command: Sequence[str], environment: dict[str, str], folder: Path | None = None, **streams: Any
 ) -> Iterator[subprocess.Popen]:
-    """Run a child process within a block; at the end of the block it is killed and its `returncode` is set.
+    """Run a child process within a block; at the end of the block it is killed and its `returncode`
+    is set.
 
     Parameters
     ----------
     command : sequence of str
     environment : dict
     folder : Path, optional
-        The child's own folder: every process that the child has started ends with it, also if this process is
-        killed, in which case the folder is removed. Without a folder only the child itself is ended.
+        The child's own folder: every process that the child has started ends with it, also if this
+        process is killed, in which case the folder is removed. Without a folder only the child
+        itself is ended.
     **streams
         Arguments of `subprocess.Popen`: `stdin` (none by default), `stdout`, `stderr`.
     """
     child = subprocess.Popen(
         command,
         env=environment | ({} if folder is None else {MARK_NAME: str(folder)}),
-        start_new_session=folder is not None,  # its own group, which is killed as a whole and does not get Ctrl-C
+        # its own group, which is killed as a whole and does not get Ctrl-C
+        start_new_session=folder is not None,
         **{"stdin": subprocess.DEVNULL} | streams,
     )
     try:
@@ -71,14 +77,19 @@ def started(
 
 @contextlib.contextmanager
 def _guarded(child: subprocess.Popen, folder: Path | None) -> Iterator[None]:
-    """Run a shell that kills the child's group and removes its folder if this process ends before the block does."""
+    """Run a shell that kills the child's group and removes its folder if this process ends
+    before the block does.
+    """
     if folder is None or sys.platform == "win32":
         yield
         return
     shell = subprocess.Popen(
         ["sh", "-c", WATCHDOG, "tetopt", str(child.pid), str(folder)],
-        stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
-    )  # fmt: skip
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
     try:
         yield
     finally:
@@ -87,7 +98,10 @@ def _guarded(child: subprocess.Popen, folder: Path | None) -> Iterator[None]:
 
 
 def watched(
-    child: subprocess.Popen, seconds: float, measure: Callable[[int], int], problem: Callable[[int], str | None]
+    child: subprocess.Popen,
+    seconds: float,
+    measure: Callable[[int], int],
+    problem: Callable[[int], str | None],
 ) -> tuple[int, str | None]:
     """Wait for a child until it ends or there is a problem.
 
@@ -120,7 +134,9 @@ def watched(
 
 
 def family_bytes(pid: int) -> int:
-    """Return the resident memory of a child with its own folder and of all processes that it has started."""
+    """Return the resident memory of a child with its own folder and of all processes that it has
+    started.
+    """
     import psutil
 
     total = 0
@@ -149,7 +165,8 @@ def _marked(folder: Path) -> set[psutil.Process]:
 
     processes = set()
     for process in psutil.process_iter():
-        with contextlib.suppress(psutil.Error, OSError):  # it has ended meanwhile, or access is denied
+        # it has ended meanwhile, or access is denied
+        with contextlib.suppress(psutil.Error, OSError):
             if process.environ().get(MARK_NAME) == str(folder):
                 processes.add(process)
     return processes
@@ -181,16 +198,20 @@ def limit_self(name: str, value: float) -> None:
     kind = getattr(resource, name)
     hard = resource.getrlimit(kind)[1]
     with contextlib.suppress(ValueError, OSError):  # macOS has no such memory limit
-        resource.setrlimit(kind, (int(value if hard == resource.RLIM_INFINITY else min(value, hard)), hard))
+        resource.setrlimit(
+            kind, (int(value if hard == resource.RLIM_INFINITY else min(value, hard)), hard)
+        )
 
 
 # How it ended
 
 
 def signal_words(code: int) -> str | None:
-    """Return the signal behind a return code, e.g. "signal 11, SIGSEGV"; None if the process exited by itself.
+    """Return the signal behind a return code, e.g. "signal 11, SIGSEGV"; None if the process exited
+    by itself.
 
-    A negative code comes from the process itself; a code above 128 comes from a shell whose program crashed.
+    A negative code comes from the process itself; a code above 128 comes from a shell whose program
+    crashed.
     """
     number = -code if code < 0 else code - SHELL_OFFSET
     try:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 
 def install_hint(*packages: str) -> str:
-    """Return the command that installs packages; the newest of each fits tetopt's extras, which have lower bounds only.
+    """Return the command that installs packages; the newest of each fits tetopt's extras, which
+    have lower bounds only.
 
     Packages are named, because ``pip install "tetopt[...]"`` works only where an index has tetopt.
 

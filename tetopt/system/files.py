@@ -1,7 +1,7 @@
 """Outputs that appear whole or not at all, and never replace other files by accident.
 
-tetopt writes all its files by `written_whole`: under a temporary name in the same folder, synchronised to disk, and
-then renamed in one step.
+tetopt writes all its files by `written_whole`: under a temporary name in the same folder,
+synchronised to disk, and then renamed in one step.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ import numpy as np
 
 from tetopt.errors import InputError
 
-TEMPORARY_LETTERS = 40  # letters of an output's name in its temporary name: the name may have the maximum length
+# letters of an output's name in its temporary name: the name may have the maximum length
+TEMPORARY_LETTERS = 40
 # Errors of folders that cannot be synchronised at all, as on some network file systems.
 UNSYNCHRONISED = (errno.EINVAL, errno.ENOTSUP, errno.ENOSYS, errno.EACCES, errno.EPERM, errno.EBADF)
 
@@ -44,8 +45,8 @@ _OUTPUTS: ContextVar[Outputs | None] = ContextVar("outputs", default=None)
 def outputs_of_command() -> Iterator[Outputs]:
     """Treat the outputs checked by `checked_output` within a block as those of one command.
 
-    An output must not be one of the inputs, nor the same as another output. Folders made by `results_folder` that are
-    empty at the end are removed.
+    An output must not be one of the inputs, nor the same as another output. Folders made by
+    `results_folder` that are empty at the end are removed.
     """
     outputs = Outputs([], {}, [], [])
     token = _OUTPUTS.set(outputs)
@@ -54,7 +55,8 @@ def outputs_of_command() -> Iterator[Outputs]:
     finally:
         _OUTPUTS.reset(token)
         for folder in reversed(outputs.made):
-            with suppress(OSError, ValueError):  # it is not empty, has been replaced, or has an invalid name
+            # it is not empty, has been replaced, or has an invalid name
+            with suppress(OSError, ValueError):
                 folder.rmdir()
 
 
@@ -77,12 +79,15 @@ def outputs_of_run(values: Iterable[Any]) -> Iterator[None]:
 def name_files(values: Iterable[Any]) -> None:
     """Record the paths among the values of a command's options; no output may be named twice."""
     if (outputs := _OUTPUTS.get()) is not None:
-        flat = (each for value in values for each in (value if isinstance(value, list) else [value]))
+        flat = (
+            each for value in values for each in (value if isinstance(value, list) else [value])
+        )
         outputs.named.extend(each for each in flat if isinstance(each, Path))
 
 
 def results_folder(path: Path) -> Path:
-    """Return `path`, created with its parents if missing; InputError for a file, or if it cannot be created.
+    """Return `path`, created with its parents if missing; InputError for a file, or if it cannot be
+    created.
 
     A command that is rejected afterwards leaves no empty folder.
     """
@@ -93,41 +98,58 @@ def results_folder(path: Path) -> Path:
         outputs.made.extend(new)
     try:
         path.mkdir(parents=True, exist_ok=True)
-    except (OSError, ValueError) as error:  # a name too long, or with letters that the file system does not allow
+    # a name too long, or with letters that the file system does not allow
+    except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{path}: cannot create the folder for the results: {reason}") from error
     return path
 
 
 def checked_output(
-    path: str | Path, suffixes: tuple[str, ...], force: bool = False, is_ours: Callable[[Path], bool] | None = None
+    path: str | Path,
+    suffixes: tuple[str, ...],
+    force: bool = False,
+    is_ours: Callable[[Path], bool] | None = None,
 ) -> Path:
-    """Return `path` if an output may be written there; checks by creating and removing a file in its folder.
+    """Return `path` if an output may be written there; checks by creating and removing a file in
+    its folder.
 
-    Call it before the work starts. With `force` and a symbolic link, the file that the link points to is written and
-    the link stays. `is_ours` is for outputs that are folders: it says whether an existing folder may be replaced.
+    Call it before the work starts. With `force` and a symbolic link, the file that the link points
+    to is written and the link stays. `is_ours` is for outputs that are folders: it says whether an
+    existing folder may be replaced.
 
     Raises
     ------
     InputError
-        The suffix is not among `suffixes` (in any case); the folder is missing or read-only; a folder or device is in
-        the place of the file; the file exists and `force` is not set; the command uses it as an input or output too.
+        The suffix is not among `suffixes` (in any case); the folder is missing or read-only; a
+        folder or device is in the place of the file; the file exists and `force` is not set; the
+        command uses it as an input or output too.
     """
     path = check_suffix(path, suffixes)
     if os.path.isdir(path) and (is_ours is None or not is_ours(path)):
-        raise InputError(f"{path}: expected a file to write, found a{'' if is_ours is None else 'n unrelated'} folder")
+        raise InputError(
+            f"{path}: expected a file to write, found "
+            f"a{'' if is_ours is None else 'n unrelated'} folder"
+        )
     try:
         place = Path(os.path.realpath(path))
         before = _state(place)
-    except (OSError, ValueError) as error:  # a name too long, or with letters that the file system does not allow
-        raise InputError(f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}") from error
+    # a name too long, or with letters that the file system does not allow
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}"
+        ) from error
     through = f"is a link to {place}: " if path.is_symlink() else ""
     if not place.parent.is_dir():
         raise InputError(f"{path}: {through}its folder does not exist; create it first")
     if before is not None and is_ours is not None and not stat.S_ISDIR(before.st_mode):
-        raise InputError(f"{path}: {through}expected a folder to write, found something else; remove it first")
+        raise InputError(
+            f"{path}: {through}expected a folder to write, found something else; remove it first"
+        )
     if before is not None and is_ours is None and not stat.S_ISREG(before.st_mode):
-        raise InputError(f"{path}: {through}expected a file to write, found a device, a pipe or a circular link")
+        raise InputError(
+            f"{path}: {through}expected a file to write, found a device, a pipe or a circular link"
+        )
     if os.path.lexists(path) and not force:
         raise InputError(f"{path}: already exists; pass `force` to replace it")
     _check_once(path, place)
@@ -146,7 +168,9 @@ def check_suffix(path: str | Path, suffixes: tuple[str, ...]) -> Path:
 
 
 def _check_once(path: Path, place: Path) -> None:
-    """Raise InputError if the command names the file a second time, as an input or as another output."""
+    """Raise InputError if the command names the file a second time, as an input or as another
+    output.
+    """
     if (outputs := _OUTPUTS.get()) is None:
         return
     others = list(outputs.named)
@@ -155,11 +179,15 @@ def _check_once(path: Path, place: Path) -> None:
     if any(os.path.realpath(other) == str(place) for other in others) or (
         place.exists() and any(other.exists() and place.samefile(other) for other in others)
     ):
-        raise InputError(f"{path}: is also an input or another output of this command; choose another name")
+        raise InputError(
+            f"{path}: is also an input or another output of this command; choose another name"
+        )
 
 
 def _check_folder(path: Path, folder: Path) -> None:
-    """Raise InputError unless a file can be created in the folder: permissions alone do not tell."""
+    """Raise InputError unless a file can be created in the folder: permissions alone do not
+    tell.
+    """
     try:
         handle, name = tempfile.mkstemp(prefix=".tetopt-", dir=folder)
         os.close(handle)
@@ -169,19 +197,26 @@ def _check_folder(path: Path, folder: Path) -> None:
 
 
 def check_space(path: Path, n_bytes: int) -> None:
-    """Raise InputError if the disk of `path` has fewer than `n_bytes` bytes free, as far as it reports them."""
+    """Raise InputError if the disk of `path` has fewer than `n_bytes` bytes free, as far as it
+    reports them.
+    """
     free = shutil.disk_usage(os.path.realpath(path.parent)).free
     if free < n_bytes:
-        raise InputError(f"{path}: needs at least {n_bytes} bytes, but only {free} are free; free some space first")
+        raise InputError(
+            f"{path}: needs at least {n_bytes} bytes, but only {free} are free; free some space "
+            "first"
+        )
 
 
 @contextmanager
 def written_whole(path: Path, n_bytes: int | None = None) -> Iterator[Path]:
-    """Give a temporary path next to `path`, with its suffix, that replaces `path` when the block ends without error.
+    """Give a temporary path next to `path`, with its suffix, that replaces `path` when the block
+    ends without error.
 
-    After an error or an interruption, the previous file is unchanged. After a kill or a power cut, the old or the new
-    file is whole, and a temporary file, whose name begins with a dot, may remain. The new file keeps the permissions
-    and, where allowed, the group of the file that it replaces; otherwise it gets the default permissions.
+    After an error or an interruption, the previous file is unchanged. After a kill or a power cut,
+    the old or the new file is whole, and a temporary file, whose name begins with a dot, may
+    remain. The new file keeps the permissions and, where allowed, the group of the file that it
+    replaces; otherwise it gets the default permissions.
 
     Raises
     ------
@@ -211,11 +246,16 @@ def _output(path: Path, n_bytes: int | None = None) -> Iterator[Path]:
     System errors within the block are reported as errors of writing `path`.
     """
     outputs, key = _OUTPUTS.get(), _absolute(path)
-    place = Path(os.path.realpath(path)) if outputs is None else outputs.places.get(key, Path(os.path.realpath(path)))
+    place = (
+        Path(os.path.realpath(path))
+        if outputs is None
+        else outputs.places.get(key, Path(os.path.realpath(path)))
+    )
     with telling(path, n_bytes, place.parent):
         yield place
     if outputs is not None and key in outputs.places and path not in outputs.written:
-        outputs.written.append(path)  # once: a mesh is written first, and again with its measurements
+        # once: a mesh is written first, and again with its measurements
+        outputs.written.append(path)
 
 
 def _hidden(path: Path) -> str:
@@ -224,7 +264,9 @@ def _hidden(path: Path) -> str:
 
 
 def _temporary_folder(stack: ExitStack, path: Path, folder: Path, suffix: str = "") -> Path:
-    """Create a folder next to an output until the stack is unwound; files that cannot be removed remain, hidden."""
+    """Create a folder next to an output until the stack is unwound; files that cannot be removed
+    remain, hidden.
+    """
     temporary = Path(tempfile.mkdtemp(prefix=_hidden(path), suffix=suffix, dir=folder))
     stack.callback(shutil.rmtree, temporary, ignore_errors=True)
     return temporary
@@ -232,10 +274,11 @@ def _temporary_folder(stack: ExitStack, path: Path, folder: Path, suffix: str = 
 
 @contextmanager
 def folder_written_whole(path: Path) -> Iterator[Path]:
-    """Do the same as `written_whole` for a folder: give a temporary folder, which replaces `path` at the end.
+    """Do the same as `written_whole` for a folder: give a temporary folder, which replaces `path`
+    at the end.
 
-    An existing folder is first moved aside. Between the two moves, also if the process is killed then, no folder has
-    the name.
+    An existing folder is first moved aside. Between the two moves, also if the process is killed
+    then, no folder has the name.
 
     Raises
     ------
@@ -264,7 +307,8 @@ def folder_written_whole(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def telling(path: Path, n_bytes: int | None = None, folder: Path | None = None) -> Iterator[None]:
-    """Report system errors as errors of writing `path`; on a full disk with the number of bytes, if known.
+    """Report system errors as errors of writing `path`; on a full disk with the number of bytes, if
+    known.
 
     `folder` is the real folder of the file, by default that of `path`.
     """
@@ -282,17 +326,23 @@ def save_bytes(path: str | Path, whole: bytes) -> None:
 
 
 def save_text(path: str | Path, text: str) -> None:
-    """Write text as UTF-8, whole or not at all; invalid characters, from names that are not UTF-8, are escaped."""
+    """Write text as UTF-8, whole or not at all; invalid characters, from names that are not
+    UTF-8, are escaped.
+    """
     save_bytes(path, text.encode("utf-8", "backslashreplace"))
 
 
 def save_json(path: Path, value: Any) -> None:
-    """Write `value` as JSON, whole or not at all; may contain numpy numbers and arrays, NamedTuples and paths."""
+    """Write `value` as JSON, whole or not at all; may contain numpy numbers and arrays,
+    NamedTuples and paths.
+    """
     save_text(path, json.dumps(_plain(value), indent=1, allow_nan=False) + "\n")
 
 
 def kept_places(path: Path, suffix: str) -> Iterator[Path]:
-    """Yield free names for an output that cannot be written to `path`: next to it, then in new temporary folders."""
+    """Yield free names for an output that cannot be written to `path`: next to it, then in new
+    temporary folders.
+    """
     names = chain([path.stem], (f"{path.stem}_optimised_{number}" for number in count(1)))
     places = (path.with_name(f"{name}{suffix}") for name in names)
     yield next(place for place in places if place != path and not os.path.lexists(place))
@@ -314,7 +364,9 @@ def _state(place: Path) -> os.stat_result | None:
 
 
 def _take_rights(temporary: Path, place: Path) -> None:
-    """Give the new file the permissions and group of the file that it replaces, or those that the umask leaves."""
+    """Give the new file the permissions and group of the file that it replaces, or those that
+    the umask leaves.
+    """
     before = _state(place)
     if before is None:
         mask = os.umask(0)
@@ -326,7 +378,8 @@ def _take_rights(temporary: Path, place: Path) -> None:
     if hasattr(os, "chown") and os.stat(temporary).st_gid != before.st_gid:
         try:
             os.chown(temporary, -1, before.st_gid)
-        except OSError:  # not one of our groups: the present group gets the permissions of all others
+        # not one of our groups: the present group gets the permissions of all others
+        except OSError:
             mode = (mode & ~0o070) | (mode & 0o007) << 3
     os.chmod(temporary, mode)
 
@@ -334,8 +387,8 @@ def _take_rights(temporary: Path, place: Path) -> None:
 def _on_disk(path: Path, place: Path | None = None) -> None:
     """Synchronise a file to disk, with the permissions of the file in its `place`.
 
-    Without this, a power cut after the renaming would leave an empty file. The file is opened before its permissions
-    change, as they may not allow writing.
+    Without this, a power cut after the renaming would leave an empty file. The file is opened
+    before its permissions change, as they may not allow writing.
     """
     handle = os.open(path, os.O_RDWR)
     try:
@@ -372,7 +425,9 @@ def _reason(error: OSError, folder: Path, n_bytes: int | None) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Convert `value` to JSON's own types; numbers that are not finite become null, as JSON cannot express them."""
+    """Convert `value` to JSON's own types; numbers that are not finite become null, as JSON
+    cannot express them.
+    """
     if hasattr(value, "_asdict"):
         return {key: _plain(item) for key, item in value._asdict().items()}
     if isinstance(value, dict):
@@ -386,5 +441,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not np.isfinite(value):
         return None
     if isinstance(value, str | Path):
-        return str(value).encode("utf-8", "backslashreplace").decode()  # lone surrogates from names: no valid JSON
+        # lone surrogates from names: no valid JSON
+        return str(value).encode("utf-8", "backslashreplace").decode()
     return value

@@ -1,7 +1,7 @@
 """Other Python processes, which compile kernels, read files, run pipelines and work on tasks.
 
-None of them imports modules from the current folder, which may be as untrusted as its files. This holds for
-processes started here, for those that they start, and for those of libraries.
+None of them imports modules from the current folder, which may be as untrusted as its files. This
+holds for processes started here, for those that they start, and for those of libraries.
 """
 
 from __future__ import annotations
@@ -11,10 +11,11 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-# Numba reads this variable when it is imported. Those of BLAS, which dask sets to one, stay: its rounding depends on
-# the number of threads.
+# Numba reads this variable when it is imported. Those of BLAS, which dask sets to one, stay: its
+# rounding depends on the number of threads.
 THREADS_NAME = "NUMBA_NUM_THREADS"
-SAFE_PATH_NAME = "PYTHONSAFEPATH"  # the same as python -P, inherited by all processes that a process starts
+# the same as python -P, inherited by all processes that a process starts
+SAFE_PATH_NAME = "PYTHONSAFEPATH"
 
 
 def python_command(*words: str) -> list[str]:
@@ -23,18 +24,28 @@ def python_command(*words: str) -> list[str]:
 
 
 def python_environment(**names: str) -> dict[str, str]:
-    """Return the environment of such a process, which imports from the same folders as this one; adds `names`."""
-    return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), SAFE_PATH_NAME: "1"} | names
+    """Return the environment of such a process, which imports from the same folders as this one;
+    adds `names`.
+    """
+    return (
+        os.environ
+        | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), SAFE_PATH_NAME: "1"}
+        | names
+    )
 
 
 def others_environment() -> dict[str, str]:
-    """Return the environment of a user's program, which may be in Python and import modules from its own folder."""
+    """Return the environment of a user's program, which may be in Python and import modules from
+    its own folder.
+    """
     return {name: value for name, value in os.environ.items() if name != SAFE_PATH_NAME}
 
 
 @contextmanager
 def safe_path() -> Iterator[None]:
-    """Keep Python processes that libraries start within the block from importing modules of the current folder."""
+    """Keep Python processes that libraries start within the block from importing modules of the
+    current folder.
+    """
     before = os.environ.get(SAFE_PATH_NAME)
     os.environ[SAFE_PATH_NAME] = "1"
     try:

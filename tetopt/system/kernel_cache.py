@@ -1,10 +1,11 @@
-"""numba's cache of compiled functions, in a folder of their own sources, where only this user may write.
+"""numba's cache of compiled functions, in a folder of their own sources, where only this user may
+write.
 
-Code that cannot be read is compiled again, and code that cannot be written, because the disk is full or the folder is
-gone, is not kept; in both cases a one-line `RuntimeWarning` is issued once.
+Code that cannot be read is compiled again, and code that cannot be written, because the disk is
+full or the folder is gone, is not kept; in both cases a one-line `RuntimeWarning` is issued once.
 
-This relies on internals of numba. Where numba lacks a name, or on request (`IS_PLAIN`), functions are compiled and
-kept only with numba's documented features.
+This relies on internals of numba. Where numba lacks a name, or on request (`IS_PLAIN`), functions
+are compiled and kept only with numba's documented features.
 """
 
 from __future__ import annotations
@@ -36,14 +37,21 @@ INSIDE = (
 )
 MISSING = sorted(name for owner, names in INSIDE for name in names if not hasattr(owner, name))
 # True if functions are compiled with documented features of numba only.
-IS_PLAIN = bool(MISSING) or os.environ.get("TETOPT_PLAIN_NUMBA") == "1" or bool(numba.config.DISABLE_JIT)
-PLAIN_NOTICE = f"kernels take longer to compile: tetopt cannot use the internals of numba {numba.__version__} ({{}})"
+IS_PLAIN = (
+    bool(MISSING) or os.environ.get("TETOPT_PLAIN_NUMBA") == "1" or bool(numba.config.DISABLE_JIT)
+)
+PLAIN_NOTICE = (
+    "kernels take longer to compile: tetopt cannot use the internals of numba "
+    f"{numba.__version__} ({{}})"
+)
 NOT_KEPT = "compiled kernels cannot be kept, so later runs compile them again: {}"
 
 
 @cache
 def checksum() -> str:
-    """Return the checksum of the sources of all kernels and their constants; code of other sources is not reused."""
+    """Return the checksum of the sources of all kernels and their constants; code of other
+    sources is not reused.
+    """
     folder, total = Path(__file__).parents[1], 0
     patterns = [
         "system/kernel*.py",
@@ -74,7 +82,10 @@ class KeptCache(FunctionCache):
         except OSError:  # writing either repairs this or issues a warning
             return None
         except Exception as error:  # of any kind, from pickle
-            warn(f"recompiling kernels: the cache {self.cache_path} has damaged files ({type(error).__name__})")
+            warn(
+                f"recompiling kernels: the cache {self.cache_path} has damaged files "
+                f"({type(error).__name__})"
+            )
             with contextlib.suppress(OSError):  # as above
                 self.flush()
             return None
@@ -88,7 +99,9 @@ class KeptCache(FunctionCache):
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorate as `numba.njit` does; `cache=True` keeps the code in the folder of this version of all kernels."""
+    """Decorate as `numba.njit` does; `cache=True` keeps the code in the folder of this version
+    of all kernels.
+    """
     if IS_PLAIN:
         return plain_njit(**options)
     is_kept = options.pop("cache", False)
@@ -99,7 +112,8 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
             with _kept_in(_own_folder("linked")) as is_there:
                 try:
                     dispatcher._cache = KeptCache(function) if is_there else dispatcher._cache
-                except RuntimeError as error:  # no locator: the folder is gone or no longer writable
+                # no locator: the folder is gone or no longer writable
+                except RuntimeError as error:
                     warn(NOT_KEPT.format(error), NotKeptWarning)
         return dispatcher
 
@@ -119,7 +133,9 @@ def plain_njit(*signature: Any, **options: Any) -> Callable[[Callable[..., Any]]
 
 @contextlib.contextmanager
 def _kept_in(folder: Path | None) -> Iterator[bool]:
-    """Have numba keep the functions that are decorated within the block in a folder; give whether there is one."""
+    """Have numba keep the functions that are decorated within the block in a folder; give
+    whether there is one.
+    """
     before = numba.config.CACHE_DIR
     if folder is not None:
         numba.config.CACHE_DIR = str(folder)

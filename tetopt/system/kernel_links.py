@@ -1,6 +1,8 @@
-"""The internals of numba that kernels use: records passed by address, units called through linker symbols.
+"""The internals of numba that kernels use: records passed by address, units called through linker
+symbols.
 
-Any version of numba may drop what this module imports. `tetopt.system.kernels` then does without it.
+Any version of numba may drop what this module imports. `tetopt.system.kernels` then does without
+it.
 """
 
 from __future__ import annotations
@@ -45,7 +47,9 @@ class RecordType(types.Type):
         super().__init__(f"{record.__module__}.{record.__qualname__}-{checksum()}")
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle by name for the keys of numba's cache: the record of another version may no longer exist."""
+        """Pickle by name for the keys of numba's cache: the record of another version may no
+        longer exist.
+        """
         return _type_of_name, (self.record.__module__, self.record.__qualname__, checksum())
 
 
@@ -85,7 +89,9 @@ class _RecordFields(AttributeTemplate):
 
 @lower_getattr_generic(RecordType)
 def _load_field(context: Any, builder: Any, record: RecordType, value: Any, name: str) -> Any:
-    """Load a field of a record. LLVM learns that its memory is constant while kernels run, and hoists loads."""
+    """Load a field of a record. LLVM learns that its memory is constant while kernels run, and
+    hoists loads.
+    """
     field, first = record.fields[name], record.offsets[name]
     words = builder.bitcast(value, ir.IntType(64).as_pointer())
     constant = builder.module.add_metadata([])
@@ -99,7 +105,10 @@ def _load_field(context: Any, builder: Any, record: RecordType, value: Any, name
     if isinstance(field, types.Array):
         array, n = context.make_array(field)(context, builder), field.ndim
         shape, strides = [word(1 + d) for d in range(n)], [word(1 + n + d) for d in range(n)]
-        data, itemsize = word(0, array.data.type), context.get_constant(types.intp, numpy_dtype(field).itemsize)
+        data, itemsize = (
+            word(0, array.data.type),
+            context.get_constant(types.intp, numpy_dtype(field).itemsize),
+        )
         populate_array(array, data, shape, strides, itemsize, meminfo=None)
         return impl_ret_borrowed(context, builder, field, array._getvalue())
     if field == types.boolean:
@@ -108,7 +117,9 @@ def _load_field(context: Any, builder: Any, record: RecordType, value: Any, name
 
 
 class Packed:
-    """A record laid out in memory for kernels, which get its address. It keeps alive everything it points to."""
+    """A record laid out in memory for kernels, which get its address. It keeps alive everything
+    it points to.
+    """
 
     __slots__ = ("address", "kept", "type", "words")
 
@@ -146,9 +157,14 @@ class Packed:
         return None
 
     def _check(self, inner: Any, name: str) -> None:
-        """Raise TypeError unless a field gets a record of its type: kernels would misread another record's memory."""
+        """Raise TypeError unless a field gets a record of its type: kernels would misread
+        another record's memory.
+        """
         if getattr(inner, "type", None) != self.type.fields[name]:
-            raise TypeError(f"{self.type.record.__name__}.{name}: expected {self.type.fields[name]}, got {inner!r}")
+            raise TypeError(
+                f"{self.type.record.__name__}.{name}: expected {self.type.fields[name]}, got "
+                f"{inner!r}"
+            )
 
 
 @typeof_impl.register(Packed)
@@ -161,18 +177,26 @@ def _unbox_packed(_type: RecordType, value: Any, context: Any) -> NativeValue:
     number = context.pyapi.object_getattr_string(value, "address")
     address = context.pyapi.long_as_voidptr(number)
     context.pyapi.decref(number)
-    return NativeValue(address, is_error=cgutils.is_not_null(context.builder, context.pyapi.err_occurred()))
+    return NativeValue(
+        address, is_error=cgutils.is_not_null(context.builder, context.pyapi.err_occurred())
+    )
 
 
 @intrinsic
 def fails(_context: Any, address: Any, values: Any, number: Any) -> Any:
-    """Call the task at an address with the address of a record and a number; return whether it raised an error."""
+    """Call the task at an address with the address of a record and a number; return whether it
+    raised an error.
+    """
 
     def generate(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
         convention, kinds = context.call_conv, (types.voidptr, types.int64)
-        task = builder.inttoptr(arguments[0], convention.get_function_type(types.void, kinds).as_pointer())
+        task = builder.inttoptr(
+            arguments[0], convention.get_function_type(types.void, kinds).as_pointer()
+        )
         record = builder.inttoptr(arguments[1], cgutils.voidptr_t)
-        status, _ = convention.call_function(builder, task, types.void, kinds, [record, arguments[2]])
+        status, _ = convention.call_function(
+            builder, task, types.void, kinds, [record, arguments[2]]
+        )
         return status.is_error
 
     return types.boolean(types.int64, types.int64, types.int64), generate
@@ -181,7 +205,9 @@ def fails(_context: Any, address: Any, values: Any, number: Any) -> Any:
 # The only parallel loop: separate loops took 2 s each to compile.
 @njit(cache=True, parallel=True)
 def run(task: int, values: int, n: int) -> int:
-    """Call the task at an address for a record and all numbers below n; return how many calls fail."""
+    """Call the task at an address for a record and all numbers below n; return how many calls
+    fail.
+    """
     n_failed = 0
     for number in prange(n):
         n_failed += fails(task, values, np.int64(number))
@@ -189,13 +215,17 @@ def run(task: int, values: int, n: int) -> int:
 
 
 def function_type(symbol: str, function: Callable[..., Any], of_call: types.Type) -> types.Function:
-    """Return the numba type that calls a function by its symbol and raises the errors that the function raises."""
+    """Return the numba type that calls a function by its symbol and raises the errors that the
+    function raises.
+    """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         convention = context.call_conv
         kind = convention.get_function_type(signature.return_type, signature.args)
         callee = cgutils.get_or_insert_function(builder.module, kind, symbol)
-        status, value = convention.call_function(builder, callee, signature.return_type, signature.args, arguments)
+        status, value = convention.call_function(
+            builder, callee, signature.return_type, signature.args, arguments
+        )
         with cgutils.if_unlikely(builder, status.is_error):
             convention.return_status_propagate(builder, status)
         return value
@@ -216,7 +246,9 @@ def address_of(dispatcher: Any) -> int:
 
 
 def add_symbol(symbol: str, address: int) -> None:
-    """Add a symbol to the linker; RuntimeError if that fails, because using the symbol would end the process."""
+    """Add a symbol to the linker; RuntimeError if that fails, because using the symbol would end
+    the process.
+    """
     llvm.add_symbol(symbol, address)
     if llvm.address_of_symbol(symbol) != address:
         raise RuntimeError(f"the linker has no symbol {symbol}")

@@ -1,14 +1,15 @@
 """Compiled kernels: each is compiled once, separately, and receives records by address.
 
-numba recompiles a function inside every function that calls it, and passes a record of thirty arrays as three hundred
-numbers. Here a *unit* is compiled on its own, with a signature from its annotations, and is called through a linker
-symbol, as C calls a function in another file; a *record* (a NamedTuple of arrays, numbers and records) is a block of
-memory that is passed by address. *Helpers* are plain numba functions that are compiled into the units that use them;
-Python calls *entries*; and a parallel loop runs a unit for each number of a range (`run`).
+numba recompiles a function inside every function that calls it, and passes a record of thirty
+arrays as three hundred numbers. Here a *unit* is compiled on its own, with a signature from its
+annotations, and is called through a linker symbol, as C calls a function in another file; a
+*record* (a NamedTuple of arrays, numbers and records) is a block of memory that is passed by
+address. *Helpers* are plain numba functions that are compiled into the units that use them; Python
+calls *entries*; and a parallel loop runs a unit for each number of a range (`run`).
 
-Symbols and addresses use internals of numba (`tetopt.system.kernel_links`). If these fail the test below, or on
-request, kernels are plain numba functions with the same signatures that take records by value: slower, with identical
-results.
+Symbols and addresses use internals of numba (`tetopt.system.kernel_links`). If these fail the test
+below, or on request, kernels are plain numba functions with the same signatures that take records
+by value: slower, with identical results.
 
 docs/develop/kernels.md gives the gain of each of these.
 """
@@ -41,7 +42,15 @@ from numpy.typing import NDArray
 from tetopt.system.cache import place_cache
 from tetopt.system.child import started
 from tetopt.system.interpreter import python_command, python_environment
-from tetopt.system.kernel_cache import IS_PLAIN, PLAIN_NOTICE, NotKeptWarning, checksum, njit, plain_njit, warn
+from tetopt.system.kernel_cache import (
+    IS_PLAIN,
+    PLAIN_NOTICE,
+    NotKeptWarning,
+    checksum,
+    njit,
+    plain_njit,
+    warn,
+)
 from tetopt.system.kernel_types import by_value, cast, type_of
 from tetopt.system.lock import lock_file
 
@@ -61,7 +70,8 @@ Bools1 = Annotated[NDArray[np.bool_], types.boolean[::1]]
 Bools2 = Annotated[NDArray[np.bool_], types.boolean[:, ::1]]
 Bools3 = Annotated[NDArray[np.bool_], types.boolean[:, :, ::1]]
 
-# In the cache's folder, shared by all runs of this installation: other installations compile other files.
+# In the cache's folder, shared by all runs of this installation: other installations compile other
+# files.
 LOCK_NAME = f"compiling-{zlib.crc32(str(Path(__file__).parents[1]).encode()):08x}.lock"
 PIECES_PER_THREAD = 8  # pieces of a plain loop, as some take longer than others
 POLLED_SECONDS = 0.1  # between polls of compiling processes
@@ -73,7 +83,9 @@ _links: list[Any] = []  # the result of `links`, once it is known
 
 
 def links() -> Any:
-    """Return `kernel_links` if it passes its test, which runs once; otherwise None, and kernels are plain numba."""
+    """Return `kernel_links` if it passes its test, which runs once; otherwise None, and kernels
+    are plain numba.
+    """
     with _LINKING:
         if not _links:
             _links.append(None)
@@ -81,7 +93,8 @@ def links() -> Any:
                 try:
                     _links[0] = import_module("tetopt.system.kernel_links")
                     check_links()
-                except Exception as error:  # any kind: numba's internals may be gone, or behave differently
+                # any kind: numba's internals may be gone, or behave differently
+                except Exception as error:
                     _unlink(error)
     return _links[0]
 
@@ -97,19 +110,25 @@ def _unlink(error: Exception) -> None:
 
 
 def packed(value: Any) -> Any:
-    """Lay out a record for kernels; return any other value, including a laid-out record, unchanged."""
+    """Lay out a record for kernels; return any other value, including a laid-out record,
+    unchanged.
+    """
     if links() is None and hasattr(value, "kept"):  # laid out before a later kernel failed to link
         value = value.kept[0]
     if numba.config.DISABLE_JIT or not (isinstance(value, tuple) and hasattr(value, "_fields")):
         return value
-    return cast(value, by_value(type(value)), "argument") if links() is None else links().Packed(value)
+    return (
+        cast(value, by_value(type(value)), "argument") if links() is None else links().Packed(value)
+    )
 
 
 ALL_KERNELS: list[Any] = []  # all kernels of the modules imported so far
 _LOOPING = threading.Lock()  # held while a loop runs, where numba's threads can serve only one
 
 
-ALLOCATING_NAMES = frozenset(("empty", "empty_like", "full", "zeros", "ones", "array", "arange", "copy"))
+ALLOCATING_NAMES = frozenset(
+    ("empty", "empty_like", "full", "zeros", "ones", "array", "arange", "copy")
+)
 
 
 def _named(function: Any) -> list[Any]:
@@ -118,9 +137,11 @@ def _named(function: Any) -> list[Any]:
 
 
 def _counts(function: Callable[..., Any]) -> bool:
-    """Return whether numba must count references to arrays in a function: it creates some, or a helper returns some.
+    """Return whether numba must count references to arrays in a function: it creates some, or a
+    helper returns some.
 
-    Counting is atomic and happens twice per call; it took a third of a sweep and half of a pass of flips.
+    Counting is atomic and happens twice per call; it took a third of a sweep and half of a pass of
+    flips.
     """
     if ALLOCATING_NAMES.intersection(function.__code__.co_names):
         return True
@@ -130,17 +151,22 @@ def _counts(function: Callable[..., Any]) -> bool:
 
 def _returns_arrays(function: Callable[..., Any]) -> bool:
     result = function.__annotations__.get("return")
-    return result not in ("None", "bool", "int", "float", "Any") and not str(result).startswith("tuple")
+    return result not in ("None", "bool", "int", "float", "Any") and not str(result).startswith(
+        "tuple"
+    )
 
 
 def _versioned(function: Callable[..., Any], **values: Any) -> Callable[..., Any]:
-    """Return a copy of a function that closes over the checksum of all kernels, with its own global values.
+    """Return a copy of a function that closes over the checksum of all kernels, with its own global
+    values.
 
-    numba's cache is keyed by the code and closure of a single function, so it would otherwise return a function that
-    was compiled with older versions of others.
+    numba's cache is keyed by the code and closure of a single function, so it would otherwise
+    return a function that was compiled with older versions of others.
     """
     code = function.__code__.replace(co_freevars=("checksum",))
-    version = FunctionType(code, function.__globals__ | values, function.__name__, None, (CellType(checksum()),))
+    version = FunctionType(
+        code, function.__globals__ | values, function.__name__, None, (CellType(checksum()),)
+    )
     version.__qualname__, version.__module__ = function.__qualname__, function.__module__
     return version
 
@@ -152,7 +178,11 @@ class Kernel:
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self.function = function
-        self.__name__, self.__doc__, self.__module__ = function.__name__, function.__doc__, function.__module__
+        self.__name__, self.__doc__, self.__module__ = (
+            function.__name__,
+            function.__doc__,
+            function.__module__,
+        )
         self.room = self.__module__.rpartition(".")[2]
         self.is_linked = False
         ALL_KERNELS.append(self)
@@ -183,12 +213,15 @@ class Kernel:
             self.is_linked = True
 
     def _make_known(self) -> None:
-        """Compile it, and add its own symbol to the linker; an entry has none, and Python's first call compiles it."""
+        """Compile it, and add its own symbol to the linker; an entry has none, and Python's
+        first call compiles it.
+        """
 
     @cached_property
     def dispatcher(self) -> Any:
         """The numba dispatcher by which Python calls it."""
-        compiled_by = plain_njit if links() is None else njit  # with separate caches: only one has symbols
+        # with separate caches: only one has symbols
+        compiled_by = plain_njit if links() is None else njit
         return compiled_by(cache=True, error_model="numpy", nogil=True)(_versioned(self.function))
 
     def __call__(self, *values: Any) -> Any:
@@ -198,7 +231,9 @@ class Kernel:
 
     @cached_property
     def compiled(self) -> Any:
-        """The dispatcher whose code other kernels or Python call, compiled now or loaded from the cache."""
+        """The dispatcher whose code other kernels or Python call, compiled now or loaded from
+        the cache.
+        """
         self.dispatcher.compile(self.signature.args)
         return self.dispatcher
 
@@ -209,7 +244,9 @@ class Kernel:
 
 
 class Unit(Kernel):
-    """A function compiled on its own, which other kernels call through its symbol. From Python it acts as an entry."""
+    """A function compiled on its own, which other kernels call through its symbol. From Python
+    it acts as an entry.
+    """
 
     @cached_property
     def symbol(self) -> str:
@@ -229,7 +266,9 @@ class Unit(Kernel):
         if links() is None:
             options = {"cache": True, "error_model": "numpy", "nogil": True}
             return plain_njit(self.signature, **options)(_versioned(self.function))
-        dispatcher = _machine_code(cache=True, _nrt=_counts(self.function))(_versioned(self.function))
+        dispatcher = _machine_code(cache=True, _nrt=_counts(self.function))(
+            _versioned(self.function)
+        )
         dispatcher.compile(self.signature)
         return dispatcher
 
@@ -240,7 +279,9 @@ class Unit(Kernel):
 
     @cached_property
     def loop(self) -> Any:
-        """A plain function that calls it for a record and a range of numbers, and returns how many calls fail."""
+        """A plain function that calls it for a record and a range of numbers, and returns how
+        many calls fail.
+        """
         version = _versioned(_loop, _task=self)
         version.__qualname__ = f"_loop.{self.symbol}"
         signature = types.int64(self.signature.args[0], types.int64, types.int64)
@@ -291,7 +332,8 @@ def _parts(function: Callable[..., Any]) -> list[Any]:
 
 
 def link(kernels: Sequence[Any], progress: Callable[[str], None] | None = None) -> None:
-    """Link kernels and the units that they call; compile those missing from the cache in several processes.
+    """Link kernels and the units that they call; compile those missing from the cache in several
+    processes.
 
     `progress` is called with progress messages if anything has to be compiled.
     """
@@ -317,9 +359,12 @@ def link(kernels: Sequence[Any], progress: Callable[[str], None] | None = None) 
 
 
 def _n_kept(order: Sequence[Any], first: int) -> int:
-    """Return the number of kernels before the next one that is neither cached nor compiled; compile that one."""
+    """Return the number of kernels before the next one that is neither cached nor compiled;
+    compile that one.
+    """
     for number, kernel in enumerate(order[first:], start=first):
-        is_compiled = "compiled" in vars(kernel)  # by this process, so that later calls need not look for it
+        # by this process, so that later calls need not look for it
+        is_compiled = "compiled" in vars(kernel)
         kernel.link()
         if not (is_compiled or kernel.was_cached):
             return number
@@ -328,7 +373,9 @@ def _n_kept(order: Sequence[Any], first: int) -> int:
 
 @contextlib.contextmanager
 def _only_compiler(folder: Path, say: Callable[[str], None]) -> Iterator[bool]:
-    """Wait until no other run compiles into this folder, to avoid double work; return whether one did."""
+    """Wait until no other run compiles into this folder, to avoid double work; return whether
+    one did.
+    """
     has_waited = False
     try:
         lock = (folder / LOCK_NAME).open("ab")
@@ -357,15 +404,23 @@ def _callees_first(kernel: Any) -> Iterator[Any]:
     yield kernel
 
 
-def _compile_apart(order: Sequence[Any], first: int, folder: Path, say: Callable[[str], None]) -> None:
-    """Compile kernels from the `first` into the cache, in one process per core and at most `MOST_COMPILING`."""
+def _compile_apart(
+    order: Sequence[Any], first: int, folder: Path, say: Callable[[str], None]
+) -> None:
+    """Compile kernels from the `first` into the cache, in one process per core and at most
+    `MOST_COMPILING`.
+    """
     kernels = order[first:]
     n_processes = min(MOST_COMPILING, os.cpu_count() or 1)
     if n_processes < 2 or not kernels or not sys.executable:
         return
-    sizes = {kernel: sum(len(part.__code__.co_code) for part in _parts(kernel.function)) for kernel in kernels}
+    sizes = {
+        kernel: sum(len(part.__code__.co_code) for part in _parts(kernel.function))
+        for kernel in kernels
+    }
     names = [
-        f"{kernel.__module__}:{kernel.__name__}" for kernel in sorted(kernels, key=sizes.__getitem__, reverse=True)
+        f"{kernel.__module__}:{kernel.__name__}"
+        for kernel in sorted(kernels, key=sizes.__getitem__, reverse=True)
     ]
     with contextlib.ExitStack() as stack:
         try:
@@ -375,7 +430,8 @@ def _compile_apart(order: Sequence[Any], first: int, folder: Path, say: Callable
         # Only this process reacts to Ctrl-C, and then ends the others.
         code = (
             "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); "
-            f"from tetopt.system.kernels import compile_named; compile_named({names!r}, {claims!r}, {os.getpid()})"
+            f"from tetopt.system.kernels import compile_named; compile_named({names!r}, "
+            f"{claims!r}, {os.getpid()})"
         )
         command, environment = python_command("-c", code), python_environment()
         processes = [stack.enter_context(started(command, environment)) for _ in range(n_processes)]
@@ -385,10 +441,12 @@ def _compile_apart(order: Sequence[Any], first: int, folder: Path, say: Callable
 
 
 def compile_named(names: Sequence[str], claims: str, parent: int) -> None:
-    """Compile kernels, given as `module:name`, into numba's cache unless another process has claimed them.
+    """Compile kernels, given as `module:name`, into numba's cache unless another process has
+    claimed them.
 
-    The symbols that they call are placeholders here, so none may be called in this process. It ends when `parent`
-    ends, or when code cannot be kept; `parent` then compiles the rest and warns the user.
+    The symbols that they call are placeholders here, so none may be called in this process. It ends
+    when `parent` ends, or when code cannot be kept; `parent` then compiles the rest and warns the
+    user.
     """
     warnings.simplefilter("ignore")
     warnings.simplefilter("error", NotKeptWarning)
@@ -429,7 +487,10 @@ def _run_plain(task: Unit, n: int, values: Any) -> int:
 
     def fraction(thread: int) -> int:
         record = cast(values, task.signature.args[0], task.__name__, thread)
-        return sum(loop(record, first, min(first + step, n)) for first in range(thread * step, n, n_threads * step))
+        return sum(
+            loop(record, first, min(first + step, n))
+            for first in range(thread * step, n, n_threads * step)
+        )
 
     with ThreadPoolExecutor(n_threads) as threads:
         return sum(threads.map(fraction, range(n_threads)))
@@ -438,7 +499,8 @@ def _run_plain(task: Unit, n: int, values: Any) -> int:
 def run(task: Any, n: int, values: Any) -> None:
     """Call a unit `task(values, number)` for all numbers below n, on numba's threads.
 
-    `values` is a record. The calls must be independent. If one fails, MemoryError is raised, the only error of units.
+    `values` is a record. The calls must be independent. If one fails, MemoryError is raised, the
+    only error of units.
     """
     if numba.config.DISABLE_JIT:
         for number in range(n):
@@ -450,11 +512,15 @@ def run(task: Any, n: int, values: Any) -> None:
     else:
         laid_out = packed(values)
         if laid_out.type != task.signature.args[0]:
-            raise TypeError(f"{task.__name__}: expected a {task.signature.args[0]}, got a {laid_out.type}")
+            raise TypeError(
+                f"{task.__name__}: expected a {task.signature.args[0]}, got a {laid_out.type}"
+            )
         with _LOOPING if numba.threading_layer() == "workqueue" else contextlib.nullcontext():
             n_failed = links().run(task.address, laid_out.address, n)
     if n_failed > 0:
-        raise MemoryError(f"{task.__name__}: {n_failed} of {n} calls could not allocate their arrays")
+        raise MemoryError(
+            f"{task.__name__}: {n_failed} of {n} calls could not allocate their arrays"
+        )
 
 
 # For functions that Python does not call.
@@ -476,7 +542,8 @@ def helper(function: Callable[..., Any]) -> Any:
     return _machine_code(_nrt=_counts(function))(function)
 
 
-inlined = njit(error_model="numpy", inline="always")  # a helper that numba inlines itself, before LLVM
+# a helper that numba inlines itself, before LLVM
+inlined = njit(error_model="numpy", inline="always")
 
 
 def own(records: Any) -> Any:
@@ -518,7 +585,8 @@ def _call(rows: Any, address: int, place: int) -> tuple[bool, bool]:
 
 
 def check_links() -> None:
-    """Compile a unit of nested records that allocates; call it by symbol, by address, and in the parallel loop.
+    """Compile a unit of nested records that allocates; call it by symbol, by address, and in the
+    parallel loop.
 
     Raises an error of any kind if one of these fails.
     """
@@ -530,10 +598,13 @@ def check_links() -> None:
     rows = packed(_Rows(_Row(x, 2.0), len(x)))
     failures = called(rows, multiplied.address, rows.address)
     n_threads = numba.get_num_threads()
-    numba.set_num_threads(1)  # OpenMP starts no threads then, which a fork of the user's would not survive
+    # OpenMP starts no threads then, which a fork of the user's would not survive
+    numba.set_num_threads(1)
     try:
         n_failed = links().run(multiplied.address, rows.address, len(x))
     finally:
         numba.set_num_threads(n_threads)
     if failures != (False, True) or n_failed != 0 or x.tolist() != [4.0, 4.0, 2.0]:
-        raise RuntimeError(f"a unit changed ones to {x}, its failures are {failures} and {n_failed}")
+        raise RuntimeError(
+            f"a unit changed ones to {x}, its failures are {failures} and {n_failed}"
+        )

@@ -13,7 +13,8 @@ HAS_LOCKS = fcntl is not None
 
 
 def lock_file(stream: IO[Any], *, is_shared: bool = False) -> bool:
-    """Lock an open file until it is closed; return False if another process holds it. Nothing is locked on Windows.
+    """Lock an open file until it is closed; return False if another process holds it. Nothing is
+    locked on Windows.
 
     Raises
     ------

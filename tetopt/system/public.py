@@ -1,8 +1,10 @@
-"""Check the arguments of all public functions by their annotations, with a one-line message for a mistake.
+"""Check the arguments of all public functions by their annotations, with a one-line message for a
+mistake.
 
-Functions check ranges (which exclude NaN), shapes and consistency themselves. Checking only Images, Meshes and other
-records would take a third of this code, but 227 of the 1505 wrong calls in tests/system/test_public.py would end in an
-AttributeError, a ValueError, an IndexError, a KeyError or an OverflowError from inner functions.
+Functions check ranges (which exclude NaN), shapes and consistency themselves. Checking only Images,
+Meshes and other records would take a third of this code, but 227 of the 1505 wrong calls in
+tests/system/test_public.py would end in an AttributeError, a ValueError, an IndexError, a KeyError
+or an OverflowError from inner functions.
 """
 
 from __future__ import annotations
@@ -60,9 +62,16 @@ def checked(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def unmasked(what: str, values: ArrayLike) -> NDArray:
-    """Return values as an array; InputError for masked ones, whose hidden numbers numpy would use."""
-    if isinstance(values, np.ma.MaskedArray) and (n_masked := int(np.ma.getmaskarray(values).sum())):
-        raise InputError(f"{what}: got {n_masked} masked values; replace them by numbers first, as by array.filled(0)")
+    """Return values as an array; InputError for masked ones, whose hidden numbers numpy would
+    use.
+    """
+    if isinstance(values, np.ma.MaskedArray) and (
+        n_masked := int(np.ma.getmaskarray(values).sum())
+    ):
+        raise InputError(
+            f"{what}: got {n_masked} masked values; replace them by numbers first, as by "
+            "array.filled(0)"
+        )
     return np.asarray(values)
 
 
@@ -83,9 +92,13 @@ def checked_simplices(
     except InputError:
         raise
     except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{what}: expected arrays of numbers for points and cells ({error})") from error
+        raise InputError(
+            f"{what}: expected arrays of numbers for points and cells ({error})"
+        ) from error
     if places.ndim != 2 or places.shape[1] not in (2, 3) or places.dtype.kind == "c":
-        got = f"{places.dtype} of shape {places.shape}" if places.dtype.kind == "c" else places.shape
+        got = (
+            f"{places.dtype} of shape {places.shape}" if places.dtype.kind == "c" else places.shape
+        )
         raise InputError(f"{what} points: expected shape (N, 2) or (N, 3), got {got}")
     width = n_corners or places.shape[1] + 1
     if nodes.ndim != 2 or nodes.shape[1] != width or len(nodes) == 0:
@@ -94,29 +107,42 @@ def checked_simplices(
         raise InputError(f"{what} cells: expected integers, got {nodes.dtype}")
     if not np.isfinite(places).all():
         first = int(np.flatnonzero(~np.isfinite(places).all(axis=1))[0])
-        raise InputError(f"{what} points: expected finite coordinates, but node {first} is {places[first].tolist()}")
+        raise InputError(
+            f"{what} points: expected finite coordinates, but node {first} is "
+            f"{places[first].tolist()}"
+        )
     if nodes.min() < 0 or nodes.max() >= len(places):
-        raise InputError(f"{what} cells: expected indices in 0..{len(places) - 1}, got {nodes.min()}..{nodes.max()}")
+        raise InputError(
+            f"{what} cells: expected indices in 0..{len(places) - 1}, got "
+            f"{nodes.min()}..{nodes.max()}"
+        )
     return places, np.array(nodes, dtype=np.int64, order="C")
 
 
 def _with_plain_numbers(value: Any, is_whole: bool) -> Any:
-    """Convert numpy's numbers, also in records, lists and options, to Python's: sums of 8 or 16 bits would overflow."""
+    """Convert numpy's numbers, also in records, lists and options, to Python's: sums of 8 or 16
+    bits would overflow.
+    """
     if isinstance(value, dict):
         return {key: _with_plain_numbers(each, False) for key, each in value.items()}
-    if isinstance(value, tuple | list) and any(isinstance(each, np.number | float) for each in value):
+    if isinstance(value, tuple | list) and any(
+        isinstance(each, np.number | float) for each in value
+    ):
         plain = [_with_plain_numbers(each, is_whole) for each in value]
         return value._make(plain) if hasattr(value, "_make") else type(value)(plain)
-    if isinstance(value, np.integer) or (is_whole and isinstance(value, float | np.floating) and value.is_integer()):
+    if isinstance(value, np.integer) or (
+        is_whole and isinstance(value, float | np.floating) and value.is_integer()
+    ):
         return int(value)
     return float(value) if isinstance(value, np.floating) else value
 
 
 def check_arguments(function: Callable[..., Any], arguments: dict[str, Any]) -> None:
-    """Raise InputError unless the arguments, by name, have the types that the function's annotations name.
+    """Raise InputError unless the arguments, by name, have the types that the function's
+    annotations name.
 
-    Checked annotations are Images, Meshes and other records, numbers, strings, paths, arrays, sequences and dicts of
-    these, and classes of the function's module. All others are ignored.
+    Checked annotations are Images, Meshes and other records, numbers, strings, paths, arrays,
+    sequences and dicts of these, and classes of the function's module. All others are ignored.
     """
     for name, value in arguments.items():
         parameter = inspect.signature(function).parameters[name]
@@ -128,14 +154,22 @@ def check_arguments(function: Callable[..., Any], arguments: dict[str, Any]) -> 
 
 
 def _check(what: str, annotation: str, value: Any, names: dict[str, Any]) -> None:
-    """Raise InputError unless `value` has one of the types between the annotation's bars, or one of them is unknown."""
+    """Raise InputError unless `value` has one of the types between the annotation's bars, or one
+    of them is unknown.
+    """
     kinds = re.split(r" \| (?![^\[]*\])", annotation)
     unmasked(what, value) if isinstance(value, np.ma.MaskedArray) else None
     answers = [_is_of(kind, value, names) for kind in kinds]
     if True in answers or None in answers:
-        if "Sizes" in kinds and isinstance(value, tuple):  # a record whose constructor checks nothing
+        # a record whose constructor checks nothing
+        if "Sizes" in kinds and isinstance(value, tuple):
             for field, kind in type(value).__annotations__.items():
-                _check(f"{what}.{field}", getattr(kind, "__forward_arg__", str(kind)), getattr(value, field), names)
+                _check(
+                    f"{what}.{field}",
+                    getattr(kind, "__forward_arg__", str(kind)),
+                    getattr(value, field),
+                    names,
+                )
         return
     expected = " or ".join(_in_words(kind, names) for kind in kinds)
     remedy = next((f"; {REMEDIES[kind]}" for kind in kinds if kind in REMEDIES), "")
@@ -152,7 +186,9 @@ def _is_of(kind: str, value: Any, names: dict[str, Any]) -> bool | None:
     if kind in ("str", "bool", "Path"):
         return isinstance(value, {"str": str, "bool": bool | np.bool_, "Path": Path}[kind])
     if head in ARRAY_WORDS:
-        return _is_array(value) and (head not in TABLE_WORDS or (isinstance(value, np.ndarray) and value.ndim == 2))
+        return _is_array(value) and (
+            head not in TABLE_WORDS or (isinstance(value, np.ndarray) and value.ndim == 2)
+        )
     if head in ("dict", "Mapping"):
         return isinstance(value, dict if head == "dict" else Mapping)
     if head == "Callable":
@@ -161,7 +197,9 @@ def _is_of(kind: str, value: Any, names: dict[str, Any]) -> bool | None:
         if isinstance(value, str) or not isinstance(value, Iterable):
             return False
         item = inner.split(",")[0]
-        return not isinstance(value, list | tuple) or all(_is_of(item, each, names) is not False for each in value)
+        return not isinstance(value, list | tuple) or all(
+            _is_of(item, each, names) is not False for each in value
+        )
     known = getattr(tetopt, kind) if kind in REMEDIES else names.get(kind)
     if get_origin(known) is Literal:  # the function itself checks the value
         return isinstance(value, str)
@@ -185,7 +223,8 @@ def _is_number(value: Any, is_whole: bool) -> bool:
 def _is_array(value: Any) -> bool:
     try:
         return np.asarray(value).dtype.kind in "buif"
-    except (TypeError, ValueError):  # rows of different lengths, or an object that numpy cannot convert
+    # rows of different lengths, or an object that numpy cannot convert
+    except (TypeError, ValueError):
         return False
 
 
@@ -197,5 +236,8 @@ def _shown(value: Any) -> str:
         text = ascii(value) if isinstance(value, str) else str(value)
         return text if len(text) <= 80 else f"{text[:77]}..."
     if type(value) in (list, tuple):  # no record
-        return f"{type(value).__name__} of {', '.join(sorted({type(each).__name__ for each in value})) or 'nothing'}"
+        return (
+            f"{type(value).__name__} of "
+            f"{', '.join(sorted({type(each).__name__ for each in value})) or 'nothing'}"
+        )
     return f"{type(value).__module__}.{type(value).__qualname__}".removeprefix("builtins.")

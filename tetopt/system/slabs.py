@@ -12,13 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 SLABS_PER_THREAD = 16  # as some take longer than others, and temporaries are as large as a slab
-SLAB_ELEMENTS = 1 << 16  # of a slab at least: waking a thread for fewer takes longer than their work
+# of a slab at least: waking a thread for fewer takes longer than their work
+SLAB_ELEMENTS = 1 << 16
 
 Result = TypeVar("Result")
 
 
-def over_slabs(fill: Callable[[int, int], Result], n: int, n_elements: int, most: int | None = None) -> list[Result]:
-    """Call a function with the first position and the end of each of some slabs, and return its results in order.
+def over_slabs(
+    fill: Callable[[int, int], Result], n: int, n_elements: int, most: int | None = None
+) -> list[Result]:
+    """Call a function with the first position and the end of each of some slabs, and return its
+    results in order.
 
     Parameters
     ----------
@@ -43,7 +47,8 @@ def over_slabs(fill: Callable[[int, int], Result], n: int, n_elements: int, most
 def sum_over_slabs(
     count: Callable[[int, int], NDArray[np.int64]], n: int, n_elements: int, n_counts: int
 ) -> NDArray[np.int64]:
-    """Sum the `n_counts` whole numbers that a function counts in each of some slabs; arguments as for `over_slabs`.
+    """Sum the `n_counts` whole numbers that a function counts in each of some slabs; arguments as
+    for `over_slabs`.
 
     The more numbers, the fewer slabs, so that all counts together take a byte per element at most.
     """

@@ -1,6 +1,8 @@
-"""Work directories: the folders of unfinished runs, made by tetopt, for its owner alone and for one run at a time.
+"""Work directories: the folders of unfinished runs, made by tetopt, for its owner alone and for one
+run at a time.
 
-A cohort (OUT/.work) and a mesh in parts (MESH.work) each have one. Its lock file tells it from a folder of the user's.
+A cohort (OUT/.work) and a mesh in parts (MESH.work) each have one. Its lock file tells it from a
+folder of the user's.
 """
 
 from __future__ import annotations
@@ -19,13 +21,18 @@ WORK_LOCK_NAME = "tetopt-lock"
 
 
 def check(path: Path) -> None:
-    """Raise InputError for anything but a work directory, or an empty folder, which may become one."""
+    """Raise InputError for anything but a work directory, or an empty folder, which may become
+    one.
+    """
     kind = irregular(path, follow=False) or "a file"
     if kind == "a folder" and any(path.iterdir()) and not (path / WORK_LOCK_NAME).is_file():
         kind = f"a folder without {WORK_LOCK_NAME}"
     elif kind == "a folder":
         return
-    raise InputError(f"{path}: expected a work directory of tetopt's, got {kind}; move it away and run this again")
+    raise InputError(
+        f"{path}: expected a work directory of tetopt's, got {kind}; move it away and run this "
+        "again"
+    )
 
 
 def create(path: Path) -> None:
@@ -40,7 +47,8 @@ def create(path: Path) -> None:
 
 @contextmanager
 def locked(path: Path, keys: Sequence[str] | None = None) -> Iterator[None]:
-    """Lock a work directory, created if missing, for a single run; with `keys`, runs of other keys may share it.
+    """Lock a work directory, created if missing, for a single run; with `keys`, runs of other keys
+    may share it.
 
     A lock ends with its process, even if the process is killed.
 
@@ -60,14 +68,18 @@ def locked(path: Path, keys: Sequence[str] | None = None) -> Iterator[None]:
 def _lock(stack: ExitStack, path: Path, what: str, *, is_shared: bool) -> None:
     """Lock a file until the stack is unwound; it names the run, unless others share the lock."""
     if path.is_symlink():  # another file would be emptied
-        raise InputError(f"{path}: expected a regular file, got a link; move it away and run this again")
+        raise InputError(
+            f"{path}: expected a regular file, got a link; move it away and run this again"
+        )
     if not HAS_LOCKS:
         return
     stream = stack.enter_context(path.open("a+", encoding="utf-8", errors="replace"))
     if not lock_file(stream, is_shared=is_shared):
         stream.seek(0)
         whose = stream.read(200).strip() or "another process"
-        raise InputError(f"{what}: another run is writing there ({whose}); wait until it ends, or stop it")
+        raise InputError(
+            f"{what}: another run is writing there ({whose}); wait until it ends, or stop it"
+        )
     stream.truncate(0)
     if not is_shared:
         stack.callback(stream.truncate, 0)
@@ -76,9 +88,12 @@ def _lock(stack: ExitStack, path: Path, what: str, *, is_shared: bool) -> None:
 
 
 def discard(path: Path, names: Sequence[str]) -> list[str]:
-    """Remove tetopt's files, by patterns of their names, and the folder; return the names of others, which stay."""
+    """Remove tetopt's files, by patterns of their names, and the folder; return the names of
+    others, which stay.
+    """
     for name in names:
-        for pattern in (name, f".{name}.????????.*"):  # the second: a killed run was writing it, see `written_whole`
+        # the second: a killed run was writing it, see `written_whole`
+        for pattern in (name, f".{name}.????????.*"):
             for file in path.glob(pattern):
                 if not file.is_dir():
                     file.unlink(missing_ok=True)
