@@ -631,7 +631,10 @@ def test_an_image_of_another_box_is_rejected_unless_registered(folder, tmp_path,
     for name in ("finer", "half_off"):
         assert exit_code(*convert, tmp_path / f"{name}.nii") == 0
         assert "a.vtu was built from a different image" in capsys.readouterr().err
-    expected = r"tetopt: .*moved.nii: expected the box of .*a.vtu's image, a.nii.gz, .* mm, got .* pass --registered\n"
+    expected = (
+        r"tetopt: .*moved.nii: expected the box of .*a.vtu's image, a.nii.gz, .* mm, "
+        r"got .* pass --registered\n"
+    )
     fem = ["fem", tmp_path / "moved.nii", folder / "a.vtu", *mapping, "--load", "compress:1%"]
     for words in ([*convert, tmp_path / "moved.nii"], fem):
         assert exit_code(*words) == 2

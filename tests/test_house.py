@@ -310,8 +310,8 @@ def test_only_the_command_prints():
 # What forks on voxels that are only stored, or on parts; the methods of `Image` and `Task.way`
 # stand for it.
 FORK = re.compile(
-    r"\.is_stored\b|\bStored(Image|Content|Source)\b|\bn_parts (is|==|!=|<|>)|\bisinstance\([^)]*\bSource\b"
-    r"|tetopt\.parts\b"
+    r"\.is_stored\b|\bStored(Image|Content|Source)\b|\bn_parts (is|==|!=|<|>)"
+    r"|\bisinstance\([^)]*\bSource\b|tetopt\.parts\b"
 )
 
 

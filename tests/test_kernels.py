@@ -199,7 +199,8 @@ started, start = [], kernels.started
 kernels.started = lambda *words: started.append(1) or start(*words)
 kernels.link([k.step_7])
 kernels.link([k.step_7])  # compiles nothing again
-print(k.step_7(k.Row(np.ones(3)), 2), len(started), [f.was_cached for f in (k.step_0, k.step_3, k.step_7)])
+cached = [f.was_cached for f in (k.step_0, k.step_3, k.step_7)]
+print(k.step_7(k.Row(np.ones(3)), 2), len(started), cached)
 """
 
 
@@ -365,7 +366,8 @@ from tetopt.system import kernels
 kernels._compile_apart = lambda *_: None  # what is compiled is compiled here
 {before}
 kernels.link([k.step_2])
-print(k.step_2(k.Row(np.ones(3)), 2), k.plain(2.0), [f.was_cached for f in (k.step_0, k.step_1, k.step_2)])
+cached = [f.was_cached for f in (k.step_0, k.step_1, k.step_2)]
+print(k.step_2(k.Row(np.ones(3)), 2), k.plain(2.0), cached)
 """
 PLAIN = """
 from tetopt.system.kernel_cache import njit
@@ -646,7 +648,8 @@ except MemoryError as error:
 row = Row(np.zeros(4), 4)
 row.x.flags.writeable = False  # numba takes it for another type
 run(large, 4, row)
-print(over_it(row), row.x, last_doubled(np.ones(3)), over_it(row._replace(x=np.ones(4))), kernels.links() is None)
+replaced = over_it(row._replace(x=np.ones(4)))
+print(over_it(row), row.x, last_doubled(np.ones(3)), replaced, kernels.links() is None)
 """
 UNKNOWN_SYMBOLS = """
 add = llvmlite.binding.add_symbol

@@ -22,10 +22,11 @@ USAGE = (
     "[options of tetopt cohort]"
 )
 ABOUT = """
-Mesh the images of a BIDS dataset. participant: mesh the given subjects, or all; several such runs, each with its own
-subjects, may write to the same OUT at the same time. group: write the table and the page of all subjects in OUT.
-Options of `tetopt cohort`, including those of `tetopt mesh`, follow the level (python -m tetopt cohort --help);
-their names may contain underscores instead of hyphens.
+Mesh the images of a BIDS dataset. participant: mesh the given subjects, or all; several such runs,
+each with its own subjects, may write to the same OUT at the same time. group: write the table and
+the page of all subjects in OUT. Options of `tetopt cohort`, including those of `tetopt mesh`,
+follow the level (python -m tetopt cohort --help); their names may contain underscores instead of
+hyphens.
 """
 
 
@@ -55,8 +56,8 @@ def cohort_words(arguments: Sequence[str]) -> list[str]:
 
     Examples
     --------
-    >>> cohort_words(["/data", "/out", "participant", "--participant_label", "01", "02", "--max_gb", "8"])
-    ['cohort', '/data', '--output=/out', '--participant-label=01', '--participant-label=02', '--max-gb', '8']
+    >>> cohort_words(["/data", "/out", "participant", "--participant_label", "01", "--max_gb", "8"])
+    ['cohort', '/data', '--output=/out', '--participant-label=01', '--max-gb', '8']
     """
     hyphened = [_with_hyphens(word) for word in arguments]
     places = [place for place, word in enumerate(hyphened) if word in LEVELS]

@@ -211,7 +211,7 @@ class Image:
         Examples
         --------
         >>> image = tetopt.Image(np.zeros((4, 5, 6)), np.diag([2.0, 2.0, 3.0, 1.0]))
-        >>> image.to_world([[0, 0, 1], [-0.5, -0.5, -0.5]])  # a voxel's centre, and the box's corner
+        >>> image.to_world([[0, 0, 1], [-0.5, -0.5, -0.5]])  # a voxel's centre, the box's corner
         array([[ 0. ,  0. ,  3. ],
                [-1. , -1. , -1.5]])
         """
@@ -315,7 +315,8 @@ class Image:
 
         Examples
         --------
-        >>> stored = tetopt.Image.stored(np.memmap("scan.raw", dtype=np.int16, mode="w+", shape=(64, 64, 64)))
+        >>> voxels = np.memmap("scan.raw", dtype=np.int16, mode="w+", shape=(64, 64, 64))
+        >>> stored = tetopt.Image.stored(voxels)
         >>> list(stored.boxes())
         [(slice(0, 64, None), slice(0, 64, None), slice(0, 64, None))]
         """

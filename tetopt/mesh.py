@@ -125,7 +125,8 @@ class Mesh:
 
         Examples
         --------
-        >>> mesh = tetopt.Mesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]], [[0.5, -0.1], [0, 0.5], [0.5, 0.5]])
+        >>> middles = [[0.5, -0.1], [0, 0.5], [0.5, 0.5]]
+        >>> mesh = tetopt.Mesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]], middles)
         >>> pieces, n_pieces = mesh.straight_pieces()
         >>> n_pieces, [round(float(each.cell_volumes.sum()), 4) for each in (mesh, pieces)]
         (4, [0.5667, 0.55])

@@ -132,8 +132,10 @@ def test_a_cohort_of_nothing_has_a_page(tmp_path):
 # What a reader does, one step after the other, and what is there then.
 STEPS = """<script>
 const say = (words) => {
-  document.body.append(Object.assign(document.createElement("p"), {className: "said", textContent: words})); };
-const first = () => [...document.querySelectorAll(".name b")].slice(0, 3).map((e) => e.textContent).join(" ");
+  const options = {className: "said", textContent: words};
+  document.body.append(Object.assign(document.createElement("p"), options)); };
+const first = () =>
+  [...document.querySelectorAll(".name b")].slice(0, 3).map((e) => e.textContent).join(" ");
 const pick = (name, value) => { const e = document.querySelector(`[aria-label="${name}"]`);
   e.value = value; e.dispatchEvent(new Event(e.type === "search" ? "input" : "change")); };
 const head = (words) =>
@@ -146,11 +148,13 @@ head("subject"); say(first());
 document.querySelectorAll(".pager button")[1].click(); say(first() + pager());
 pick("Which subjects", "odd"); say(pager());
 pick("Which subjects", "failed"); say(pager());
-pick("Which subjects", "all"); pick("Filter by text", "LPS"); say(first()); pick("Filter by text", "");
+pick("Which subjects", "all"); pick("Filter by text", "LPS"); say(first());
+pick("Filter by text", "");
 document.querySelectorAll(".bar")[1].dispatchEvent(new Event("click")); say(first() + pager());
 document.querySelector(".chips button").click(); say(pager());
 pick("How", "pictures"); say(document.querySelectorAll(".tile img").length + " tiles");
-document.querySelectorAll(".said").forEach((e) => e.hidden = true); heights.push(document.documentElement.scrollHeight);
+document.querySelectorAll(".said").forEach((e) => e.hidden = true);
+heights.push(document.documentElement.scrollHeight);
 heights.forEach(say);
 </script>"""
 
@@ -183,11 +187,13 @@ def test_a_browser_sorts_and_filters(cohort, tmp_path):
 
 
 BARS = """<script>
-const chart = [...document.querySelectorAll(".chart")].find((e) => e.textContent.includes("volume of the mask"));
+const chart = [...document.querySelectorAll(".chart")]
+  .find((e) => e.textContent.includes("volume of the mask"));
 const bars = [...chart.querySelectorAll("title")].map((e) => e.textContent);
 const feet = [...chart.querySelectorAll(".foot span")].map((e) => e.textContent);
 for (const words of [bars[0], bars[bars.length - 1], ...feet])
-  document.body.append(Object.assign(document.createElement("p"), {className: "said", textContent: words}));
+  document.body.append(
+    Object.assign(document.createElement("p"), {className: "said", textContent: words}));
 </script>"""
 
 

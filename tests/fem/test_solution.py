@@ -673,12 +673,15 @@ from tetopt.fem.solution import solution_fields, solve
 from tetopt.model.build import build_model
 
 image = tetopt.Image(np.random.default_rng(0).uniform(1.0, 50.0, (12, 12, 12)))
-model = build_model(tetopt.lattice_mesh(image, nodes=4200), image, young="1 + h", loads=["compress:5%"])
+mesh = tetopt.lattice_mesh(image, nodes=4200)
+model = build_model(mesh, image, young="1 + h", loads=["compress:5%"])
 solution = solve(model)
 fields = solution_fields(model.mesh, solution)
 assert solution.n_iterations > 5 and len(solution.system.free) > 10_000
-numbers = [solution.u, solution.stress, fields.point_data["stress_nodes"], *solution.reactions.values()]
-print(hashlib.sha256(b"".join(each.tobytes() for each in numbers)).hexdigest(), repr(solution.strain_energy))
+nodal = fields.point_data["stress_nodes"]
+numbers = [solution.u, solution.stress, nodal, *solution.reactions.values()]
+digest = hashlib.sha256(b"".join(each.tobytes() for each in numbers)).hexdigest()
+print(digest, repr(solution.strain_energy))
 """
 
 

@@ -539,7 +539,8 @@ def texts_in_meshes(draw):
         b"lps",
     )
     array = (
-        f'<DataArray type="UInt8" Name="{field}" NumberOfTuples="{len(content)}" format="ascii">'.encode()
+        f'<DataArray type="UInt8" Name="{field}" NumberOfTuples="{len(content)}" '.encode()
+        + b'format="ascii">'
         + b" ".join(b"%d" % byte for byte in content)
         + b"</DataArray>"
     )

@@ -38,8 +38,8 @@ OUTSIDE_VOXELS = 1e-3  # of digits that a text leaves out
 MOST_CONDITION = 1e6  # of an affine whose inverse tells where a node is
 # What a library has said itself, past tetopt.
 RAW_TEXT = re.compile(
-    r"0x[0-9a-f]{8}|\.cxx|itk::|vtk\w+ \(|Generic Warning|^Warning|^ERROR|\.py:\d+|Traceback|terminate called|libpng|"
-    r"TIFF|RuntimeWarning|UserWarning|DeprecationWarning|^WARNING"
+    r"0x[0-9a-f]{8}|\.cxx|itk::|vtk\w+ \(|Generic Warning|^Warning|^ERROR|\.py:\d+|Traceback|"
+    r"terminate called|libpng|TIFF|RuntimeWarning|UserWarning|DeprecationWarning|^WARNING"
 )
 # outputs before the one that failed
 SAID_WRITTEN = re.compile("^written before the error: |is kept", re.MULTILINE)

@@ -943,9 +943,8 @@ def toml(rng, data):
     if how == "value":
         rows[k] = f"{key} = {toml_value(rng)}"
     elif how == "key":
-        rows[k] = (
-            f"{one_of(rng, ['x', 'kind', '__class__', 'a.b.c', 'size_mm.x', 'shape', '[shape]'])} = {toml_value(rng)}"
-        )
+        keys = ["x", "kind", "__class__", "a.b.c", "size_mm.x", "shape", "[shape]"]
+        rows[k] = f"{one_of(rng, keys)} = {toml_value(rng)}"
     elif how == "doubled":
         rows.insert(k, rows[k])
     elif how == "gone":

@@ -55,7 +55,8 @@ TABLES = {
     "lut.txt": b"# labels\n0 Unknown 0 0 0 0\n1 left-lung 10 20 30 0\n2 liver 40 50 60 0\n",
     "snap.txt": b'0 0 0 0 0 0 0 "Clear"\n1 255 0 0 1 1 1 "left lung"\n2 0 255 0 1 1 1 "liver"\n',
     "dseg.tsv": b"index\tname\tcolor\n1\tleft lung\t#ff0000\n2\tliver\t#00ff00\n",
-    "slicer.csv": b"LabelValue,Name,Color_R,Color_G,Color_B,Color_A\n1,lung,10,20,30,255\n2,liver,40,50,60,255\n",
+    "slicer.csv": b"LabelValue,Name,Color_R,Color_G,Color_B,Color_A\n1,lung,10,20,30,255\n"
+    b"2,liver,40,50,60,255\n",
 }
 MAPPINGS = {
     "mapping.toml": b'label = ["0", "1", "*"]\n'

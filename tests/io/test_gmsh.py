@@ -398,10 +398,7 @@ def test_names_that_are_taken(version, kind):
     model = unlabelled(sample_model())
     members = next(iter(getattr(model.sets, kind).values()))
     model = model._replace(sets=model.sets._replace(**{kind: {"Material_2": members}}))
-    with pytest.raises(
-        InputError,
-        match=r'^set Material_2: the file uses the name "Material_2" for something else; rename the set',
-    ):
+    with pytest.raises(InputError, match=r'^set Material_2: the file uses the name "Material_2"'):
         WRITERS[version](model)
 
 

@@ -39,7 +39,8 @@ SLICER = """# Color table file C:/Users/a/Segmentation-label_ColorTable.ctbl
 2 connective_tissue 111 184 210 255
 3 (none) 0 0 0 0
 """
-SLICER_CSV = """LabelValue,Name,Color_R,Color_G,Color_B,Color_A,Category_CodeMeaning,Type_CodeMeaning
+SLICER_CSV = """LabelValue,Name,Color_R,Color_G,Color_B,Color_A,\
+Category_CodeMeaning,Type_CodeMeaning
 1,"kidney, left",185,102,83,255,Anatomical Structure,Kidney
 2,tumour,144,238,144,255,Morphologically Altered Structure,Neoplasm
 """

@@ -146,10 +146,7 @@ def test_order_2(n):
 
 def test_refused():
     model = sample_model()
-    with pytest.raises(
-        InputError,
-        match=r'^set material_1: the file uses the name "material_1" for something else; rename the set',
-    ):
+    with pytest.raises(InputError, match=r'^set material_1: the file uses the name "material_1"'):
         medit(model._replace(sets=Sets({}, {"material_1": np.array([0])})))
 
 
@@ -182,7 +179,8 @@ gmsh.logger.start()
 gmsh.open(sys.argv[1])
 mesh = gmsh.model.mesh
 order, points, _ = mesh.getNodes()
-elements = {str(entity): mesh.getElements(*entity)[2][0].tolist() for entity in gmsh.model.getEntities()}
+entities = gmsh.model.getEntities()
+elements = {str(entity): mesh.getElements(*entity)[2][0].tolist() for entity in entities}
 determinants = []
 for kind in mesh.getElementTypes(gmsh.model.getDimension()):
     places, _ = mesh.getIntegrationPoints(kind, "Gauss3")

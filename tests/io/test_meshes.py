@@ -57,12 +57,15 @@ def write_grid(path, cells, points):
 POINTS = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [9, 9, 9]]
 LINE, TRIANGLE, QUAD, TETRA, HEXAHEDRON, QUADRATIC = 3, 5, 9, 10, 12, 24
 
-VTU = """<?xml version="1.0"?><VTKFile type="UnstructuredGrid" version="0.1" byte_order="LittleEndian">
+VTU = """<?xml version="1.0"?>
+<VTKFile type="UnstructuredGrid" version="0.1" byte_order="LittleEndian">
 <UnstructuredGrid><Piece NumberOfPoints="5" NumberOfCells="1"><Points>
-<DataArray type="Float64" NumberOfComponents="3" format="ascii">0 0 0 1 0 0 0 1 0 0 0 {z} 5 5 5</DataArray></Points>
+<DataArray type="Float64" NumberOfComponents="3" format="ascii">
+0 0 0 1 0 0 0 1 0 0 0 {z} 5 5 5</DataArray></Points>
 <Cells><DataArray type="Int64" Name="connectivity" format="ascii">{nodes}</DataArray>
 <DataArray type="Int64" Name="offsets" format="ascii">4</DataArray>
-<DataArray type="UInt8" Name="types" format="ascii">10</DataArray></Cells></Piece></UnstructuredGrid></VTKFile>"""
+<DataArray type="UInt8" Name="types" format="ascii">10</DataArray></Cells>
+</Piece></UnstructuredGrid></VTKFile>"""
 
 
 # --------------------------------------------------------------------------------------------------

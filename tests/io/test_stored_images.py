@@ -297,7 +297,7 @@ def test_only_the_box_that_is_asked_for_is_read(pyramid, tmp_path):
     chunk = path / "0" / "c" / "0" / "1" / "0" / "0"
     chunk.write_bytes(chunk.read_bytes()[:9])
     assert load_image(path, volume=0, crop=[(0, 4), (None, None), (None, None)]).shape == (4, 5, 4)
-    message = rf"^{re.escape(str(path / '0'))}: its voxels 0:6, 0:5, 0:4 cannot be read \(.*\); copy it again$"
+    message = rf"^{re.escape(str(path / '0'))}: its voxels 0:6, 0:5, 0:4 cannot be read"
     with pytest.raises(InputError, match=message):
         load_image(path, volume=0)
     with pytest.raises(InputError, match=message.replace("0:6", "4:6")):

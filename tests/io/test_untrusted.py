@@ -173,12 +173,16 @@ def test_modules_of_the_current_folder_are_not_run(tmp_path):
 
 def vtu(*, points="4", compressor="", extra="", data=POINTS, head=b""):
     """A tetrahedron, its points appended."""
-    text = f"""<?xml version="1.0"?><VTKFile type="UnstructuredGrid" version="1.0" byte_order="LittleEndian"
- header_type="UInt64" {compressor}><UnstructuredGrid>{extra}<Piece NumberOfPoints="{points}" NumberOfCells="1"><Points>
-<DataArray type="Float64" Name="Points" NumberOfComponents="3" format="appended" offset="0"/></Points>
+    text = f"""<?xml version="1.0"?>
+<VTKFile type="UnstructuredGrid" version="1.0" byte_order="LittleEndian"
+ header_type="UInt64" {compressor}><UnstructuredGrid>{extra}
+<Piece NumberOfPoints="{points}" NumberOfCells="1"><Points>
+<DataArray type="Float64" Name="Points" NumberOfComponents="3" format="appended" offset="0"/>
+</Points>
 <Cells><DataArray type="Int64" Name="connectivity" format="ascii">0 1 2 3</DataArray>
 <DataArray type="Int64" Name="offsets" format="ascii">4</DataArray>
-<DataArray type="UInt8" Name="types" format="ascii">10</DataArray></Cells></Piece></UnstructuredGrid>
+<DataArray type="UInt8" Name="types" format="ascii">10</DataArray></Cells>
+</Piece></UnstructuredGrid>
 <AppendedData encoding="raw">_"""
     return text.encode() + head + data + b"</AppendedData></VTKFile>"
 

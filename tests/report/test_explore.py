@@ -191,7 +191,8 @@ PROBE = """<script>
 const said = {};
 const $ = (id) => document.getElementById(id);
 const canvas = document.querySelector("canvas");
-const press = (group, value) => [...$(group).children].find((b) => b.dataset.value === String(value)).click();
+const press = (group, value) =>
+  [...$(group).children].find((b) => b.dataset.value === String(value)).click();
 const put = (id, value) => { $(id).value = value; $(id).dispatchEvent(new Event("change")); };
 const slide = (id, value) => { $(id).value = value; $(id).dispatchEvent(new Event("input")); };
 const frame = () => new Promise((done) => setTimeout(done, 60));
@@ -203,14 +204,16 @@ const grid = () => {  // every ninth pixel
   const all = context.getImageData(0, 0, width, height).data;
   const colours = [];
   for (let y = 3; y < height; y += 9) {
-    for (let x = 3; x < width; x += 9) colours.push([x, y, ...all.subarray(4 * (y * width + x)).slice(0, 3)]);
+    for (let x = 3; x < width; x += 9)
+      colours.push([x, y, ...all.subarray(4 * (y * width + x)).slice(0, 3)]);
   }
   return colours;
 };
 const send = (type, x, y) => canvas.dispatchEvent(
   new PointerEvent(type, { pointerId: 1, clientX: x, clientY: y, bubbles: true }));
 const steps = {
-  first() {}, whole() { press("style", true); put("at-number", AT_0); }, turned() { press("side", true); },
+  first() {},
+  whole() { press("style", true); put("at-number", AT_0); }, turned() { press("side", true); },
   uncut() { press("axis", -1); },
   within() { put("low-number", 45); put("high-number", 60); }, crossed() { put("low-number", 70); },
   cut() { put("low-number", 45); put("high-number", 60); press("style", false); press("axis", 1);
@@ -220,7 +223,8 @@ const steps = {
 const warped = async () => {
   canvas.setPointerCapture = () => {};
   const names = (id) => [...$(id).children].map((option) => option.textContent);
-  const state = () => [$("warp-number").value, $("warped").textContent, $("field").selectedOptions[0].textContent,
+  const state = () => [$("warp-number").value, $("warped").textContent,
+    $("field").selectedOptions[0].textContent,
     $("extremes").textContent, Number(canvas.dataset.section)];
   said.about = $("about").textContent;
   said.names = [names("field"), names("by"), names("step")];
@@ -263,10 +267,11 @@ const run = async () => {
   for (const [name, act] of Object.entries(steps)) {
     act();
     await frame();
-    said[name] = [$("count").textContent, Number(canvas.dataset.surface), Number(canvas.dataset.section),
-      $("low-number").value, $("high-number").value];
+    said[name] = [$("count").textContent, Number(canvas.dataset.surface),
+      Number(canvas.dataset.section), $("low-number").value, $("high-number").value];
   }
-  said.labels = [...$("labels").children].map((entry) => [entry.textContent, entry.firstChild.style.background]);
+  said.labels = [...$("labels").children].map((entry) =>
+    [entry.textContent, entry.firstChild.style.background]);
   slide("low", 0); put("field", 0); press("side", false); press("axis", 2); put("at-number", AT_2);
   press("from", "S");
   await frame();
@@ -286,7 +291,8 @@ const run = async () => {
   await frame();
   const before = canvas.toDataURL();
   const changes = {
-    drag() { send("pointerdown", 100, 100); send("pointermove", 160, 120); send("pointerup", 160, 120); },
+    drag() { send("pointerdown", 100, 100); send("pointermove", 160, 120);
+      send("pointerup", 160, 120); },
     back() { press("from", "S"); },
     wheel() { canvas.dispatchEvent(new WheelEvent("wheel", { deltaY: 200, cancelable: true })); },
     backAgain() { press("from", "S"); },
@@ -304,7 +310,8 @@ const run = async () => {
   const labels = async () => {
     await frame();
     return [$("count").textContent, Number(canvas.dataset.surface), Number(canvas.dataset.glass),
-      $("field").selectedOptions[0].textContent, [...$("labels").children].map((entry) => entry.textContent),
+      $("field").selectedOptions[0].textContent,
+      [...$("labels").children].map((entry) => entry.textContent),
       canvas.toDataURL()];
   };
   put("set", -1); press("inside", "cells"); press("axis", -1); press("from", "S");

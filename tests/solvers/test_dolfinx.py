@@ -87,11 +87,13 @@ mu = young / (2 * (1 + nu))
 
 def product(u, v):
     strain = ufl.sym(ufl.grad(u))
-    return ufl.inner(lame * ufl.tr(strain) * ufl.Identity(dim) + 2 * mu * strain, ufl.sym(ufl.grad(v))) * ufl.dx
+    stress = lame * ufl.tr(strain) * ufl.Identity(dim) + 2 * mu * strain
+    return ufl.inner(stress, ufl.sym(ufl.grad(v))) * ufl.dx
 
 u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
 nothing = ufl.inner(fem.Constant(mesh, np.zeros(dim)), v) * ufl.dx
-u = LinearProblem(product(u, v), nothing, bcs, petsc_options={"ksp_type": "preonly", "pc_type": "lu"}).solve()
+options = {"ksp_type": "preonly", "pc_type": "lu"}
+u = LinearProblem(product(u, v), nothing, bcs, petsc_options=options).solve()
 read["energy"] = fem.assemble_scalar(fem.form(0.5 * product(u, u)))
 np.savez("read.npz", **read)
 """
@@ -214,7 +216,8 @@ if is_nodal:
     text = root.find(".//Grid[@Name='mesh']/Attribute[@Name='young_nodes']/DataItem").text
     young = fem.Function(fem.functionspace(mesh, ("Lagrange", 1)))
     node = np.array(mesh.geometry.input_global_indices)[flat(mesh.geometry.dofmap)]
-    young.x.array[flat(young.function_space.dofmap.list)] = np.array(text.split(), dtype=float)[node]
+    values = np.array(text.split(), dtype=float)[node]
+    young.x.array[flat(young.function_space.dofmap.list)] = values
 """
 
 SOLVE_LOADED = """
@@ -227,7 +230,8 @@ dx = ufl.dx(degree=2 * order - 2 if order == 2 else 1)
 
 def product(u, v):
     strain = ufl.sym(ufl.grad(u))
-    return ufl.inner(lame * ufl.tr(strain) * ufl.Identity(dim) + 2 * mu * strain, ufl.sym(ufl.grad(v))) * dx
+    stress = lame * ufl.tr(strain) * ufl.Identity(dim) + 2 * mu * strain
+    return ufl.inner(stress, ufl.sym(ufl.grad(v))) * dx
 
 def total(forms):
     nothing = ufl.inner(fem.Constant(mesh, np.zeros(dim)), v) * ufl.dx

@@ -31,7 +31,8 @@ from dolfinx.fem.petsc import LinearProblem
 
 corners = mesh.topology.connectivity(dim, 0).array.reshape(-1, dim + 1)
 nodes = getattr(mesh.geometry.dofmap, "array", mesh.geometry.dofmap).reshape(len(corners), -1)
-original_node, original_cell = np.array(mesh.geometry.input_global_indices), mesh.topology.original_cell_index
+original_node = np.array(mesh.geometry.input_global_indices)
+original_cell = mesh.topology.original_cell_index
 node_of_vertex = np.empty(corners.max() + 1, dtype=int)
 node_of_vertex[corners] = original_node[nodes[:, : dim + 1]]
 vertices = mesh.topology.connectivity(dim - 1, 0).array.reshape(-1, dim)
@@ -45,7 +46,9 @@ for each in root.findall(".//Grid[@Name='cells']/Information"):
     name = each.get("Name")
     read["cells " + name] = np.array(original_cell)[members(cell_tags, "cells", name)]
 
-vector = ufl.VectorElement("Lagrange", mesh.ufl_cell(), 2) if hasattr(ufl, "VectorElement") else ("Lagrange", 2, (dim,))
+vector = ("Lagrange", 2, (dim,))
+if hasattr(ufl, "VectorElement"):
+    vector = ufl.VectorElement("Lagrange", mesh.ufl_cell(), 2)
 V = fem.functionspace(mesh, vector)
 bcs = []
 for name, numbers in json.load(open("loads.json")).items():
@@ -57,11 +60,13 @@ dx = ufl.dx(metadata={"quadrature_degree": 2})
 
 def product(u, v):
     strain = ufl.sym(ufl.grad(u))
-    return ufl.inner(lame * ufl.tr(strain) * ufl.Identity(dim) + 2 * mu * strain, ufl.sym(ufl.grad(v))) * dx
+    stress = lame * ufl.tr(strain) * ufl.Identity(dim) + 2 * mu * strain
+    return ufl.inner(stress, ufl.sym(ufl.grad(v))) * dx
 
 u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
 nothing = ufl.inner(fem.Constant(mesh, np.zeros(dim)), v) * dx
-u = LinearProblem(product(u, v), nothing, bcs, petsc_options={"ksp_type": "preonly", "pc_type": "lu"}).solve()
+options = {"ksp_type": "preonly", "pc_type": "lu"}
+u = LinearProblem(product(u, v), nothing, bcs, petsc_options=options).solve()
 read["energy"] = fem.assemble_scalar(fem.form(0.5 * product(u, u)))
 np.savez("read.npz", **read)
 u.name = "displacement"

@@ -326,10 +326,7 @@ def test_an_error_names_the_file_and_a_full_disk_the_bytes(tmp_path, monkeypatch
 
 def test_space_is_asked_for(tmp_path):
     check_space(tmp_path / "a.vtu", 1)
-    with pytest.raises(
-        InputError,
-        match=r"a.vtu: needs at least 1000000000000000000 bytes, but only \d+ are free; free some space",
-    ):
+    with pytest.raises(InputError, match=r"a.vtu: needs at least 10{18} bytes, but only \d+ are"):
         check_space(tmp_path / "a.vtu", 10**18)
 
 

@@ -299,7 +299,7 @@ def units(unit: str, ndim: int) -> Callable[..., str]:
 
     Examples
     --------
-    >>> units("mm", 3)(1.43e6), units("bytes", 3)(2.5e9), units("s", 3)(90.0), units("", 3)(0.123456)
+    >>> units("mm", 3)(1.43e6), units("bytes", 3)(2.5e9), units("s", 3)(90.0), units("", 3)(0.1234)
     ('1.43 l', '2.5 GB', '1.5 min', '0.123')
     >>> units("mm", 3)(4e5, 1.43e6), units("mm", 3)(1.43e6, 4e5), units("mm", 3)(3e3, 1.43e6)
     ('0.4 l', '1.43 l', '3 ml')

@@ -203,7 +203,8 @@ class MeshingResult(NamedTuple):
         Examples
         --------
         >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-        >>> tetopt.mesh_image(image, 300, iterations=0).plot(off_screen=True).shape  # doctest: +SKIP
+        >>> result = tetopt.mesh_image(image, 300, iterations=0)
+        >>> result.plot(off_screen=True).shape  # doctest: +SKIP
         (768, 1024, 3)
         """
         if values is None and self.labels is not None:

@@ -555,7 +555,13 @@ def compression(
 
     >>> bar = Mesh([[0, 0], [1, 0], [1, 2], [0, 2]], [[0, 1, 2], [0, 2, 3]])
     >>> pressed = compression(
-    ...     bar, 10.0, 0.3, fixed_nodes=[2, 3], pushed_nodes=[0, 1], displacement=[0.0, 0.02], is_bonded=False
+    ...     bar,
+    ...     10.0,
+    ...     0.3,
+    ...     fixed_nodes=[2, 3],
+    ...     pushed_nodes=[0, 1],
+    ...     displacement=[0.0, 0.02],
+    ...     is_bonded=False,
     ... )
     >>> round(pressed.strain_energy, 12)
     0.001

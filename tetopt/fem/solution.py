@@ -155,7 +155,8 @@ def solve(model: Model, step: int = 1, method: Method = "auto") -> Solution:
     >>> from tetopt.model.sets import standard_sets
     >>> bar = tetopt.Mesh([[0, 0], [2, 0], [2, 1], [0, 1]], [[0, 1, 2], [0, 2, 3]])
     >>> words = ["hold:x_min", "traction:x_max:1,0"]
-    >>> model = tetopt.build_model(bar, young=10.0, nu=0.0, known_sets=standard_sets(bar), loads=words)
+    >>> sets = standard_sets(bar)
+    >>> model = tetopt.build_model(bar, young=10.0, nu=0.0, known_sets=sets, loads=words)
     >>> solution = tetopt.solve(model)
     >>> [(each.round(12) + 0.0).tolist() for each in (solution.u[1], solution.reactions["x_min"])]
     [[0.2, 0.0], [-1.0, 0.0]]

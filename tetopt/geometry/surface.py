@@ -57,7 +57,8 @@ class Surface(NamedTuple):
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
     >>> mesh = tetopt.lattice_mesh(image, nodes=300)
-    >>> surface = tetopt.extract_surface(mesh.points, mesh.cells, np.ones(len(mesh.cells), dtype=bool))
+    >>> whole = np.ones(len(mesh.cells), dtype=bool)
+    >>> surface = tetopt.extract_surface(mesh.points, mesh.cells, whole)
     >>> surface.triangles.shape, surface.n_parted
     ((260, 3), 0)
     """

@@ -183,7 +183,8 @@ def _materials(parts: list[_Part]) -> str:
             *(
                 f'<material id="{k}" name="{part.material}" type="neo-Hookean">\n'
                 f"{_parameter('density', part.density, DENSITY_MAP)}"
-                f"{_parameter('E', part.young, YOUNG_MAP)}{_parameter('v', part.nu, NU_MAP)}</material>\n"
+                f"{_parameter('E', part.young, YOUNG_MAP)}"
+                f"{_parameter('v', part.nu, NU_MAP)}</material>\n"
                 for k, part in enumerate(parts, start=1)
             ),
             "</Material>\n",

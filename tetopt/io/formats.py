@@ -124,8 +124,11 @@ def register_format(
 
     Examples
     --------
-    >>> tetopt.register_format(".xyz", lambda model: "\\n".join(map(str, model.mesh.points.tolist())), "points")
-    >>> tetopt.save_mesh("ball.xyz", tetopt.lattice_mesh(tetopt.load_phantom("sphere").image(voxel_mm=4), nodes=300))
+    >>> def xyz(model):
+    ...     return "\\n".join(map(str, model.mesh.points.tolist()))
+    >>> tetopt.register_format(".xyz", xyz, "points")
+    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    >>> tetopt.save_mesh("ball.xyz", tetopt.lattice_mesh(image, nodes=300))
     """
     suffix = suffix.lower()
     if not re.fullmatch(r"\.[a-z0-9_]+", suffix):

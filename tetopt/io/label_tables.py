@@ -89,7 +89,8 @@ def load_label_table(path: str | Path) -> LabelTable:
     Examples
     --------
     >>> from pathlib import Path
-    >>> _ = Path("labels.csv").write_text("label,name,color\\n1,liver,#b02020\\n2,spleen,#802060\\n")
+    >>> text = "label,name,color\\n1,liver,#b02020\\n2,spleen,#802060\\n"
+    >>> _ = Path("labels.csv").write_text(text)
     >>> table = tetopt.load_label_table("labels.csv")
     >>> table.names
     {1: 'liver', 2: 'spleen'}

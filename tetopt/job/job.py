@@ -59,7 +59,7 @@ class Job(JobOptions):
 
     Examples
     --------
-    >>> job = tetopt.Job(images="T1.nii.gz", output="brain.vtu", nodes=5000, young="0.5 + 0.01*h", loads="compress:5%")
+    >>> job = tetopt.Job(images="T1.nii.gz", output="brain.vtu", nodes=5000, young="0.5 + 0.01*h")
     >>> tetopt.Job.from_json(job.to_json()) == job
     True
     >>> tetopt.Job(images="T1.nii.gz", output="brain.vtu", nodes=5000, target_error=0.1)
@@ -125,7 +125,8 @@ class Job(JobOptions):
 
         Examples
         --------
-        >>> tetopt.Job.from_json('{"images": ["T1.nii.gz"], "output": "brain.vtu", "nodes": 300}').nodes
+        >>> text = '{"images": ["T1.nii.gz"], "output": "brain.vtu", "nodes": 300}'
+        >>> tetopt.Job.from_json(text).nodes
         300
         """
         try:

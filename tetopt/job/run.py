@@ -62,9 +62,12 @@ class Result(NamedTuple):
     Examples
     --------
     >>> tetopt.save_image("small.nii.gz", tetopt.load_phantom("sphere").image(voxel_mm=8))
-    >>> result = tetopt.run(tetopt.Job(images="small.nii.gz", output="small.vtu", nodes=60, iterations=1))
-    >>> result.model.mesh is result.mesh, result.numbers["size"]["n_nodes"] == len(result.mesh.points)
-    (True, True)
+    >>> job = tetopt.Job(images="small.nii.gz", output="small.vtu", nodes=60, iterations=1)
+    >>> result = tetopt.run(job)
+    >>> result.model.mesh is result.mesh
+    True
+    >>> result.numbers["size"]["n_nodes"] == len(result.mesh.points)
+    True
     """
 
     mesh: Mesh
@@ -123,7 +126,8 @@ def run(job: Job, on: Listener | None = None, stop: Callable[[], bool] | None = 
     Examples
     --------
     >>> tetopt.save_image("ball.nii.gz", tetopt.load_phantom("sphere").image(voxel_mm=4))
-    >>> result = tetopt.run(tetopt.Job(images="ball.nii.gz", output="ball.vtu", nodes=300, iterations=4))
+    >>> job = tetopt.Job(images="ball.nii.gz", output="ball.vtu", nodes=300, iterations=4)
+    >>> result = tetopt.run(job)
     >>> len(result.mesh.points), result.violated, result.numbers["ended"]
     (300, {}, 'iterations')
     """

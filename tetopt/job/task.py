@@ -86,7 +86,8 @@ class Meshed(NamedTuple):
     Examples
     --------
     >>> tetopt.save_image("small.nii.gz", tetopt.load_phantom("sphere").image(voxel_mm=8))
-    >>> meshed = tetopt.run(tetopt.Job(images="small.nii.gz", output="small.vtu", nodes=60, iterations=1)).meshed
+    >>> job = tetopt.Job(images="small.nii.gz", output="small.vtu", nodes=60, iterations=1)
+    >>> meshed = tetopt.run(job).meshed
     >>> sorted(meshed.seconds), meshed.result.history[-1].iteration
     (['load', 'optimize'], 1)
     """

@@ -212,7 +212,8 @@ class MaskFidelity(NamedTuple):
     >>> phantom = tetopt.load_phantom("sphere")
     >>> labels = phantom.label_image(voxel_mm=4)
     >>> mask = tetopt.Image(labels.data == 1, labels.affine)
-    >>> box = tetopt.mask_fidelity(mask, tetopt.lattice_mesh(labels, nodes=300))  # a mesh of the whole box
+    >>> mesh_of_box = tetopt.lattice_mesh(labels, nodes=300)
+    >>> box = tetopt.mask_fidelity(mask, mesh_of_box)
     >>> round(box.dice, 2), box.components, box.euler
     (0.24, 1, 2)
     """

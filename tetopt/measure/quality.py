@@ -33,7 +33,9 @@ class QualityErrors(NamedTuple):
 
     Examples
     --------
-    >>> mesh = tetopt.lattice_mesh(tetopt.Image(np.zeros((70, 70))), blocks=(7, 7))  # Table 1, third row
+    Table 1, third row:
+
+    >>> mesh = tetopt.lattice_mesh(tetopt.Image(np.zeros((70, 70))), blocks=(7, 7))
     >>> errors = tetopt.quality(mesh.points, mesh.cells).errors
     >>> f"{errors.mean:.4f} {errors.worst:.4f}"
     '0.0858 0.0858'
@@ -157,8 +159,10 @@ class Quality(NamedTuple):
     >>> numbers = tetopt.quality(mesh.points, mesh.cells)
     >>> numbers.n_nodes, numbers.n_cells, numbers.kinds["sliver"]
     (280, 1200, 0)
-    >>> print(f"{numbers.min_dihedral:.0f} to {numbers.max_dihedral:.0f} degrees, rho {numbers.mean_rho:.3f}")
-    39 to 124 degrees, rho 0.285
+    >>> print(f"{numbers.min_dihedral:.0f} to {numbers.max_dihedral:.0f} degrees")
+    39 to 124 degrees
+    >>> print(f"rho {numbers.mean_rho:.3f}")
+    rho 0.285
     """
 
     ndim: int

@@ -43,8 +43,8 @@ def counts_of(n_parts: int, lengths: Sequence[float]) -> tuple[int, ...]:
 
     Examples
     --------
-    >>> counts_of(4, (200.0, 230.0, 190.0)), counts_of(1, (1.0, 1.0, 1.0)), counts_of(12, (10.0, 20.0, 10.0))
-    ((2, 2, 1), (1, 1, 1), (2, 3, 2))
+    >>> counts_of(4, (200.0, 230.0, 190.0)), counts_of(12, (10.0, 20.0, 10.0))
+    ((2, 2, 1), (2, 3, 2))
     """
     counts = np.ones(len(lengths), dtype=np.int64)
     while np.prod(counts) < n_parts:

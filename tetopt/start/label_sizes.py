@@ -135,7 +135,8 @@ class SizesByLabel(NamedTuple):
     --------
     >>> phantom = tetopt.load_phantom("sphere")
     >>> content = tetopt.content(phantom.image(voxel_mm=4), phantom.label_image(voxel_mm=4))
-    >>> made = tetopt.sizes_by_label(tetopt.Sizes(edge_size=20.0, by_label={1: 8.0}), content, nodes=100)
+    >>> sizes = tetopt.Sizes(edge_size=20.0, by_label={1: 8.0})
+    >>> made = tetopt.sizes_by_label(sizes, content, nodes=100)
     >>> made.nodes > 100, made.scale > 1.0
     (True, True)
     """

@@ -262,7 +262,8 @@ class Sizes(NamedTuple):
         Examples
         --------
         >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-        >>> field = tetopt.Image(np.where(image.data > 60.0, 6.0, 0.0), image.affine)  # fine in the ball
+        >>> fine_in_ball = np.where(image.data > 60.0, 6.0, 0.0)
+        >>> field = tetopt.Image(fine_in_ball, image.affine)
         >>> sizes = tetopt.Sizes(edge_size=20.0, field=field)
         >>> sizes.at(np.array([[0.0, 0.0, 0.0], [30.0, 30.0, 30.0]])).tolist()
         [6.0, 20.0]
