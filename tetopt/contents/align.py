@@ -35,7 +35,7 @@ COARSER_STEP = 1e-3  # of a voxel by which one may exceed another's size and cou
 LOST_FRACTION = 0.1  # of a label's volume, whose loss in resampling is reported
 # times its connected components, above which a label's pieces after resampling are reported
 PIECES_FACTOR = 2
-REPORTED_LABELS = 5  # with the largest losses
+REPORTED_LABELS = 5  # those that keep the least
 SMALL_COMPONENT_FRACTION = 0.01  # of the largest component's voxels: smaller components are ignored
 SUSPECT_VOXELS = 200  # of a bright piece: a larger one is hardly noise
 KEEP_PIECES = "`labels` keep what they number; a `mask` replaces the rule"
@@ -186,42 +186,32 @@ def divided(image: Image, factors: Sequence[int]) -> Image:
 
 
 def _warn_of_loss(name: str, word: str, labels: Image, moved: Image) -> None:
-    """Warn of labels that vanish on the voxels of `moved`; on larger ones, also of lost volume
-    and of pieces.
+    """Warn of labels that vanish on the voxels of `moved`; on larger ones, also of those that lose
+    volume or fall into pieces.
     """
     if is_same_grid(labels, moved) or is_same_grid(labels, moved, is_cropped=True):
         return
     inside = np.where(in_box(moved, labels), labels.data, 0.0)
-    values, counts = np.unique(inside, return_counts=True)
-    left, counts_left = np.unique(moved.data, return_counts=True)
-    of_left = dict(zip(left.tolist(), (counts_left * moved.voxel_volume).tolist(), strict=True))
-    lost, pieces, is_coarser = (
-        list[tuple[float, str]](),
-        list[str](),
-        max(divisions(moved, [labels])) > 1,
-    )
-    for value, volume in zip(values.tolist(), (counts * labels.voxel_volume).tolist(), strict=True):
-        which = word if word == "the mask" else f"{word} {value:.10g}"
-        fraction = 1.0 - of_left.get(value, 0.0) / volume
-        if value > 0.0 and (fraction > LOST_FRACTION if is_coarser else value not in of_left):
-            lost.append(
-                (
-                    fraction,
-                    f"{which} loses {fraction:.0%} of its volume ({volume:.3g} mm{labels.ndim})",
-                )
-            )
-        elif value > 0.0 and is_coarser:
-            n_before, n_after = (_n_pieces(each == value) for each in (inside, moved.data))
-            if n_after > PIECES_FACTOR * n_before:
-                pieces.append(f"{which} falls into {n_after} pieces ({n_before} before)")
-    if lost or pieces:
-        every = [*(words for _, words in sorted(lost, reverse=True)), *pieces]
-        more = f"; and {len(every) - REPORTED_LABELS} more" * (len(every) > REPORTED_LABELS)
+    is_coarser = max(divisions(moved, [labels])) > 1
+    lost: list[tuple[float, str]] = []
+    for value in np.unique(inside[inside > 0.0]).tolist():
+        before, after = inside == value, moved.data == value
+        if after.any() and not is_coarser:
+            continue
+        volume = before.sum() * labels.voxel_volume
+        kept = after.sum() * moved.voxel_volume / volume
+        n_before, n_after = _n_pieces(before), _n_pieces(after)
+        if kept < 1.0 - LOST_FRACTION or n_after > PIECES_FACTOR * n_before:
+            which = word if word == "the mask" else f"{word} {value:.10g}"
+            words = f"{which} keeps {kept:.0%} of its volume ({volume:.3g} mm{labels.ndim})"
+            lost.append((kept, f"{words}, in {n_after} pieces instead of {n_before}"))
+    if lost:
+        listed = "; ".join(words for _, words in sorted(lost)[:REPORTED_LABELS])
+        more = f"; and {len(lost) - REPORTED_LABELS} more" * (len(lost) > REPORTED_LABELS)
         sizes = [" x ".join(f"{edge:.3g}" for edge in each.spacing) for each in (labels, moved)]
         warn(
-            f"{name}: resampled from voxels of {sizes[0]} mm to {sizes[1]} mm; "
-            f"{'; '.join(every[:REPORTED_LABELS])}"
-            f"{more}; resample the image to the finer voxels to keep them"
+            f"{name}: resampled from voxels of {sizes[0]} mm to {sizes[1]} mm; {listed}{more}; "
+            "resample the image to the finer voxels to keep them"
         )
 
 
@@ -378,29 +368,18 @@ def foreground(image: Image, level: float | None = None, labels: Image | None = 
     is_kept[bright[is_labelled]] = True
     dropped = sizes[~is_kept]
     is_inside = is_kept[bright]
-    fraction, least = (
-        float(is_inside.mean()),
-        LEAST_CLASS_FRACTION if level is None and labels is None else 0.0,
-    )
-    if least < fraction < 1.0 - least:
-        mask = Image(is_inside, image.affine)
-        return Foreground(mask, *(np.sort(voxels[voxels > 0])[::-1] for voxels in (dropped, kept)))
-    if level is None:
-        raise _no_background(
-            f"{100 * fraction:.4g} % of the voxels would be foreground at level {limit:.4g}"
+    fraction = float(is_inside.mean())
+    least = LEAST_CLASS_FRACTION if level is None and labels is None else 0.0
+    if not least < fraction < 1.0 - least:
+        low, high = image.range
+        instead = "" if labels is None else "; or give the labels as `mask`, with `mask_label`"
+        raise InputError(
+            f"`background` {'auto, ' * (level is None)}{limit:.4g}: {100.0 * fraction:.4g} % of "
+            "the voxels would be foreground; choose a level between the background's and the "
+            f"tissue's values (the image ranges from {low:g} to {high:g}){instead}"
         )
-    low, high = image.range
-    instead = (
-        "; or give the labels' file as `mask`, with `mask_label`"
-        if 0.0 < is_labelled.mean() < 1.0
-        else ""
-    )
-    outcome = "every voxel is foreground" if fraction > 0.5 else "no voxel is foreground"
-    raise InputError(
-        f"`background` {limit:g}: {outcome}; choose a level between the background's and the "
-        "tissue's values (the "
-        f"image ranges from {low:g} to {high:g}){instead}"
-    )
+    mask = Image(is_inside, image.affine)
+    return Foreground(mask, *(np.sort(voxels[voxels > 0])[::-1] for voxels in (dropped, kept)))
 
 
 class FilledHoles(NamedTuple):
