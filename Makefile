@@ -13,7 +13,7 @@ export PYTHONDONTWRITEBYTECODE =
 
 SOLVERS = calculix-ccx python3-dolfinx
 
-.PHONY: demo check test test-deep test-mutants dist test-lowest test-pythons test-slow test-random test-solvers test-nojit test-onethread test-plain test-bounds test-hostile test-container test-slurm test-cohort test-parts lint bench measured bench-blocks fingerprints docs clean
+.PHONY: demo check test test-deep test-mutants dist test-lowest test-pythons test-slow test-random test-solvers test-nojit test-onethread test-plain test-bounds test-hostile test-container test-slurm test-cohort lint bench measured fingerprints docs clean
 
 demo: $(VENV)/.demo
 	$(BIN)/tetopt demo -o demo --force
@@ -116,12 +116,6 @@ test-cohort: $(VENV)/.test
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt warm-up
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python tests/cohort/campaign.py
 
-# The MNI152 brain in parts on dask's workers, which are killed, interrupted and out of disk; then its seams: ten minutes.
-test-parts: $(VENV)/.test
-	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt warm-up
-	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python tests/parts/campaign.py
-	NUMBA_CACHE_DIR=$(NUMBA_CACHE) PYTHONPATH=tests $(BIN)/python tests/parts/seams.py
-
 # The site, into docs/_build/html, without the network; warnings are errors. The gallery's programs run, for minutes.
 docs: $(VENV)/.test
 	rm -rf docs/_build docs/reference/api/generated
@@ -146,13 +140,6 @@ bench: $(VENV)/.test
 measured: $(VENV)/.test
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt warm-up
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python scripts/measure.py $(DATA) $(PEERS)
-
-# Memory and time of a mesh in parts, of EDGE^3 voxels: 1024 takes three quarters of an hour, and 2 GB in FOLDER.
-EDGE ?= 1024
-FOLDER ?= /tmp
-bench-blocks: $(VENV)/.test
-	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt warm-up
-	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python tests/benchmarks/benchmark_blocks.py $(EDGE) --folder $(FOLDER) -o bench_blocks.json --force
 
 # Whether meshes are still those of the version that wrote tests/fingerprints.json, to the last bit.
 fingerprints: $(VENV)/.test

@@ -197,7 +197,6 @@ MEASUREMENTS = {
         (
             "tetopt mesh $T1 -o n15000.vtu --json n15000.json --nodes 15000 --force",
             "tetopt mesh $T1 -o n40000.vtu --json n40000.json --nodes 40000 --force",
-            "tetopt mesh $T1 -o parts.vtu --json parts.json --nodes 40000 --parts 4 --force",
         ),
         runs,
     ),

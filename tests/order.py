@@ -11,7 +11,6 @@ LONGEST_FILES = (
     "examples/test_examples.py",
     "hostile/test_hostile.py",
     "test_cli_domains.py",
-    "test_cli_parts.py",
     "test_cli.py",
     "study/test_paper_files.py",
     "start/test_sizes.py",

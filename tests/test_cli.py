@@ -660,7 +660,7 @@ def groups_of_help(capsys, *words):
     }
 
 
-def test_help_of_mesh_is_in_seven_groups(monkeypatch, capsys):
+def test_help_of_mesh_is_in_six_groups(monkeypatch, capsys):
     """Each of at most eighteen options, and the help; without `--help-all` the twenty that most
     users take.
     """
@@ -672,7 +672,6 @@ def test_help_of_mesh_is_in_seven_groups(monkeypatch, capsys):
         "Number and size of cells": 10,
         "Initial mesh": 4,
         "Optimisation": 11,
-        "Meshing in parts": 4,
         "For the solver": 14,
     }
     shown = groups_of_help(capsys, "mesh", "--help")

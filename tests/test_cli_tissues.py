@@ -142,8 +142,6 @@ def test_what_cannot_be(folder, capfd):
     )
     refused("--tissues: expected different files", "--tissues", f"{folder / 'grey.nii.gz'},")
     refused("gone.nii.gz", "--tissues", folder / "gone.nii.gz")
-    parts = words(folder, "--tissues", both(folder), "--parts", "2", size=FEW)
-    assert_refused(capfd, parts, "--tissues: needs all cells or voxels")
     for values, match in (
         (100.0 * ROWS[0], "grey.nii.gz: expected probabilities from 0 to 1, got .* to 84"),
         (ROWS[0] - 0.5, "grey.nii.gz: expected probabilities from 0 to 1, got -0.5"),

@@ -307,35 +307,6 @@ def test_only_the_command_prints():
     assert printed == []
 
 
-# What forks on voxels that are only stored, or on parts; the methods of `Image` and `Task.way`
-# stand for it.
-FORK = re.compile(
-    r"\.is_stored\b|\bStored(Image|Content|Source)\b|\bn_parts (is|==|!=|<|>)"
-    r"|\bisinstance\([^)]*\bSource\b|tetopt\.parts\b"
-)
-
-
-def test_only_parts_and_images_know_of_parts_and_stored_voxels():
-    """One image, one source and one run: what differs is within `parts/`, runs in parts and the
-    class of images.
-    """
-    knowing = {ROOT / "tetopt" / name for name in ("image.py", "job/in_parts.py")}
-    knowing |= set((ROOT / "tetopt" / "parts").glob("*.py"))
-    forks = [
-        f"{path.relative_to(ROOT)}:{number}: {line.strip()}"
-        for path in SOURCES
-        if path not in knowing
-        for number, line in enumerate(text_of(path).splitlines(), 1)
-        if FORK.search(line)
-    ]
-    assert forks == []
-    assert any(FORK.search(text_of(path)) for path in knowing)
-    choosing = [
-        path.name for path in SOURCES if path not in knowing and "in_parts" in text_of(path)
-    ]
-    assert choosing == ["read.py"]
-
-
 def test_mutants_are_of_code_and_tests_that_are_there():
     """`tests/mutants/run.py` changes a text that a file has once, and runs tests that exist."""
     stale = []

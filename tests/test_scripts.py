@@ -213,32 +213,3 @@ def test_choose_average(tmp_path, monkeypatch, capsys):
     assert "exists" in capsys.readouterr().err
     assert script("choose_average").main([*words, "--force", "--averages", "voigt"]) == 2
     assert "average: expected mean" in capsys.readouterr().err
-
-
-def test_benchmark_of_parts(tmp_path, capsys):
-    """Its table adds up: all parts of all rounds are tasks, and the stages follow one another."""
-    arguments = [
-        "24",
-        "--nodes",
-        "500",
-        "--parts",
-        "2",
-        "--workers",
-        "0",
-        "--folder",
-        str(tmp_path),
-    ]
-    output = tmp_path / "bench.json"
-    assert script("benchmark_blocks").main([*arguments, "-o", str(output)]) == 0
-    rows = json.loads(output.read_text())
-    assert rows["n_nodes"] == pytest.approx(500, abs=50)
-    names = [stage["name"] for stage in rows["stages"]]
-    assert names[0] == "statistics, octree"
-    assert names[1] == "measure 0, 2 parts"
-    n_parts = [int(name.split(", ")[1].split()[0]) for name in names if "parts" in name]
-    assert len(rows["tasks"]) == sum(n_parts)
-    assert sum(task["result"]["n_voxels"] for task in rows["tasks"][:2]) == 24**3
-    assert not (tmp_path / "balls-24.work").exists()
-    assert "peaks of workers" in capsys.readouterr().out
-    assert script("benchmark_blocks").main([*arguments, "-o", str(output)]) == 2
-    assert "exists" in capsys.readouterr().err

@@ -14,7 +14,6 @@ from .contents.probabilities import (
     resample_tissue as resample_tissue,
     tissue_labels as tissue_labels,
 )
-from .contents.statistics import Statistics as Statistics
 from .energy.discretization import E_D as E_D
 from .energy.geometric import E_G as E_G
 from .energy.sampling import (
@@ -45,7 +44,6 @@ from .io.frd import Results as Results, read_frd as read_frd
 from .io.images import load_image as load_image, save_image as save_image
 from .io.label_tables import load_label_table as load_label_table
 from .io.meshes import load_mesh as load_mesh
-from .io.stored_images import open_stored as open_stored
 from .io.surfaces import save_surface as save_surface
 from .job.events import Event as Event
 from .job.job import Job as Job

@@ -1,9 +1,9 @@
-"""The image: a scalar field on voxels with its place in the world, in memory or stored."""
+"""The image: a scalar field on voxels with its place in the world."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import prod
@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from tetopt.errors import InputError
 from tetopt.interop import notebook
-from tetopt.system.budget import check_memory
 from tetopt.system.public import unmasked
 
 # determinant of the axes' directions, below which they do not span the space
@@ -27,12 +26,6 @@ LENGTH_RANGE = (1e-9, 1e9)
 MOST_OFFSET = 1e9  # voxels from the world's origin: beyond, coordinates do not resolve 1e-7 voxel
 # Limits for intensities and their range: squares summed over 2^31 voxels stay normal doubles.
 INTENSITY_RANGE = (1e-152, 1e148)
-READ_BYTES = 2**28  # most of a stored volume read at a time: 128 planes of 1024^2 voxels of 16 bits
-# processed at a time: half a megabyte per field, which fits into a processor's cache
-PIECE_VOXELS = 2**16
-LOADED_BYTES = 16.0  # per voxel while all are read: as stored, and as floats of either size
-
-Box = tuple[slice, slice, slice]
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +34,7 @@ class Image:
 
     Voxel *centres* sit at the integer indices (the NIfTI convention), so the domain runs from index
     -0.5 to ``shape - 0.5`` along every axis. The affine maps indices to world millimetres, RAS+ in
-    3-D; it may flip, rotate, shear and scale each axis differently. The voxels are in memory, or
-    stay in their file (`Image.stored`, `tetopt.open_stored`) and are read box by box.
+    3-D; it may flip, rotate, shear and scale each axis differently.
 
     Parameters
     ----------
@@ -61,7 +53,6 @@ class Image:
     See Also
     --------
     load_image : Read an image from a file.
-    open_stored : Open an image and leave its voxels in the file.
 
     Examples
     --------
@@ -70,7 +61,7 @@ class Image:
     (3, [2.0, 2.0, 3.0], 12.0)
     """
 
-    voxels: Any  # `data`, or a stored array that is sliced box by box
+    data: NDArray[np.floating]
     affine: NDArray[np.float64]
 
     def __init__(self, data: ArrayLike, affine: ArrayLike | None = None) -> None:
@@ -78,64 +69,13 @@ class Image:
         affine = checked_affine(
             np.eye(checked.ndim + 1) if affine is None else affine, checked.ndim
         )
-        vars(self).update(voxels=checked, affine=affine, data=checked)
+        vars(self).update(data=checked, affine=affine)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Check and lock the arrays of a copy, or of an unpickled image, again: pickle keeps
         neither.
         """
-        return Image.stored if self.is_stored else Image, (self.voxels, self.affine)
-
-    @classmethod
-    def stored(cls, voxels: Any, affine: ArrayLike | None = None) -> Image:
-        """Make a 3-D image whose voxels stay in their array, which need not fit into memory.
-
-        Parameters
-        ----------
-        voxels : array of three axes
-            Any object with a `shape` and a `dtype` that returns an array of numbers for a tuple of
-            slices: an array of zarr, dask or h5py, or a memory-mapped numpy array. Values are
-            checked as they are read.
-        affine : (4, 4) array, optional
-            As for `Image`.
-
-        Returns
-        -------
-        Image
-            The image, with nothing read yet.
-
-        Raises
-        ------
-        InputError
-            A number of axes other than three, an empty axis, or an invalid affine.
-
-        Examples
-        --------
-        >>> voxels = np.memmap("scan.raw", dtype=np.int16, mode="w+", shape=(64, 64, 64))
-        >>> stored = tetopt.Image.stored(voxels, np.diag([0.5, 0.5, 0.5, 1.0]))
-        >>> stored.shape, stored.box((0, 0, 0), (8, 8, 8)).shape
-        ((64, 64, 64), (8, 8, 8))
-        """
-        shape = tuple(int(size) for size in voxels.shape)
-        if len(shape) != 3 or 0 in shape:
-            raise InputError(f"image: expected three non-empty axes, got shape {shape}")
-        image = cls.__new__(cls)
-        vars(image).update(
-            voxels=voxels, affine=checked_affine(np.eye(4) if affine is None else affine, 3)
-        )
-        return image
-
-    @cached_property
-    def data(self) -> NDArray[np.floating]:
-        """All intensities, as in `Image(data)`; a stored image reads them at first use and keeps
-        them.
-        """
-        check_memory(
-            LOADED_BYTES * prod(self.shape), f"image: {self._size()}", "read it box by box"
-        )
-        whole = _checked_data(self.read((0,) * self.ndim, self.shape))
-        vars(self).update(voxels=whole)  # later boxes come from memory
-        return whole
+        return Image, (self.data, self.affine)
 
     @cached_property
     def range(self) -> tuple[float, float]:
@@ -161,19 +101,9 @@ class Image:
         return np.array_equal(np.rint(self.data), self.data)
 
     @property
-    def is_stored(self) -> bool:
-        """True if the voxels are stored outside memory and have not been read as a whole."""
-        return "data" not in vars(self)
-
-    @property
-    def in_memory(self) -> Image | None:
-        """The image itself, or None if its voxels are only stored."""
-        return None if self.is_stored else self
-
-    @property
     def shape(self) -> tuple[int, ...]:
         """Number of voxels along each axis."""
-        return tuple(int(size) for size in self.voxels.shape)
+        return self.data.shape
 
     @property
     def ndim(self) -> int:
@@ -215,10 +145,7 @@ class Image:
         array([[ 0. ,  0. ,  3. ],
                [-1. , -1. , -1.5]])
         """
-        return (
-            transformed(np.asarray(index, dtype=np.float64), self.affine[:-1, :-1])
-            + self.affine[:-1, -1]
-        )
+        return _to_world(self.affine, index)
 
     def to_index(self, points: ArrayLike) -> NDArray[np.float64]:
         """Index coordinates of world points, the inverse of `to_world`.
@@ -244,31 +171,8 @@ class Image:
             shifted, np.asarray(np.linalg.inv(self.affine[:-1, :-1]), dtype=np.float64)
         )
 
-    def read(self, start: Sequence[int], stop: Sequence[int]) -> NDArray:
-        """Read the voxels of a box of indices into memory, in the stored type.
-
-        Parameters
-        ----------
-        start, stop : (n,) sequences of int
-            The first index of the box along each axis, and the one after its last.
-
-        Returns
-        -------
-        (stop - start) array
-            The voxels; a view if they are in memory.
-
-        Examples
-        --------
-        >>> stored = tetopt.Image.stored(np.arange(64, dtype=np.int16).reshape(4, 4, 4))
-        >>> stored.read((0, 0, 0), (1, 2, 4)).tolist()
-        [[[0, 1, 2, 3], [4, 5, 6, 7]]]
-        """
-        return np.asarray(
-            self.voxels[tuple(slice(int(a), int(b)) for a, b in zip(start, stop, strict=True))]
-        )
-
     def box(self, start: Sequence[int], stop: Sequence[int]) -> Image:
-        """Read a box of indices as an image in memory; every voxel keeps its place in the world.
+        """Return a box of indices as an image; every voxel keeps its place in the world.
 
         Parameters
         ----------
@@ -280,67 +184,19 @@ class Image:
         Image
             The box.
 
-        Raises
-        ------
-        InputError
-            Values that are invalid for an `Image`, such as NaN.
-
         Examples
         --------
-        >>> stored = tetopt.Image.stored(np.arange(64, dtype=np.int16).reshape(4, 4, 4))
-        >>> corner = stored.box((2, 2, 2), (4, 4, 4))
-        >>> corner.to_world([0, 0, 0]).tolist() == stored.to_world([2, 2, 2]).tolist()
+        >>> image = tetopt.Image(np.arange(64).reshape(4, 4, 4))
+        >>> corner = image.box((2, 2, 2), (4, 4, 4))
+        >>> corner.to_world([0, 0, 0]).tolist() == image.to_world([2, 2, 2]).tolist()
         True
         """
-        affine = self.affine.copy()
-        affine[:-1, -1] = self.to_world(start)
-        return Image(self.read(start, stop), affine)
-
-    @property
-    def box_bytes(self) -> float:
-        """Memory that iterating over `boxes` takes, bytes."""
-        return 2.0 * READ_BYTES if self.is_stored else 0.0
-
-    def boxes(self) -> Iterator[Box]:
-        """Iterate over the voxels in boxes of whole rows, plane by plane; a 2-D image is one plane
-        of a volume.
-
-        Boxes in memory are small. Stored ones are as thick as chunks and take at most `READ_BYTES`,
-        except that a row is always read whole.
-
-        Returns
-        -------
-        iterator of three slices
-            Slices along the axes of a volume; a 2-D image is its first plane.
-
-        Examples
-        --------
-        >>> voxels = np.memmap("scan.raw", dtype=np.int16, mode="w+", shape=(64, 64, 64))
-        >>> stored = tetopt.Image.stored(voxels)
-        >>> list(stored.boxes())
-        [(slice(0, 64, None), slice(0, 64, None), slice(0, 64, None))]
-        """
-        s0, s1, s2 = shape = (1,) * (3 - self.ndim) + self.shape
-        if not self.is_stored:
-            return _boxes(shape, max(PIECE_VOXELS // (s1 * s2), 1), s1)
-        chunks = getattr(self.voxels, "chunks", None)
-        most_rows = max(READ_BYTES // (s2 * np.dtype(self.voxels.dtype).itemsize), 1)
-        if chunks:
-            # dask lists all chunk sizes along each axis.
-            n_planes, step = (
-                min(int(np.max(sizes)), s) for sizes, s in zip(chunks[:2], (s0, s1), strict=True)
-            )
-        elif _is_first_axis_fastest(self.voxels):
-            n_planes, step = s0, 1
-        else:
-            n_planes, step = max(min(s0, most_rows // s1), 1), 1
-        n_planes = min(n_planes, most_rows)
-        n_rows = most_rows // n_planes
-        return _boxes(shape, n_planes, min(n_rows // step * step or n_rows, s1))
+        affine = shifted_affine(self.affine, start)
+        return Image(self.data[tuple(map(slice, start, stop))], affine)
 
     def __repr__(self) -> str:
-        values = "stored" if self.is_stored else f"{self.range[0]:.4g} to {self.range[1]:.4g}"
-        return f"Image({self._size()}, {self.voxels.dtype}, {values})"
+        values = f"{self.range[0]:.4g} to {self.range[1]:.4g}"
+        return f"Image({self._size()}, {self.data.dtype}, {values})"
 
     def _size(self) -> str:
         """Number and size of voxels."""
@@ -350,15 +206,13 @@ class Image:
         return f"{counts} voxels of {sides} mm"
 
     def _repr_html_(self) -> str:
-        """Numbers and the middle slice, for a notebook; a stored image shows neither intensities
-        nor a picture.
-        """
-        rows = [("size", self._size()), ("kind", str(self.voxels.dtype))]
-        if self.is_stored:
-            return notebook.card_html("Image", rows, "")
-        rows.insert(
-            1, ("intensities", f"{self.range[0]:.4g} to {self.range[1]:.4g}, mean {self.mean:.4g}")
-        )
+        """Numbers and the middle slice, for a notebook."""
+        values = f"{self.range[0]:.4g} to {self.range[1]:.4g}, mean {self.mean:.4g}"
+        rows = [
+            ("size", self._size()),
+            ("intensities", values),
+            ("kind", str(self.data.dtype)),
+        ]
         return notebook.card_html("Image", rows, notebook.slice_html(self.data, self.affine))
 
 
@@ -373,6 +227,17 @@ def transformed(vectors: NDArray[np.float64], matrix: NDArray[np.float64]) -> ND
     for column in range(1, matrix.shape[1]):
         product = product + vectors[..., column : column + 1] * matrix[:, column]
     return product
+
+
+def _to_world(affine: NDArray[np.float64], index: ArrayLike) -> NDArray[np.float64]:
+    return transformed(np.asarray(index, dtype=np.float64), affine[:-1, :-1]) + affine[:-1, -1]
+
+
+def shifted_affine(affine: NDArray[np.float64], start: Sequence[int]) -> NDArray[np.float64]:
+    """Return the affine of the voxels from index `start` on."""
+    shifted = affine.copy()
+    shifted[:-1, -1] = _to_world(affine, start)
+    return shifted
 
 
 def _checked_data(data: ArrayLike) -> NDArray[np.floating]:
@@ -398,19 +263,15 @@ def _checked_data(data: ArrayLike) -> NDArray[np.floating]:
         )
     is_bad = ~np.isfinite(data)
     if is_bad.any():
-        check_finite(int(np.count_nonzero(is_bad)), tuple(int(i) for i in np.argwhere(is_bad)[0]))
+        first = tuple(int(i) for i in np.argwhere(is_bad)[0])
+        raise InputError(
+            f"image data: {np.count_nonzero(is_bad)} voxels are NaN or infinite, the first at "
+            f"index {first}; replace them first, for example with the background's value"
+        )
     values = _as_lossless_float(data)
     check_intensities(float(values.min()), float(values.max()))
     values.setflags(write=False)
     return values
-
-
-def check_in_memory(image: Image, what: str, remedy: str) -> None:
-    """Raise InputError unless the voxels are in memory, as `what` requires; `remedy` names an
-    alternative.
-    """
-    if image.is_stored:
-        raise InputError(f"{what} of an image in memory, but this image is stored; {remedy}")
 
 
 def check_kind(dtype: np.dtype) -> None:
@@ -425,16 +286,6 @@ def check_kind(dtype: np.dtype) -> None:
         )
     if dtype.kind not in "buif":
         raise InputError(f"image data: expected numbers, got dtype {dtype}")
-
-
-def check_finite(n_bad: int, first: tuple[int, ...]) -> None:
-    """Raise InputError if `n_bad` voxels are not finite, the first at this index."""
-    if n_bad > 0:
-        raise InputError(
-            f"image data: {n_bad} voxels are NaN or infinite, the first at index {first}; "
-            "replace them first, for "
-            "example with the background's value"
-        )
 
 
 def check_intensities(low: float, high: float) -> None:
@@ -522,30 +373,3 @@ def _check_extents(
             "origin, got "
             f"{origin.tolist()} mm; correct the file's header"
         )
-
-
-def _is_first_axis_fastest(voxels: Any) -> bool:
-    """True if a mapped array is stored in NIfTI order, which scatters planes along the first
-    axis over the file.
-    """
-    strides = getattr(voxels, "strides", None)
-    return strides is not None and abs(strides[0]) < abs(strides[-1])
-
-
-def _boxes(shape: Sequence[int], n_planes: int, n_rows: int) -> Iterator[Box]:
-    """Boxes of up to `n_planes` planes and `n_rows` rows, with all columns."""
-    for i in range(0, shape[0], n_planes):
-        for j in range(0, shape[1], n_rows):
-            yield (
-                slice(i, min(i + n_planes, shape[0])),
-                slice(j, min(j + n_rows, shape[1])),
-                slice(0, shape[2]),
-            )
-
-
-def pieces(shape: Sequence[int]) -> Iterator[Box]:
-    """Divide a box of voxels (P, R, K) into boxes of whole rows: plane by plane, and rows in
-    order.
-    """
-    n_rows = min(shape[1], max(PIECE_VOXELS // shape[2], 1))
-    return _boxes(shape, max(PIECE_VOXELS // (n_rows * shape[2]), 1), n_rows)

@@ -96,13 +96,7 @@ def check_workers(count: int | None, scheduler: str | None) -> None:
         _check_scheduler(scheduler)
 
 
-def share_of(
-    n_tasks: int,
-    worker_bytes: float,
-    count: int | None,
-    threads: int | None,
-    most: float = float("inf"),
-) -> Share:
+def share_of(n_tasks: int, worker_bytes: float, count: int | None, threads: int | None) -> Share:
     """Divide this machine, within its affinity and container limits, among at least one worker.
 
     Parameters
@@ -112,8 +106,6 @@ def share_of(
         Memory of a worker with the largest task, bytes.
     count, threads : int, optional
         Maximum number of workers; threads of each task instead of its fraction of the cores.
-    most : float
-        Maximum memory of a worker, bytes.
     """
     from dask.system import CPU_COUNT
 
@@ -121,7 +113,7 @@ def share_of(
     number = max(
         1, min(n_tasks, CPU_COUNT // (threads or 1), int(free / worker_bytes), count or n_tasks)
     )
-    return Share(number, threads or max(1, CPU_COUNT // number), min(free / number, most))
+    return Share(number, threads or max(1, CPU_COUNT // number), free / number)
 
 
 @contextmanager

@@ -15,8 +15,6 @@ from tetopt.energy.sampling import overlap_of
 from tetopt.geometry.check import check_unfolded, manifold_problems
 from tetopt.io.formats import file_bytes
 from tetopt.measure.measures import fidelity
-from tetopt.parts.rounds import PartsRequest, mesh_in_parts
-from tetopt.parts.work import save_volume
 
 pytestmark = pytest.mark.full
 SPREAD = 3  # of the asks of a run, those at which the quick test stops
@@ -55,15 +53,6 @@ def meshed(kind, stop):
     (_, _, _, content), options = KINDS[kind]
     whole = content.image if options.get("mode") == "paper" else content
     return tetopt.mesh_image(whole, iterations=4, stop=stop, **options)
-
-
-def in_parts(folder, stop):
-    """Asked for in two parts, in a folder of its own."""
-    folder.mkdir()
-    image = KINDS["plain"][0][0]
-    save_volume(folder, image)
-    asked_for = PartsRequest(400, 2, 0.85, 6, 3.0, 12.0, 5e-4, None, "of this test")
-    return mesh_in_parts(asked_for, folder, is_over=stop)
 
 
 class Asked:
@@ -148,31 +137,6 @@ def test_a_run_stopped_anywhere_is_sound(kind):
         mask,
         options.get("order", 1),
     )
-
-
-def test_parts_stopped_anywhere_are_sound(tmp_path):
-    """Before the first round is complete there is no mesh, which is said."""
-    stop = Asked()
-    in_parts(tmp_path / "whole", stop)
-    image, n_kept = KINDS["plain"][0][0], 0
-    for k in range(1, stop.number + 1):
-        parted, said = None, ""
-        try:
-            parted = in_parts(tmp_path / str(k), Asked(k))
-        except tetopt.InputError as error:
-            said = str(error)
-        if parted is None:
-            assert "before the first round was complete" in said
-            continue
-        n_kept += 1
-        assert parted.result.ended == "stopped"
-        assert len(parted.part) == len(parted.result.mesh.cells)
-        assert all(len(values) == len(parted.part) for values in parted.fields.values())
-        np.testing.assert_allclose(
-            parted.fields["mean"], tetopt.cell_moments(image, parted.result.mesh).mean, atol=1e-9
-        )
-        assert_sound(parted.result, image, None, None)
-    assert n_kept > 0
 
 
 def test_cells_are_lifted_no_longer_than_a_run_has_time():

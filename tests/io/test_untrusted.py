@@ -496,12 +496,6 @@ def test_a_volume_that_does_not_fit_memory(tmp_path, monkeypatch, name):
         path,
         "its 3 x 4 x 5 voxels: needs about .* of memory, .* is free; crop or resample it first",
     )
-    if name == "a.nrrd":
-        refused(
-            load_image,
-            path,
-            r"first, or convert it to \.zarr or uncompressed \.nii, which are read in parts$",
-        )
 
 
 @pytest.mark.parametrize("name", ["a.nii.gz", "a.nii"])

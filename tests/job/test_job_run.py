@@ -16,12 +16,11 @@ from tetopt.job.source import Source
 pytestmark = pytest.mark.full
 
 UNLIKE = ("seconds", "memory")  # in run.json and in its rows, from run to run
-OF_PARTS = {"parts": 2, "nodes": 300, "workers": 1}
 
 
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory):
-    """An image of 3-D with a mask, labels and a second contrast, one of 2-D, one for parts, a
+    """An image of 3-D with a mask, labels and a second contrast, one of 2-D, a
     mesh to start from.
     """
     folder = tmp_path_factory.mktemp("inputs")
@@ -38,8 +37,6 @@ def inputs(tmp_path_factory):
             folder / f"{name}.nii.gz",
             tetopt.Image(1.0 * data, image.affine if data.ndim == 3 else None),
         )
-    ball = 400.0 * ((np.indices((24, 24, 24)) - 12.0) ** 2).sum(axis=0) < 400.0 * 60.0
-    tetopt.save_image(folder / "c.nii", tetopt.Image(500.0 + 400.0 * ball))
     assert (
         exit_code(
             "mesh", folder / "a.nii.gz", "-o", folder / "s.vtu", "--nodes", 60, "--iterations", 1
@@ -59,11 +56,10 @@ KINDS = {
     "plane": ("p.nii.gz", {}),
     "paper": ("a.nii.gz", {"method": "paper"}),
     "target error": ("a.nii.gz", {"target_error": 0.5, "nodes": None}),
-    "parts": ("c.nii", OF_PARTS),
 }
 FILES = {"mask", "labels", "start"}  # options that are files
 DRAWN = ("image", "labels")  # of the kinds; pictures take longer than all else
-LONG = ("order 2", "target error", "parts")  # several runs each
+LONG = ("order 2", "target error")  # several runs each
 OF_FORMAT = {
     ".inp": {"young": "1 + 0.01*h", "loads": "compress:5%"},
     ".feb": {"young": "2", "loads": ["hold:superior"]},
@@ -146,7 +142,7 @@ def test_a_run_leaves_the_files_of_the_command(inputs, tmp_path, monkeypatch, ki
     assert set(numbers) == set(result.numbers)
     stages = [event.data.name for event in events if event.kind == "started"]
     assert stages[0] == "read"
-    assert {"round" if kind == "parts" else "optimise", "write"} <= set(stages)
+    assert {"optimise", "write"} <= set(stages)
     sentences = {event.data: event.text for event in events if event.kind == "violated"}
     assert sentences == {
         name: f"requirement violated: {name}: {words}" for name, words in result.violated.items()

@@ -55,7 +55,6 @@ RIGHT = {
     },
     "build_model": {"mesh": MESH, "image": IMAGE, "sets": ["a=x<1"], "bins": 3, "order": 1},
     "octree_mesh": {"image": IMAGE, "nodes": 100, "sizes": None},
-    "open_stored": {"path": "a.nii", "volume": 0},
     "optimize": {
         "image": IMAGE,
         "mesh": MESH,
@@ -251,7 +250,6 @@ def warning_calls(folder):
         "save_mesh": lambda: tetopt.save_mesh(folder / "b.vtk", MESH, {"a\nb": np.ones(1)}),
         "load_image": lambda: tetopt.load_image(folder / "even.nii"),
         "load_image, of a large one": lambda: tetopt.load_image(folder / "large.nii"),
-        "open_stored": lambda: tetopt.open_stored(folder / "large.nii"),
         "build_model": lambda: tetopt.build_model(own),
     }
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import numpy as np
 
-from tetopt import Image, InputError, load_phantom, save_image
+from tetopt import InputError, load_phantom, save_image
 from tetopt.cli.console import print_line
 from tetopt.cli.options import ForceOption
 from tetopt.io.images import OUTPUT_SUFFIXES
@@ -51,7 +51,7 @@ def phantom_command(
             raise InputError(
                 f"{output}: expected a 3-D phantom, got a 2-D one; write it as .nii.gz"
             )
-        low, high = save_zarr(output, Image.stored(voxels, voxels.affine), voxels, np.int16)
+        low, high = save_zarr(output, voxels.affine, voxels, np.int16)
     else:
         image = phantom.image(voxel_mm=voxel_mm, blur_mm=blur_mm, noise_sd=noise_sd, seed=seed)
         low, high = image.data.min(), image.data.max()

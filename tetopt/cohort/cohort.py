@@ -80,7 +80,7 @@ def run_cohort(
     on : callable, optional
         Called with each `Event`; without it, warnings are Python's warnings.
     **options
-        For all subjects, those of a `Job` except images, outputs and parts; for the cohort:
+        For all subjects, those of a `Job` except images and outputs; for the cohort:
         `suffix`, `participants`, `sessions`, `mesh_format`, `write_table`, `dry_run`,
         `retry_failed`, `collect`, `workers`, `scheduler`.
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, ClassVar
 
 from tetopt.io.formats import FORMATS
-from tetopt.job.options import Option, SchedulerOption, WorkersOption
+from tetopt.job.options import Option
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,5 +45,9 @@ class CohortOptions:
     collect: Annotated[
         bool, Option(None, "Write the table and page of existing results; run nothing.")
     ] = False
-    workers: WorkersOption = None
-    scheduler: SchedulerOption = None
+    workers: Annotated[
+        int | None, Option("N", "Maximum number of simultaneous tasks on this machine.", least=1)
+    ] = None
+    scheduler: Annotated[
+        str | None, Option("ADDRESS", "A running dask scheduler with its workers: tcp://host:8786.")
+    ] = None

@@ -27,7 +27,6 @@ from tetopt.contents.memberships import (
     supersampling,
 )
 from tetopt.contents.noise import noise_level
-from tetopt.contents.statistics import Statistics
 from tetopt.errors import InputError
 from tetopt.image import Image
 
@@ -98,8 +97,6 @@ class Content(NamedTuple):
         Labels with smooth interfaces.
     keeps_components : bool
         Keep connected components of a mesh that the mask does not have.
-    statistics : Statistics, optional
-        Statistics of the image, if a pass over its voxels has computed them.
     whole : Image, optional
         The first contrast as given, if `image` is another: a part of it, with other values beyond
         the mask, or divided.
@@ -130,7 +127,6 @@ class Content(NamedTuple):
     continuation: Continuation | None = None
     smooth: SmoothLabels | None = None
     keeps_components: bool = False
-    statistics: Statistics | None = None
     whole: Image | None = None
     repeats: tuple[int, ...] = ()
     is_flat: bool = True
@@ -224,8 +220,6 @@ class Content(NamedTuple):
         """Variance of all channels over the voxels to cover, intensity^2; times `volume` it is
         E_D of a single cell.
         """
-        if self.statistics is not None and self.is_plain and self.region is None:
-            return self.statistics.variance
         if self.is_plain and self.region is None:
             return self.image.variance
         if self.squared_spread is not None:
@@ -237,8 +231,6 @@ class Content(NamedTuple):
     @property
     def spread(self) -> Spread:
         """Spread of the first contrast's intensities over its own voxels to cover."""
-        if self.statistics is not None:
-            return Spread(*self.statistics[:4])
         if self.continuation is None:
             return Spread(self.given.mean, *self.given.range, self.given.variance)
         around = () if self.whole is None else self.continuation.part

@@ -133,10 +133,10 @@ def cell_moments(image: Image, mesh: Mesh) -> CellMoments:
 
 
 def cell_moments_and_ranges(
-    image: Image, mesh: Mesh, bits: int | None = None
+    image: Image, mesh: Mesh
 ) -> tuple[CellMoments, tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """`cell_moments` and `cell_ranges` in two thirds of the time; `bits` as for `sampling_grid`."""
-    sampled = _sampled(image, mesh, bits)
+    """`cell_moments` and `cell_ranges` in two thirds of the time."""
+    sampled = _sampled(image, mesh)
     return _moments(image, mesh, sampled), _ranges(image, mesh, sampled)
 
 
@@ -148,8 +148,8 @@ class _Sampled(NamedTuple):
     sides: Facets
 
 
-def _sampled(image: Image, mesh: Mesh, bits: int | None = None) -> _Sampled:
-    return _on_grid(image, mesh, sampling_grid(image, mesh.points, bits))
+def _sampled(image: Image, mesh: Mesh) -> _Sampled:
+    return _on_grid(image, mesh, sampling_grid(image, mesh.points))
 
 
 def _placed(image: Image, mesh: Mesh) -> _Sampled:
@@ -392,13 +392,8 @@ class SamplingGrid(NamedTuple):
         return self.prefix.shape[0], self.prefix.shape[1], self.prefix.shape[2] - 1
 
 
-def sampling_grid(
-    image: Image, points: NDArray[np.float64], bits: int | None = None
-) -> SamplingGrid:
+def sampling_grid(image: Image, points: NDArray[np.float64]) -> SamplingGrid:
     """The image and the fixed-point grid for nodes near `points`, (N, n) world mm.
-
-    If the image is a part of another one, `bits` are those of the other one's grid, which are no
-    more.
 
     Differences of coordinates stay below 2**29 units, so that their products, areas and
     determinants are exact in 64- and 128-bit integers. On an image of whole numbers whose sums of
@@ -410,7 +405,7 @@ def sampling_grid(
     InputError
         Mesh and image differ in dimension, or the mesh reaches 2**20 voxels or more.
     """
-    bits = grid_bits(image, points) if bits is None else bits
+    bits = grid_bits(image, points)
     shape = (1,) * (3 - image.ndim) + image.shape
     (low, high), mean, is_whole = image.range, image.mean, image.is_whole
     # constants become 0, whole numbers stay whole
@@ -454,9 +449,7 @@ def grid_bits(image: Image, points: NDArray[np.float64]) -> int:
     return bits
 
 
-def channel_grid(
-    content: Content, points: NDArray[np.float64], bits: int | None = None
-) -> SamplingGrid:
+def channel_grid(content: Content, points: NDArray[np.float64]) -> SamplingGrid:
     """`sampling_grid` of all channels of a content: sums of the first, of all channels' squares,
     and of the others.
 
@@ -468,7 +461,7 @@ def channel_grid(
         As for `sampling_grid`.
     """
     if content.is_plain and content.region is None:
-        return sampling_grid(content.image, points, bits)
+        return sampling_grid(content.image, points)
     n_channels, n, region = content.n_channels, content.image.ndim, content.region
     shape = (1,) * (3 - n) + content.image.shape
     _check_grid(shape, n_channels + 2)
@@ -482,11 +475,11 @@ def channel_grid(
         ]
 
     if content.is_plain:
-        grid = sampling_grid(content.image, points, bits)
+        grid = sampling_grid(content.image, points)
         shift, bits, is_short = grid.shift, grid.bits, grid.prefix.dtype == np.int32
     else:
         grid, shift = None, 0.0
-        bits = grid_bits(content.image, points) if bits is None else bits
+        bits = grid_bits(content.image, points)
         # No channel's sums are larger than those of the squares of its whole numbers.
         largest = over_slabs(
             lambda a, b: _squares(channels(a, b)).sum(axis=-1).max(),

@@ -44,7 +44,6 @@ from tetopt.engine.loop import (
     Boundary,
     IterationRecord,
     MeshingResult,
-    Whole,
     check_common_options,
     deadline,
     grace,
@@ -388,14 +387,11 @@ class Run:
         power: float = SHAPE_POWER,
         boundary: Boundary = "slide",
         is_graded: bool = False,
-        whole: Whole | None = None,
     ) -> None:
         """Take the arguments of `tetopt.engine.state.state_of`."""
         self.content, self.image, self.n = content, content.image, content.image.ndim
-        self.grid = channel_grid(content, mesh.points, None if whole is None else whole.bits)
-        self.state: State = state_of(
-            content, mesh, self.grid, k_D, power, boundary, is_graded, whole
-        )
+        self.grid = channel_grid(content, mesh.points)
+        self.state: State = state_of(content, mesh, self.grid, k_D, power, boundary, is_graded)
         ticks = self.state.complex.ticks
         is_kept = self.is_still if boundary == "fixed" else np.zeros(len(ticks), dtype=bool)
         self.kept = dict(
@@ -405,7 +401,7 @@ class Run:
         self.has_labels = False
         self.label_voxels: LabelVoxels | None = None  # computed when needed
         # Variance of the noise, estimated when first needed.
-        self.image_noise: float | None = None if whole is None else whole.noise
+        self.image_noise: float | None = None
         # positions at which nodes' flips were last evaluated
         self.ticks_flipped = np.full_like(ticks, FAR_TICKS)
         # expected gain of each node's next move, (N,); see `sweep`

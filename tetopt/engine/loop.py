@@ -98,19 +98,6 @@ class IterationRecord(NamedTuple):
     seconds: float
 
 
-class Whole(NamedTuple):
-    """Properties of the whole mesh for a part: the part's position, and the whole's
-    normalisation.
-    """
-
-    start: tuple[int, ...]  # first voxel of the part's image in the whole image, by axis
-    shape: tuple[int, ...]  # shape of the whole image
-    bits: int  # bits of its sampling grid
-    E_G: float  # shape energy of the initial mesh
-    squares: float  # its sum of squares, in squared units of the content's values
-    noise: float  # variance of the image's noise, in the same unit
-
-
 class MeshingResult(NamedTuple):
     """Result of `optimize` and, with all fields, of `mesh_image`.
 
@@ -301,22 +288,12 @@ def check_common_options(k_D: float, iterations: int, boundary: str) -> None:
         raise InputError(f"boundary: expected slide or fixed, got {boundary!r}")
 
 
-def side_ticks(grid: SamplingGrid, whole: Whole | None = None) -> NDArray[np.int64]:
+def side_ticks(grid: SamplingGrid) -> NDArray[np.int64]:
     """`tetopt.geometry.box.box_sides` in ticks, (3, 2), which are whole numbers; a slice is one
     voxel thick.
-
-    With `whole`, the sides of its box in the part's ticks.
     """
     half = 1 << (grid.bits - 1)
-    if whole is None:
-        return np.array(
-            [(-half, (size << grid.bits) - half) for size in grid.shape], dtype=np.int64
-        )
-    low = -np.array(whole.start, dtype=np.int64) << grid.bits
-    sides = np.column_stack(
-        [low - half, low + (np.array(whole.shape, dtype=np.int64) << grid.bits) - half]
-    )
-    return sides if len(sides) == 3 else np.vstack([[(-half, half)], sides])
+    return np.array([(-half, (size << grid.bits) - half) for size in grid.shape], dtype=np.int64)
 
 
 def relative_movement(

@@ -56,13 +56,7 @@ from tetopt.start.carve import carved, part_of
 from tetopt.start.clip import lattice_within
 from tetopt.start.label_sizes import SizesByLabel, sizes_by_label
 from tetopt.start.memory import LABEL_BYTES, PROCESS_BYTES, READ_BYTES, REGION_BYTES, bytes_of
-from tetopt.start.octree import (
-    is_near,
-    nearest_octree,
-    nodes_for_walls,
-    nodes_of_sizes,
-    octree_mesh,
-)
+from tetopt.start.octree import is_near, nearest_octree, nodes_of_sizes, octree_mesh
 from tetopt.start.sizes import Sizes
 from tetopt.system.budget import at_most, check_memory
 
@@ -354,13 +348,6 @@ class MeshSearch:
         content, aim = self._content, self._aim
         is_filled = aim.mode != "start" and content.region is None
         result = requested(result, content, aim.target_error, is_filled)
-        if (
-            aim.mode == "graded"
-            and aim.order == 1
-            and aim.nodes is not None
-            and result.ended not in CUT_SHORT
-        ):
-            result = _with_nodes_for_walls(result, content, aim.nodes, aim.sizes)
         if aim.order == 2:
             mesh, curving = curved(result.mesh, content, result.labels)
             result = checked_curved(result._replace(mesh=mesh, curving=curving), content)
@@ -388,22 +375,6 @@ def _initial(content: Content, aim: Aim, corners: int | None) -> Mesh:
     return lattice_within(
         content.image, content.region, aim.kind, nodes=corners, spacing=aim.spacing
     )
-
-
-def _with_nodes_for_walls(
-    result: MeshingResult, content: Content, nodes: int, sizes: Sizes | None
-) -> MeshingResult:
-    """Add the number of nodes that would keep a mask's walls to violated requirements, if the
-    initial mesh lost some.
-
-    Both requirements end in the advice to allow more nodes.
-    """
-    names = {"mask", "components"} & set(result.violated)
-    enough = nodes_for_walls(content, result.initial, nodes, sizes) if names else None
-    if enough is None:
-        return result
-    more = {name: f"{result.violated[name]}, about {enough}" for name in names}
-    return result._replace(violated={**result.violated, **more})
 
 
 def _time_left(options: dict[str, Any], begin: float) -> dict[str, float]:

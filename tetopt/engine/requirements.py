@@ -140,18 +140,6 @@ def violated_box(mesh: Mesh, image: Image, start: Mesh | None = None) -> dict[st
     return {"box": BEYOND_WORDS.format(beyond)} if beyond > allowed + ON_SIDE_VOXELS else {}
 
 
-def checked_in_box(result: MeshingResult, grid: Image, min_dihedral: float) -> MeshingResult:
-    """Like `checked`, for a mesh that fills the box of an image, whose voxels need not be in
-    memory.
-    """
-    violated = (
-        _violated_min_dihedral(result, min_dihedral)
-        | _uncovered(grid, result)
-        | violated_box(result.mesh, grid)
-    )
-    return result._replace(violated=violated)
-
-
 def _violated_min_dihedral(result: MeshingResult, min_dihedral: float) -> dict[str, str]:
     mesh = result.mesh
     if mesh.ndim != 3:

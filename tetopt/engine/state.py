@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from tetopt.contents.content import Content
 from tetopt.energy.sampling import SamplingGrid, check_orientations, to_ticks, volume_of
 from tetopt.engine.complex import Objective, Sides, State, build, energies
-from tetopt.engine.loop import E_D_ROUNDING, SHAPE_POWER, Boundary, Whole, frozen_axes, side_ticks
+from tetopt.engine.loop import E_D_ROUNDING, SHAPE_POWER, Boundary, frozen_axes, side_ticks
 from tetopt.errors import InputError
 from tetopt.geometry.check import check_unfolded
 from tetopt.geometry.topology import boundary_facets, facets
@@ -24,13 +24,9 @@ def state_of(
     power: float = SHAPE_POWER,
     boundary: Boundary = "slide",
     is_graded: bool = False,
-    whole: Whole | None = None,
 ) -> State:
     """The state of an initial mesh, which normalises the two energies, without angle limit; `grid`
     is the content's.
-
-    A part of a mesh is normalised by the `whole`; nodes and facets that it shares with the rest
-    stay unchanged, like boundary nodes off the box's sides.
 
     Raises
     ------
@@ -38,16 +34,14 @@ def state_of(
         A mesh that is invalid for sampling, is folded or has a cell too flat for a shape energy; or
         energies that overflow.
     """
-    state = unweighted(content, mesh, grid, power, boundary, is_graded, whole)
+    state = unweighted(content, mesh, grid, power, boundary, is_graded)
     flat = np.flatnonzero(~np.isfinite(state.complex.E_shape[: len(mesh.cells)]))
     if len(flat):
         raise InputError(
             f"mesh: {len(flat)} cells are too flat to optimise, such as {flat[:5].tolist()}; "
             "remove them or move their nodes apart"
         )
-    E_G0, squares0 = (
-        content_energies(state, content) if whole is None else (whole.E_G, whole.squares)
-    )
+    E_G0, squares0 = content_energies(state, content)
     weight = k_D / squares0 if squares0 > 0.0 else 0.0
     if not (0.0 < E_G0 < np.inf and np.isfinite(squares0) and np.isfinite(weight)):
         raise InputError(
@@ -65,7 +59,6 @@ def unweighted(
     power: float,
     boundary: Boundary,
     is_graded: bool = False,
-    whole: Whole | None = None,
 ) -> State:
     """The state of a mesh with weight 1 for both energies. Raise InputError like `state_of`, but
     accept flat cells.
@@ -76,7 +69,7 @@ def unweighted(
     shared = facets(mesh.cells)
     check_unfolded(mesh, shared)
     matrix = matrix_of(image)
-    own_sides = side_ticks(grid, whole)
+    own_sides = side_ticks(grid)
     is_frozen = frozen_axes(
         ticks, boundary_facets(mesh.cells, shared), own_sides, boundary, region is not None
     )

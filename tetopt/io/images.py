@@ -28,7 +28,7 @@ from nibabel.wrapstruct import WrapStructError
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError, Remark, warn
-from tetopt.image import Image
+from tetopt.image import Image, shifted_affine
 from tetopt.io.apart import DEFLATE_RATIO
 from tetopt.io.contradictions import notes_of_nifti, notes_of_rest
 from tetopt.io.itk_headers import HEADED_SUFFIXES, data_files, header_sizes
@@ -48,13 +48,16 @@ from tetopt.io.volumes import (
     volume_index,
 )
 from tetopt.io.zarr_images import (
+    METADATA_FILES,
     ZARR_SUFFIX,
+    ZarrLevel,
     check_chunks,
+    image_folder,
     is_zarr,
-    open_zarr,
     read_chunks,
     save_zarr,
     zarr_levels,
+    zarr_picks,
 )
 from tetopt.system.files import check_suffix
 from tetopt.system.incoming import irregular
@@ -99,8 +102,9 @@ def load_image(
     ``tetopt[itk]``) reads NRRD and MetaImage; pydicom (``tetopt[dicom]``) reads DICOM; Pillow reads
     2-D pictures and folders with one of them per slice, tifffile (``tetopt[tiff]``) TIFF stacks
     with the calibration of ImageJ or OME; zarr (``tetopt[zarr]``) reads OME-Zarr and Zarr arrays,
-    and only the requested part; `tetopt.io.stored_images.open_stored` describes their placement.
-    Axes of length 1 beyond the third are dropped.
+    and only the requested part: an OME-Zarr image (NGFF 0.4, 0.5; Zarr format 2 or 3), whose first
+    multiscale level is used, or an array with the attribute "affine". Axes of length 1 beyond the
+    third are dropped.
 
     NIfTI's scaling, its sform (or else qform) and its spatial unit are applied. ITK's LPS
     coordinates are converted to RAS. The slices of a DICOM series, and the frames of a DICOM file,
@@ -137,10 +141,12 @@ def load_image(
         ``"<path>: ..."``: the file is missing, unreadable, empty, of unknown format, truncated or
         damaged; a library is needed and not installed; a folder has no DICOM series or several;
         DICOM slices or frames are not parallel, evenly spaced and one per position, or do not state
-        where they lie; `open_stored` rejects a Zarr folder; a stack states no voxel size, or
-        another than `spacing_mm`; slices are missing or differ; there are several volumes and no
-        `volume`, or it is out of range; `slice_` or `crop` is invalid; values are RGB, complex, NaN
-        or infinite; an axis is empty; the affine is singular.
+        where they lie; Zarr metadata are damaged, without a scale, do not have three spatial axes,
+        or have units that are not lengths; codecs are unknown; chunks without a fill value are
+        missing, or all chunks; a stack states no voxel size, or another than `spacing_mm`; slices
+        are missing or differ; there are several volumes and no `volume`, or it is out of range;
+        `slice_` or `crop` is invalid; values are RGB, complex, NaN or infinite; an axis is empty;
+        the affine is singular.
 
     Warns
     -----
@@ -169,11 +175,11 @@ def load_image(
     notes: list[str] = []
     try:
         with os_errors_named():
-            is_stored = is_zarr(path)
-        if is_stored:
-            whole = open_zarr(zarr_levels(path, notes)[0], volume)
-            check_spacing(spacing_mm, whole.spacing)
-            image = _part_of_stored(whole, slice_, crop, notes)
+            is_folder = is_zarr(path)
+        if is_folder:
+            level = zarr_levels(path, notes)[0]
+            check_spacing(spacing_mm, np.linalg.norm(level.affine[:3, :3], axis=0))
+            image = _part_of_zarr(level, volume, slice_, crop, notes)
         else:
             image = part_of(Image(*_read(path, volume, notes, spacing_mm)), slice_, crop)
     except InputError as error:
@@ -223,6 +229,30 @@ def file_shape(path: str | Path) -> tuple[int, ...] | None:
         raise InputError(f"{path}: {one_line(error)}") from error
 
 
+def smaller_words(path: Path, bounds: Sequence[tuple[int, int]], most_voxels: float) -> str:
+    """Advise how to mesh at most so many voxels of a box of an image: a crop in its middle, and a
+    coarser level of an OME-Zarr image or larger voxels.
+    """
+    sides = [stop - start for start, stop in bounds]
+    factor = (max(most_voxels, 1.0) / math.prod(sides)) ** (1.0 / len(sides))
+    kept = [max(int(side * factor), 1) for side in sides]
+    starts = [
+        start + (side - n) // 2 for (start, _), side, n in zip(bounds, sides, kept, strict=True)
+    ]
+    box = ",".join(f"{start}:{start + n}" for start, n in zip(starts, kept, strict=True))
+    levels = zarr_levels(path, []) if is_zarr(path) else []
+    few = [level for level in levels if math.prod(level.shape) <= most_voxels]
+    other = f"resample it to voxels {math.ceil(10.0 / factor) / 10.0:g} times as long"
+    if few:
+        finest = max(few, key=lambda level: math.prod(level.shape))
+        other = f"use its level {finest.folder} ({_sides_words(finest.shape)} voxels)"
+    return f"use `crop` {box} ({_sides_words(kept)} voxels) or the like, or {other}"
+
+
+def _sides_words(sides: Sequence[int]) -> str:
+    return " x ".join(map(str, sides))
+
+
 def save_image(path: str | Path, image: Image) -> None:
     """Write a NIfTI file (.nii or .nii.gz), whole or not at all, with the full affine as sform, in
     mm; or OME-Zarr.
@@ -232,8 +262,7 @@ def save_image(path: str | Path, image: Image) -> None:
 
     A 2-D image becomes a 2-D file in the plane z = 0, which `load_image` reads back unchanged.
     Replaces an existing file; call `tetopt.system.files.checked_output` first.
-    `tetopt.io.zarr_images.save_zarr` writes a Zarr folder (.zarr) of a 3-D image, in chunks that
-    `tetopt.io.stored_images.open_stored` reads one by one.
+    `tetopt.io.zarr_images.save_zarr` writes a Zarr folder (.zarr) of a 3-D image.
 
     Parameters
     ----------
@@ -258,7 +287,7 @@ def save_image(path: str | Path, image: Image) -> None:
     """
     path = check_suffix(path, (*OUTPUT_SUFFIXES, ZARR_SUFFIX))
     if path.name.lower().endswith(ZARR_SUFFIX):
-        save_zarr(path, image, image.data, _for_file(image.data).dtype)
+        save_zarr(path, image.affine, image.data, _for_file(image.data).dtype)
         return
     save_voxels(path, _for_file(image.data), image)
 
@@ -433,7 +462,7 @@ def sha256(path: str | Path) -> str:
 
     For a header with separate data files it includes these. For a Zarr folder it covers all files
     in it and its subfolders, each after its name and length;
-    `tetopt.io.stored_images.stored_checksum` is a cheaper checksum.
+    `status_checksum` is a cheaper checksum.
 
     Raises
     ------
@@ -448,6 +477,30 @@ def sha256(path: str | Path) -> str:
         for file in image_files(path):
             _digest_file(digest, file)
     return digest.hexdigest()
+
+
+def status_checksum(path: str | Path) -> str:
+    """Return a SHA-256 that changes with an image, without reading its voxels.
+
+    For a Zarr folder it covers names, lengths and modification times of all files, and the contents
+    of metadata files. For a file, and the data files of a header, it covers name, length and
+    modification time. Two copies of an image have different checksums; `sha256` is the same for
+    both, but takes as long as reading them.
+
+    Raises
+    ------
+    InputError
+        For the reasons of `sha256`.
+    """
+    path = Path(path)
+    with os_errors_named(path):
+        if is_zarr(path):
+            return folder_checksum(path, lambda file: file.name in METADATA_FILES)
+        words = []
+        for file in image_files(path):
+            status = file.stat()
+            words.append(f"{file.name}\0{status.st_size}\0{status.st_mtime_ns}\0")
+    return hashlib.sha256("".join(words).encode("utf-8", "surrogateescape")).hexdigest()
 
 
 def image_files(path: Path) -> list[Path]:
@@ -476,7 +529,8 @@ def folder_checksum(path: Path, is_read: Callable[[Path], bool]) -> str:
     order.
 
     For files that are not read, by `is_read`, the time of their last change replaces their
-    contents. Links are followed, but no folder is visited twice.
+    contents. Links are followed, but no folder is visited twice. For a level of an OME-Zarr image,
+    the image's metadata count, too.
     """
     digest, known = hashlib.sha256(), set()
     files: dict[str, Path] = {}
@@ -490,6 +544,8 @@ def folder_checksum(path: Path, is_read: Callable[[Path], bool]) -> str:
             (Path(folder) / name).relative_to(path).as_posix(): Path(folder) / name
             for name in names
         }
+    if (image := image_folder(path)) is not None:
+        files |= {f"../{name}": image / name for name in METADATA_FILES if (image / name).exists()}
     for name, file in sorted(files.items()):
         if (other := irregular(file)) is not None:
             raise InputError(
@@ -590,7 +646,12 @@ def os_errors_named(path: Path | None = None) -> Iterator[None]:
     except OSError as error:
         words = f"cannot be opened ({error.strerror or error})"
         if isinstance(error, FileNotFoundError):
-            words = "no such file or folder; check the path"
+            is_url = re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", str(error.filename))
+            words = (
+                "expected a local file or folder, got a URL; download it first"
+                if is_url
+                else "no such file or folder; check the path"
+            )
         elif isinstance(error, PermissionError):
             words = "permission denied; make the file readable for your account"
         raise InputError(words if path is None else f"{error.filename or path}: {words}") from error
@@ -806,30 +867,26 @@ def part_of(image: Image, slice_: tuple[int, int] | None, crop: Bounds | None) -
     return cropped(plane, [each for axis, each in enumerate(bounds) if axis != slice_[0]])
 
 
-def _part_of_stored(
-    image: Image, slice_: tuple[int, int] | None, crop: Bounds | None, notes: list[str]
+def _part_of_zarr(
+    level: ZarrLevel,
+    volume: int | None,
+    slice_: tuple[int, int] | None,
+    crop: Bounds | None,
+    notes: list[str],
 ) -> Image:
     """Do the same for a Zarr image, of which only this part is read."""
-    bounds = checked_bounds(image.shape, [(None, None)] * 3 if crop is None else crop)
+    bounds = checked_bounds(level.shape, [(None, None)] * 3 if crop is None else crop)
     if slice_ is not None:
         axis, index = slice_
-        _check_slice(image.shape, axis, index)
+        _check_slice(level.shape, axis, index)
         _check_in_crop(bounds, axis, index)
         bounds[axis] = (index, index + 1)
-    check_room([stop - start for start, stop in bounds], image.voxels.dtype.itemsize)
-    in_file = cropped_in_file(image, bounds)
-    check_chunks(in_file.voxels, notes)
-    part = Image(read_chunks(in_file.voxels), in_file.affine)
+    shape, picks = [stop - start for start, stop in bounds], zarr_picks(level, volume, bounds)
+    check_room(shape, level.array.dtype.itemsize)
+    check_chunks(level, picks, notes)
+    affine = shifted_affine(level.affine, [start for start, _ in bounds])
+    part = Image(read_chunks(level, picks, math.prod(shape)), affine)
     return part if slice_ is None else image_slice(part, slice_[0], 0)
-
-
-def cropped_in_file(image: Image, ranges: list[tuple[int, int]]) -> Image:
-    """Return the part of a stored image in a box of indices, start to stop; its voxels stay in
-    their file.
-    """
-    affine = image.affine.copy()
-    affine[:-1, -1] = image.to_world([start for start, _ in ranges])
-    return Image.stored(image.voxels.within(ranges), affine)
 
 
 def _check_in_crop(bounds: list[tuple[int, int]], axis: int, index: int) -> None:

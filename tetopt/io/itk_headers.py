@@ -53,10 +53,6 @@ VALUE_BYTES = {  # types of NRRD without "unsigned" and the like, and those of M
     "float": 4,
     "double": 8,
 }
-READ_IN_PARTS = (
-    "crop or resample it first, or convert it to .zarr or uncompressed .nii, which "
-    "are read in parts"
-)
 
 
 class VoxelHeader(NamedTuple):
@@ -85,7 +81,7 @@ def checked_header(path: Path) -> tuple[VoxelHeader, int]:
     n_bytes = _checked_bytes(path, header)
     if header.ratio == DEFLATE_RATIO and path.suffix.lower() not in NRRD_SUFFIXES:
         _check_packed(path, header)
-    check_room(header.sizes, header.value_bytes // max(math.prod(header.sizes), 1), READ_IN_PARTS)
+    check_room(header.sizes, header.value_bytes // max(math.prod(header.sizes), 1))
     return header, n_bytes
 
 

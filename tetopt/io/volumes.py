@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.system.budget import check_memory
@@ -23,81 +21,6 @@ TOO_LONG = f"{DAMAGED_FILE} (it continues far after the last voxel, beyond byte 
 UNREADABLE_FILE = (
     "truncated or damaged, or not an image of this kind; copy it again, or check its name"
 )
-
-
-class VoxelsInFile:
-    """Three axes of an array in a file, with fixed indices on its other axes; boxes are read by
-    slicing.
-
-    Parameters
-    ----------
-    path : Path
-        Path for messages.
-    array : Any
-        Returns a numpy array for a tuple of slices and indices, one for each of its axes.
-    picks : tuple
-        For each axis of the array an index, or for the three axes a slice (start, stop).
-    chunks : tuple of int, optional
-        Edges, along all axes of the array, of the smallest block that is read at once.
-    """
-
-    def __init__(
-        self,
-        path: Path,
-        array: Any,
-        picks: tuple[int | slice, ...],
-        chunks: Sequence[int] | None = None,
-    ) -> None:
-        self.path, self.array, self.picks = path, array, picks
-        spans = [(axis, pick) for axis, pick in enumerate(picks) if isinstance(pick, slice)]
-        self.shape = tuple(pick.stop - pick.start for _, pick in spans)
-        self.chunks = None if chunks is None else tuple(int(chunks[axis]) for axis, _ in spans)
-        self.dtype = array.dtype
-
-    @property
-    def strides(self) -> tuple[int, ...] | None:
-        """Bytes between voxels along each axis of a mapped file, in which the first varies
-        fastest; None for chunks.
-        """
-        if self.chunks is not None:
-            return None
-        steps = np.cumprod([np.dtype(self.dtype).itemsize, *self.array.shape[:-1]])
-        return tuple(
-            int(step)
-            for step, pick in zip(steps, self.picks, strict=True)
-            if isinstance(pick, slice)
-        )
-
-    def within(self, ranges: Sequence[tuple[int, int]]) -> VoxelsInFile:
-        """Return the voxels in a box of indices, start (inclusive) to stop (exclusive) along the
-        three axes.
-        """
-        bounds = iter(ranges)
-        picks = []
-        for pick in self.picks:
-            if isinstance(pick, slice):
-                start, stop = next(bounds)
-                pick = slice(pick.start + start, pick.start + stop)
-            picks.append(pick)
-        part = VoxelsInFile(self.path, self.array, tuple(picks))
-        part.chunks, part.dtype = self.chunks, self.dtype
-        return part
-
-    def __getitem__(self, box: tuple[slice, ...]) -> NDArray:
-        """Read the voxels of a box of indices into memory; InputError if they cannot be read."""
-        ranges = [each.indices(size)[:2] for each, size in zip(box, self.shape, strict=True)]
-        picks = self.within(ranges).picks
-        try:
-            values = self.array[picks]
-            return np.array(values) if isinstance(values, np.memmap) else np.asarray(values)
-        except MemoryError:
-            raise
-        except Exception as error:  # codecs raise any error on damaged chunks
-            place = ", ".join(f"{start}:{stop}" for start, stop in ranges)
-            raise InputError(
-                f"{self.path}: its voxels {place} cannot be read ({one_line(error)[:200]}); copy "
-                "it again"
-            ) from error
 
 
 def volume_index(trailing: Sequence[int], volume: int | None, axes: str = "") -> tuple[int, ...]:

@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from tetopt.errors import InputError
-from tetopt.image import Image, check_kind, checked_affine
+from tetopt.image import check_kind, checked_affine
 from tetopt.io.apart import read_apart
 from tetopt.io.text import plain
 from tetopt.io.units import mm_of_axes, notes_of_size
-from tetopt.io.volumes import VoxelsInFile, one_line, volume_index
+from tetopt.io.volumes import one_line, volume_index
 from tetopt.system.budget import check_memory
 from tetopt.system.extras import install_hint
 from tetopt.system.files import folder_written_whole
@@ -54,6 +54,7 @@ WAYS = {
     "z": (2, 1.0),
 }
 ARRAY_AXES = 32  # at most in an array, the limit of the oldest supported numpy
+MOST_FOLDERS = 3  # between a level and its image: "0", or "scale0/image"
 MOST_LEVELS = 64  # in a multiscale: more than halving any volume can give
 # Errors on metadata of another structure: a list in place of a table, a missing entry, a text in
 # place of a number.
@@ -96,13 +97,21 @@ def is_zarr(path: Path) -> bool:
     return path.is_dir() and (path.name.lower().endswith(ZARR_SUFFIX) or is_node(path))
 
 
+def image_folder(level: Path) -> Path | None:
+    """Return the folder that may be the OME-Zarr image of a level; None if there is none."""
+    folders = [folder for folder in level.parents[:MOST_FOLDERS] if is_node(folder)]
+    return folders[0] if folders and is_node(level) else None
+
+
 def is_node(path: Path) -> bool:
     """Return whether a folder is a Zarr array or group, by its contents."""
     return any((path / name).exists() for name in NODE_FILES)
 
 
-def open_zarr(level: ZarrLevel, volume: int | None) -> Image:
-    """Open one volume of a level, without reading voxels.
+def zarr_picks(
+    level: ZarrLevel, volume: int | None, bounds: Sequence[tuple[int, int]]
+) -> list[int | slice]:
+    """Return the index of a box of one volume of a level, along all axes of its array.
 
     Raises
     ------
@@ -111,43 +120,51 @@ def open_zarr(level: ZarrLevel, volume: int | None) -> Image:
     """
     words = ", ".join(f"{level.names[axis]} ({level.array.shape[axis]})" for axis in level.others)
     # The last axis varies fastest, as in the file.
-    index = volume_index([level.array.shape[axis] for axis in level.others[::-1]], volume, words)[
-        ::-1
-    ]
-    picks: list[int | slice] = [slice(0, int(size)) for size in level.array.shape]
-    for axis, at in zip(level.others, index, strict=True):
-        picks[axis] = at
-    return Image.stored(
-        VoxelsInFile(level.folder, level.array, tuple(picks), level.array.chunks), level.affine
+    trailing = [level.array.shape[axis] for axis in level.others[::-1]]
+    picks: dict[int, int | slice] = dict(
+        zip(level.others[::-1], volume_index(trailing, volume, words), strict=True)
     )
+    picks |= {axis: slice(*ends) for axis, ends in zip(level.space, bounds, strict=True)}
+    return [picks[axis] for axis in range(len(picks))]
 
 
-def read_chunks(voxels: VoxelsInFile) -> NDArray:
-    """Read all of these voxels in a child process, as compiled codecs trust the headers of chunks.
+def read_chunks(level: ZarrLevel, picks: Sequence[int | slice], n_voxels: int) -> NDArray:
+    """Read voxels in a child process, as compiled codecs trust the headers of chunks.
 
     Raises
     ------
     InputError
         Without a leading path: chunks are damaged, or a codec crashes on them.
     """
-    picks = [[pick.start, pick.stop] if isinstance(pick, slice) else pick for pick in voxels.picks]
-    n_bytes = math.prod(voxels.shape) * voxels.dtype.itemsize
+    index = [[pick.start, pick.stop] if isinstance(pick, slice) else pick for pick in picks]
+    n_bytes = n_voxels * level.array.dtype.itemsize
     values: NDArray = read_apart(
-        _values, voxels.path, picks, size=n_bytes, value_bytes=n_bytes, library="zarr"
+        _values, level.folder, index, size=n_bytes, value_bytes=n_bytes, library="zarr"
     )
     return values
 
 
-def _values(folder: str, picks: list[list[int] | int]) -> NDArray:
+def _values(folder: str, index: list[list[int] | int]) -> NDArray:
     """Return a part of an array, in the child."""
-    parts = tuple(slice(*pick) if isinstance(pick, list) else pick for pick in picks)
-    voxels = VoxelsInFile(Path(folder), _node(Path(folder)), parts)
-    return voxels[tuple(slice(0, size) for size in voxels.shape)]
+    array = _node(Path(folder))
+    try:
+        return np.asarray(
+            array[tuple(slice(*pick) if isinstance(pick, list) else pick for pick in index)]
+        )
+    except MemoryError:
+        raise
+    except Exception as error:  # codecs raise any error on damaged chunks
+        place = ", ".join(
+            f"{pick[0]}:{pick[1]}" if isinstance(pick, list) else str(pick) for pick in index
+        )
+        raise InputError(
+            f"its voxels {place} cannot be read ({one_line(error)[:200]}); copy it again"
+        ) from error
 
 
 def zarr_levels(path: Path, notes: list[str]) -> list[ZarrLevel]:
-    """Return the arrays of an image, the finest first: those of OME-Zarr's first multiscale, or a
-    single array.
+    """Return the arrays of an image, the finest first: those of OME-Zarr's first multiscale, from
+    a level on if `path` is one of them, or a single array.
 
     Raises
     ------
@@ -159,10 +176,14 @@ def zarr_levels(path: Path, notes: list[str]) -> list[ZarrLevel]:
     if hasattr(node, "shape"):
         _check_array(node)
         if (affine := _own_affine(node)) is None:
+            if (folder := image_folder(path)) is not None:
+                levels = zarr_levels(folder, notes)
+                names = [level.folder for level in levels]
+                if path in names:
+                    return levels[names.index(path) :]
             raise InputError(
                 "this Zarr array has no scale; give the folder of its OME-Zarr image, or give it "
-                "the "
-                'attribute "affine", 4 x 4 numbers from index to world in mm'
+                'the attribute "affine", 4 x 4 numbers from index to world in mm'
             )
         return [
             ZarrLevel(
@@ -190,7 +211,9 @@ def zarr_levels(path: Path, notes: list[str]) -> list[ZarrLevel]:
         ) from error
 
 
-def save_zarr(path: Path, image: Image, voxels: Any, dtype: DTypeLike) -> tuple[float, float]:
+def save_zarr(
+    path: Path, affine: NDArray[np.float64], voxels: Any, dtype: DTypeLike
+) -> tuple[float, float]:
     """Write an OME-Zarr image (NGFF 0.5, Zarr's format 3) chunk by chunk, whole or not at all.
 
     Its axes are named x, y, z in the order of the indices. Scale and translation are the lengths of
@@ -201,10 +224,10 @@ def save_zarr(path: Path, image: Image, voxels: Any, dtype: DTypeLike) -> tuple[
     ----------
     path : Path
         Replaces an existing Zarr folder; call `tetopt.system.files.checked_output` first.
-    image : Image
-        Gives the placement; three-dimensional.
+    affine : (4, 4) array
+        Placement of the voxels.
     voxels : Any
-        Returns voxels for a tuple of slices, chunk by chunk.
+        Three-dimensional; returns voxels for a tuple of slices, chunk by chunk.
     dtype : dtype
         Type for storage; values are rounded for an integer type.
 
@@ -221,35 +244,33 @@ def save_zarr(path: Path, image: Image, voxels: Any, dtype: DTypeLike) -> tuple[
         For the reasons of `tetopt.system.files.folder_written_whole`.
     """
     zarr = _library()
-    if image.ndim != 3:
-        raise InputError(
-            f"{path}: expected a 3-D image for Zarr, got a {image.ndim}-D one; use .nii.gz"
-        )
+    if (n := len(voxels.shape)) != 3:
+        raise InputError(f"{path}: expected a 3-D image for Zarr, got a {n}-D one; use .nii.gz")
     axes = [{"name": name, "type": "space", "unit": "millimeter"} for name in "xyz"]
     place = [
-        {"type": "scale", "scale": image.spacing.tolist()},
-        {"type": "translation", "translation": image.affine[:3, 3].tolist()},
+        {"type": "scale", "scale": np.sqrt((affine[:3, :3] ** 2).sum(axis=0)).tolist()},
+        {"type": "translation", "translation": affine[:3, 3].tolist()},
     ]
     scales = {"axes": axes, "datasets": [{"path": "0", "coordinateTransformations": place}]}
-    ends = [range(0, size, CHUNK_EDGE) for size in image.shape]
+    ends = [range(0, size, CHUNK_EDGE) for size in voxels.shape]
     low, high = np.inf, -np.inf
     with folder_written_whole(path) as folder:
         group = zarr.open_group(folder, mode="w", zarr_format=3)
         array = group.create_array(
             "0",
-            shape=image.shape,
-            chunks=[min(size, CHUNK_EDGE) for size in image.shape],
+            shape=voxels.shape,
+            chunks=[min(size, CHUNK_EDGE) for size in voxels.shape],
             dtype=dtype,
             fill_value=0,
             dimension_names=["x", "y", "z"],
-            attributes={"affine": image.affine.tolist()},
+            attributes={"affine": affine.tolist()},
             config={"write_empty_chunks": True},
         )
         group.attrs.update({"ome": {"version": "0.5", "multiscales": [scales]}})
         for corner in itertools.product(*ends):
             box = tuple(
                 slice(at, min(at + CHUNK_EDGE, size))
-                for at, size in zip(corner, image.shape, strict=True)
+                for at, size in zip(corner, voxels.shape, strict=True)
             )
             block = _of_type(path, np.asarray(voxels[box]), array.dtype)
             low, high = min(low, float(block.min())), max(high, float(block.max()))
@@ -422,7 +443,7 @@ def _check_array(array: Any) -> None:
     )
 
 
-def check_chunks(voxels: VoxelsInFile, notes: list[str]) -> None:
+def check_chunks(level: ZarrLevel, picks: Sequence[int | slice], notes: list[str]) -> None:
     """Check that the files of these voxels' chunks are regular, and not longer or shorter than they
     can be.
 
@@ -434,13 +455,13 @@ def check_chunks(voxels: VoxelsInFile, notes: list[str]) -> None:
     InputError
         Without a leading path: the chunks are invalid.
     """
-    array = voxels.array
+    array = level.array
     edges = array.shards or array.chunks
     ranges = [
         range(pick.start // size, -(-pick.stop // size))
         if isinstance(pick, slice)
         else [pick // size]
-        for pick, size in zip(voxels.picks, edges, strict=True)
+        for pick, size in zip(picks, edges, strict=True)
     ]
     most_bytes = PACKED_BYTES + PACKED_VOXEL_BYTES * math.prod(edges)
     n_chunks, n_missing = math.prod(map(len, ranges)), 0
@@ -454,7 +475,7 @@ def check_chunks(voxels: VoxelsInFile, notes: list[str]) -> None:
     )
     for place in itertools.product(*ranges):
         name = array.metadata.encode_chunk_key(place)
-        file = f"{voxels.path}/{name}"
+        file = f"{level.folder}/{name}"
         try:
             status = os.stat(file)
         except (FileNotFoundError, NotADirectoryError):

@@ -84,8 +84,8 @@ def meshed(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
     search, first = MeshSearch(content, _aim(task), **options), 0.0
     for number, (initial, run, predicted) in enumerate(search, 1):
         if number == 1:
-            check_initial(task, initial)
-        check_room(task, initial)
+            _check_initial(task, initial)
+        check_space(job.output, CELL_BYTES * len(initial.cells))
         first = first or time.perf_counter()
         started("kernels", KERNEL_WORDS)
         nodes = (
@@ -130,12 +130,7 @@ def meshed(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
     return Meshed(result, result.initial, seconds, memory, early=early[-1] if early else None)
 
 
-def check_room(task: Task, initial: Mesh) -> None:
-    """Raise InputError if the disk has no room for the cells of the initial mesh."""
-    check_space(task.plan.job.output, CELL_BYTES * len(initial.cells))
-
-
-def check_initial(task: Task, initial: Mesh, fields: dict[str, NDArray] | None = None) -> None:
+def _check_initial(task: Task, initial: Mesh) -> None:
     """Raise InputError for what the writer would reject after the run, as far as the initial
     mesh shows.
     """
@@ -144,7 +139,7 @@ def check_initial(task: Task, initial: Mesh, fields: dict[str, NDArray] | None =
         return
 
     def build(early: SolverOptions) -> Model:
-        return model_with(task, initial, early, task.source.about, is_told=False, fields=fields)
+        return model_with(task, initial, early, task.source.about, is_told=False)
 
     check_early(job.output, job, initial.ndim, task.source.low, build)
 

@@ -456,34 +456,6 @@ class EngineOptions:
     ] = None
 
 
-WorkersOption = Annotated[
-    int | None, Option("N", "Maximum number of simultaneous tasks on this machine.", least=1)
-]
-SchedulerOption = Annotated[
-    str | None, Option("ADDRESS", "A running dask scheduler with its workers: tcp://host:8786.")
-]
-
-
-@dataclass(frozen=True, kw_only=True)
-class PartsOptions:
-    """Settings of meshing in parts, and its workers."""
-
-    panel: ClassVar[str] = "Meshing in parts"
-    parts: Annotated[
-        int | None,
-        Option(
-            "K",
-            "Mesh in K or more parts, each with its own voxels (default 1, or as memory requires).",
-            least=1,
-        ),
-    ] = None
-    workers: WorkersOption = None
-    worker_gb: Annotated[
-        float | None, Option("GB", "Memory limit of each worker on this machine.")
-    ] = None
-    scheduler: SchedulerOption = None
-
-
 @dataclass(frozen=True, kw_only=True)
 class ModelOptions:
     """Materials, sets and loads for a solver."""
@@ -603,7 +575,6 @@ class RunOptions(SolverOptions, EngineOptions, StartOptions, SizeOptions, Conten
 class JobOptions(
     OutputOptions,
     SolverOptions,
-    PartsOptions,
     EngineOptions,
     StartOptions,
     SizeOptions,

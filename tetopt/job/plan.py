@@ -24,9 +24,8 @@ from tetopt.engine.meshing import (
 from tetopt.engine.paper import default_n_t
 from tetopt.errors import InputError
 from tetopt.io.formats import FORMATS
-from tetopt.io.images import file_shape, parse_crop, parse_slice
+from tetopt.io.images import checked_bounds, file_shape, parse_crop, parse_slice, smaller_words
 from tetopt.io.label_tables import NO_TABLE, LabelTable
-from tetopt.io.stored_images import STORED_SUFFIXES, check_local
 from tetopt.job.inputs import balance_of, checked_outputs, label_sizes_of, number_of, read_companion
 from tetopt.job.model import check_solver_options
 from tetopt.job.options import JobOptions, Method, stated_part
@@ -34,9 +33,10 @@ from tetopt.model.mappings import named_file
 from tetopt.model.tissues import groups_of
 from tetopt.start.label_sizes import SizesByLabel
 from tetopt.start.lattice import KINDS, MAX_NODES
-from tetopt.start.memory import meshing_bytes
+from tetopt.start.memory import BOUND_MARGIN, CHANNEL_BYTES, meshing_bytes
 from tetopt.start.octree import nodes_of_sizes
 from tetopt.start.sizes import Sizes
+from tetopt.system.budget import check_memory
 from tetopt.system.files import checked_output, results_folder
 
 VOXEL_BYTES = 16.0  # of an image that is read whole, in addition to meshing
@@ -109,31 +109,28 @@ def kind_of(plan: Plan, ndim: int) -> str:
     return plan.job.lattice or KINDS[ndim][0]
 
 
-def whole_bytes(plan: Plan) -> float:
-    """Return the bytes that a graded mesh of an image that could stay in its file takes in one
-    piece; 0 for others.
+def check_volume(plan: Plan) -> None:
+    """Raise InputError if the file's header states more voxels than memory can mesh; none is read.
+
+    Only a run without a mask meshes them all; the reader checks the memory of reading.
     """
-    path = plan.job.images[0]
-    check_local(path)
-    if (
-        not path.name.lower().endswith(STORED_SUFFIXES)
-        or plan.job.slice_ is not None
-        or plan.mode != "graded"
-    ):
-        return 0.0
-    n_voxels = voxels_in_file(plan)
-    return VOXEL_BYTES * n_voxels + meshing_bytes(
-        n_voxels, len(plan.job.images), plan.job.nodes or DEFAULT_NODES[3]
+    job = plan.job
+    if has_region(job) or job.slice_ is not None:
+        return
+    path = job.images[0]
+    shape = (file_shape(path) or ())[:3]
+    crop = [(None, None)] * 3 if job.crop is None else parse_crop(job.crop)
+    if len(shape) < 3 or len(crop) != 3:  # the reader rejects such a crop
+        return
+    bounds = checked_bounds(shape, crop)
+    n_voxels = prod(stop - start for start, stop in bounds)
+    fixed = meshing_bytes(0, 0, job.nodes or DEFAULT_NODES[3])
+    each = VOXEL_BYTES + BOUND_MARGIN * CHANNEL_BYTES * len(job.images)
+    check_memory(
+        fixed + each * n_voxels,
+        f"{path}: an image of {' x '.join(str(stop - start) for start, stop in bounds)} voxels",
+        lambda room: smaller_words(path, bounds, (room - fixed) / each),
     )
-
-
-def voxels_in_file(plan: Plan) -> int:
-    """Return the number of voxels of the cropped image, by its header."""
-    shape = (file_shape(plan.job.images[0]) or (0,))[:3]
-    if plan.job.crop is None:
-        return prod(shape)
-    bounds = zip(shape, parse_crop(plan.job.crop), strict=False)
-    return prod(len(range(length)[slice(*ends)]) for length, ends in bounds)
 
 
 def stated_options(plan: Plan, ndim: int) -> dict[str, Any]:
@@ -158,7 +155,6 @@ def stated_options(plan: Plan, ndim: int) -> dict[str, Any]:
         "max_gb": job.max_gb,
         "start": None if job.start is None else job.start.name,
         **plan.engine_options,
-        **({} if job.parts is None else {"parts": job.parts}),
     }
 
 

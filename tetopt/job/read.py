@@ -15,14 +15,11 @@ from tetopt.job.advice import tell_label_sizes
 from tetopt.job.events import note, started, warning
 from tetopt.job.inputs import label_table, read_mesh, set_threads, warn_of_other_image
 from tetopt.job.job import Job
-from tetopt.job.meshing import meshed
-from tetopt.job.options import PartsOptions, kinds_of
-from tetopt.job.plan import Plan, changed, nodes_of_targets, plan, whole_bytes, with_numbers
+from tetopt.job.plan import Plan, changed, check_volume, nodes_of_targets, plan, with_numbers
 from tetopt.job.request import requested
 from tetopt.job.source import read_source
 from tetopt.job.task import Task
 from tetopt.mesh import Mesh
-from tetopt.system.budget import available_bytes
 
 
 def read(job: Job) -> Task:
@@ -41,8 +38,8 @@ def read(job: Job) -> Task:
     Raises
     ------
     InputError
-        As for `plan`; a file cannot be read, or does not match the others; a run in parts has
-        options that parts do not support.
+        As for `plan`; a file cannot be read, or does not match the others; meshing the image would
+        take more memory than is free.
 
     See Also
     --------
@@ -59,19 +56,12 @@ def read(job: Job) -> Task:
     checked = plan(job)
     set_threads(job.threads)
     started("read", "reading and preparing the image, with its mask and labels")
-    is_asked = any(getattr(job, name) is not None for name in kinds_of(PartsOptions))
-    if is_asked or whole_bytes(checked) > available_bytes():
-        # loaded where it is needed, like all that it imports
-        from tetopt.job.in_parts import read_in_parts
-
-        return read_in_parts(checked) or read_planned(checked)
+    check_volume(checked)
     return read_planned(checked)
 
 
 def read_planned(plan: Plan) -> Task:
-    """Read the files of a plan, and fill in the defaults that depend on them, for a mesh in one
-    piece.
-    """
+    """Read the files of a plan, and fill in the defaults that depend on them."""
     start = None if plan.job.start is None else read_mesh(plan.job.start)
     source = read_source(plan.job, plan.job.label_names, loaded=start)
     if start is not None:
@@ -88,7 +78,7 @@ def read_planned(plan: Plan) -> Task:
     elif (needed := nodes_of_targets(plan, source.content, sizes)) is not None:
         note(f"sizes require about {needed} nodes")
     # With the files' current checksums.
-    return Task(plan, source, start, sizes, requested(plan.bare), meshed, by_label)
+    return Task(plan, source, start, sizes, requested(plan.bare), by_label)
 
 
 def _check_place(mesh: Mesh, image: Image, path: str) -> None:

@@ -12,36 +12,26 @@ from pathlib import Path
 from typing import Any
 
 import tetopt
-from tetopt.io.images import sha256
-from tetopt.io.stored_images import stored_checksum
+from tetopt.io.images import sha256, status_checksum
 from tetopt.job.inputs import file_and_volume, tissue_files
 from tetopt.job.options import (
     JobOptions,
     OutputOptions,
-    PartsOptions,
     given_options,
     kinds_of,
     option_name,
 )
 from tetopt.model.mappings import FILES_IN_TEXTS, named_file
 
-# Options that do not affect the outputs: names of outputs, threads, and the workers of parts.
-OPTIONS_IGNORED = (
-    "threads",
-    *(
-        each.name
-        for each in (*fields(OutputOptions), *fields(PartsOptions))
-        if each.name != "parts"
-    ),
-)
+# Options that do not affect the outputs: names of outputs, and threads.
+OPTIONS_IGNORED = ("threads", *(each.name for each in fields(OutputOptions)))
 
 
 def requested(job: JobOptions) -> dict[str, Any]:
     """Return all that determines the outputs of a run: options, the files' names and checksums, the
     version.
 
-    Names of outputs and of folders, the number of threads and the workers of parts are not
-    included.
+    Names of outputs and of folders, and the number of threads are not included.
 
     Returns
     -------
@@ -88,7 +78,7 @@ def checksum(path: Path) -> str:
     change.
     """
     file, _ = file_and_volume(path)
-    return _kept_checksum(file, stored_checksum(file))
+    return _kept_checksum(file, status_checksum(file))
 
 
 @cache  # a thousand subjects may share an atlas's mask

@@ -25,6 +25,7 @@ from tetopt.job.advice import (
 )
 from tetopt.job.events import Listener, listened, started
 from tetopt.job.job import Job
+from tetopt.job.meshing import meshed
 from tetopt.job.read import read
 from tetopt.job.task import Meshed, Shapes, Task
 from tetopt.job.write import draw, measured_of, numbers_of, saved
@@ -115,8 +116,7 @@ def run(job: Job, on: Listener | None = None, stop: Callable[[], bool] | None = 
 
     Notes
     -----
-    In parts, workers are processes that first import your program: call this function under ``if
-    __name__ == "__main__":``. For processes of your own, use
+    For processes of your own, use
     ``multiprocessing.get_context("spawn")``: a pool that forks after a run never ends, as OpenMP's
     threads do not survive a fork.
 
@@ -134,7 +134,7 @@ def run(job: Job, on: Listener | None = None, stop: Callable[[], bool] | None = 
     begin = time.perf_counter()
     with listened(on), outputs_of_run(vars(job).values()):
         task = read(job)
-        outcome = task.way(task, stop or (lambda: False), begin)
+        outcome = meshed(task, stop or (lambda: False), begin)
         started("write", "writing and measuring the mesh")
         failed: dict[str, str] = {}
         model, about = saved(task, outcome, failed)
@@ -155,8 +155,6 @@ def run(job: Job, on: Listener | None = None, stop: Callable[[], bool] | None = 
             save_json(job.json_path, numbers)
         if undrawn is not None:
             raise undrawn
-        if outcome.end is not None:
-            outcome.end()
         return result
 
 

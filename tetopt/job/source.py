@@ -74,7 +74,6 @@ class Source(NamedTuple):
     mask: Image | None
     about: dict[str, Any]  # names, checksums, weights and the image's box, for the mesh's file
     table: LabelTable  # of the labels
-    drawn: Image  # the first contrast for pictures; a coarser level of one that stays in its file
 
     @property
     def image(self) -> Image:
@@ -235,7 +234,7 @@ def read_source(
         **({} if mask is None else {MASK_TEXT: mask_text(mask)}),
     }
     return Source(
-        paths, balance.weights, combined, contrasts, labels, mask, about, NO_TABLE, image
+        paths, balance.weights, combined, contrasts, labels, mask, about, NO_TABLE
     ).with_table(table)
 
 

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
-
-from numpy.typing import NDArray
 
 from tetopt.engine.loop import MeshingResult
 from tetopt.job.plan import Plan
@@ -36,8 +33,6 @@ class Task(NamedTuple):
         Targets and limits for the cells' edges.
     request : dict
         Everything that determines the outputs: options, checksums of files, the version.
-    way : callable
-        Builds the optimised mesh of the task, given `stop` of `run` and the run's start time.
     by_label : SizesByLabel, optional
         Sizes of labels, if sizes by label are requested.
 
@@ -54,7 +49,6 @@ class Task(NamedTuple):
     started: MeshFile | None
     sizes: Sizes | None
     request: dict[str, Any]
-    way: Callable[[Task, Callable[[], bool], float], Meshed]
     by_label: SizesByLabel | None = None
 
     @property
@@ -76,10 +70,6 @@ class Meshed(NamedTuple):
         `load`, until the optimisation, and `optimize`.
     memory : dict of str to float
         Bounds of the memory, in bytes, as in run.json.
-    fields : dict of str to array, optional
-        Fields of the cells, if they came with the mesh.
-    end : callable, optional
-        Ends a complete run; until then, the mesh is kept in other files, too.
     early : Path, optional
         The file that has the mesh already, without measurements, if the run was cut short.
 
@@ -96,6 +86,4 @@ class Meshed(NamedTuple):
     initial: Mesh
     seconds: dict[str, float]
     memory: dict[str, float]
-    fields: dict[str, NDArray] | None = None
-    end: Callable[[], None] | None = None
     early: Path | None = None

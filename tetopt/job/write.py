@@ -77,7 +77,7 @@ def model_with(
     known_sets = all_sets(
         mesh, box_of(source.contrasts[0]), fields, own, source.table.names, is_told=is_told
     )
-    return solver_model(mesh, source.image.in_memory, solver, fields, about, known_sets)
+    return solver_model(mesh, source.image, solver, fields, about, known_sets)
 
 
 def saved(task: Task, outcome: Meshed, failed: dict[str, str]) -> tuple[Model, dict[str, Any]]:
@@ -88,13 +88,7 @@ def saved(task: Task, outcome: Meshed, failed: dict[str, str]) -> tuple[Model, d
     first, or in the file itself if the run was cut short. Measurements that fail are left out, and
     noted in `failed`.
     """
-    plan, job, source, result, fields = (
-        task.plan,
-        task.plan.job,
-        task.source,
-        outcome.result,
-        outcome.fields,
-    )
+    plan, job, source, result = task.plan, task.plan.job, task.source, outcome.result
     options = stated_options(plan, source.content.image.ndim)
     if job.target_error is not None:
         options["nodes"] = result.nodes
@@ -103,9 +97,8 @@ def saved(task: Task, outcome: Meshed, failed: dict[str, str]) -> tuple[Model, d
     places = (
         islice(kept_places(job.output, ".vtu"), 1) if outcome.early is None else [outcome.early]
     )
-    early = None if outcome.end is not None else keep_early(result.mesh, result.labels, places)
-    if fields is None:
-        fields = _measured_fields(source, result, failed)
+    early = keep_early(result.mesh, result.labels, places)
+    fields = _measured_fields(source, result, failed)
     try:
         whole = model_with(task, result.mesh, job, about, labels=result.labels, fields=fields)
         model = with_chosen_sets(whole, job.output, job)
@@ -231,7 +224,7 @@ def draw(task: Task, outcome: Meshed, model: Model) -> None:
     from tetopt.report import figures, thumbnail  # matplotlib loads slowly and is needed only here
 
     pictures, mesh, source = task.plan.pictures, outcome.result.mesh, task.source
-    image = source.drawn
+    image = source.contrasts[0]
     own = continued(image, source.content.continuation)
     figures.save_run_figures(
         pictures[:3],

@@ -18,10 +18,6 @@ BOUND_MARGIN = 1.5  # so that estimates exceed the peaks of the runs that they w
 # labels' levels.
 PROCESS_BYTES = 1.6e8
 READ_BYTES, REGION_BYTES, LABEL_BYTES = 12.0, 33.0, 85.0
-# Per voxel of a part's box: values as stored and as an image, their sums, and a field of doubles.
-# Measured were 32 for doubles, 28 for single precision, 20 for 16-bit integers (parts of 8 to 27
-# million voxels).
-PART_VOXEL_BYTES = 34.0
 # of the cells' memory: the additional memory of an exchange or the end of a run
 NEXT_FRACTION = 0.3
 CELLS_PER_NODE = {2: 2, 3: 6}  # in large meshes, by dimension
@@ -51,18 +47,6 @@ def bytes_of(content: Content, nodes: int) -> float:
     return meshing_bytes(
         prod(image.shape), content.n_channels + (content.region is not None), nodes, image.ndim
     )
-
-
-def part_bytes(n_voxels: int, n_cells: int) -> float:
-    """Estimate of the peak memory of a part of a mesh beyond that of a process that runs parts.
-
-    Parameters
-    ----------
-    n_voxels : int
-        Number of voxels of the box around its cells.
-    n_cells : int
-    """
-    return PART_VOXEL_BYTES * n_voxels + BOUND_MARGIN * MESHED_CELL_BYTES * n_cells
 
 
 def next_bytes(n_nodes: int, ndim: int = 3) -> float:

@@ -30,7 +30,7 @@ from tetopt.contents.content import Content, plain
 from tetopt.contents.domain import Region
 from tetopt.contents.smoothing import largest_around
 from tetopt.errors import InputError, warn
-from tetopt.image import Image, check_in_memory
+from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.clip import clipped, lost_fraction
 from tetopt.start.lattice import MAX_NODES, near_cubes
@@ -69,8 +69,6 @@ FINER_STEPS, FINER_RATIO = 5, 1.5
 # by chance, as coarse ones do
 SMALL_LOSS, STALLED_FRACTION, STALLED_STEPS = 0.1, 0.9, 2
 MOST_WALL_NODES = 300_000  # of an octree in that search, which takes seconds
-# finer steps tried for the number of nodes that keeps all, after a run that lost walls
-WALL_STEPS = 3
 # of what the first octree loses: if a finer one loses no less, it is not worth its nodes
 LESS_LOST = 0.5
 ALWAYS_ALLOWED_NODES = 5000  # allowed even on images with fewer voxels
@@ -112,15 +110,12 @@ def octree_mesh(image: Image | Content, nodes: int, sizes: Sizes | None = None) 
     ----------
     image : Image or Content
         The mesh covers its box, index -0.5 to shape - 0.5 along each axis, exactly; with a mask, it
-        covers the mask's region, with nodes on its surface. A stored image is read box by box:
-        once, and once for each size of undivided blocks that is tried, up to eleven (a `Content`
-        with `statistics` saves one pass). The mesh is the same as for the same voxels in memory, to
-        the last bit.
+        covers the mask's region, with nodes on its surface.
     nodes : int
         Desired number of nodes. The nearest octree differs by a few per cent, or by a few dozen of
         a small number; it has up to eight times as many where a mask is thinner than its cells.
     sizes : Sizes, optional
-        Targets and limits for the blocks' edges. Targets require voxels in memory.
+        Targets and limits for the blocks' edges.
 
     Returns
     -------
@@ -131,7 +126,7 @@ def octree_mesh(image: Image | Content, nodes: int, sizes: Sizes | None = None) 
     ------
     InputError
         More nodes than leaves of 2 voxels, or of the smallest size, can have; fewer nodes than the
-        sizes need; intensities whose squares overflow; or targets for a stored image.
+        sizes need; or intensities whose squares overflow.
 
     See Also
     --------
@@ -223,14 +218,7 @@ def _block_limits(content: Content, nodes: int, sizes: Sizes | None) -> _BlockLi
         )
     smallest = sizes.smallest / SHORTEST_IN_BLOCK[n]
     largest = max(sizes.longest_edge(image, nodes, content.volume) / LONGEST_IN_BLOCK[n], smallest)
-    target = None
-    if sizes.has_target:
-        check_in_memory(
-            image,
-            "sizes: largest and field require the voxels in memory",
-            "use smallest, longest, coarsest and gradation, or crop it",
-        )
-        target = _target(image, sizes)
+    target = _target(image, sizes) if sizes.has_target else None
     return _BlockLimits(largest, target, smallest, int(np.ceil(1.0 / sizes.slope - 1e-9)))
 
 
@@ -385,28 +373,6 @@ def _finer_octrees(
             return
 
 
-def nodes_for_walls(content: Content, mesh: Mesh, nodes: int, sizes: Sizes | None) -> int | None:
-    """The number of nodes with which `octree_mesh` keeps the walls of a mask that `mesh`, of fewer
-    nodes, loses.
-
-    None if it loses none, or if no number is found.
-    """
-    if (region := content.region) is None or lost_fraction(
-        mesh, content.image, region
-    ) <= MOST_LOST:
-        return None
-    for step in range(1, WALL_STEPS + 1):
-        enough = round(nodes * FINER_RATIO**step)
-        if enough * FINER_RATIO**FINER_STEPS > MOST_WALL_NODES:
-            return None
-        try:
-            if _walled(content, enough, _block_limits(content, enough, sizes)).lost <= MOST_LOST:
-                return enough
-        except InputError:  # more nodes than voxels, or than memory has room for
-            return None
-    return None
-
-
 def _clipped_octree(content: Content, nodes: int, limits: _BlockLimits, region: Region) -> Mesh:
     """The octree with the nearest number of nodes within a region."""
     image = content.image
@@ -490,7 +456,6 @@ def _blocks_by_depth(
     n_blocks, n_summed = (float(prod(roots)) * 2.0 ** (image.ndim * d) for d in (depth, summed))
     n_fields = len(channels.means) + 1 + (content.inside is not None) + OTHER_FIELDS
     need = BLOCK_FIELD_BYTES * (n_summed * n_fields + n_blocks * (limits.target is not None))
-    need += content.image.box_bytes
     check_memory(need, f"octree: {n_blocks:.3g} blocks", "allow longer edges, or crop the image")
     sums = block_sums(content, channels, np.array(roots) << summed)
     spread = (

@@ -1,9 +1,9 @@
-"""Sums of an image's voxels over blocks, from one pass over boxes of them, in memory or stored.
+"""Sums of an image's voxels over blocks, from one pass over slabs of them.
 
 Sums are taken of the channels h' = (h - mean) / scale, at most 1, so that numbers of nodes do not
 depend on the unit of intensity, and of their squares. Each row is added to its block voxel by
 voxel, rows to their planes and planes to their blocks in order: the sums are the same to the last
-bit however the volume is divided into boxes.
+bit however the volume is divided.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 
 from tetopt.contents.content import Content, undivided
 from tetopt.contents.noise import NoiseSample, noise_planes, noise_sample, sampled_noise
-from tetopt.contents.statistics import mean_of, row_sums, statistics
 from tetopt.errors import InputError
-from tetopt.image import Box, pieces
 from tetopt.system.kernel_cache import njit
+
+# processed at a time: half a megabyte per field, which fits into a processor's cache
+PIECE_VOXELS = 2**16
 
 
 class Channels(NamedTuple):
@@ -41,26 +42,19 @@ class Channels(NamedTuple):
 
 
 def channels_of(content: Content) -> Channels:
-    """The channels of a content; stored voxels without known statistics take one pass.
+    """The channels of a content.
 
     Raises
     ------
     InputError
-        Deviations whose squares overflow, or a stored image with voxels that are invalid for an
-        `Image`.
+        Deviations whose squares overflow.
     """
-    # otherwise half of them suffice
-    is_known = content.statistics is not None or content.image.in_memory is None
-    if content.is_plain and content.region is None and content.image.ndim == 3 and is_known:
-        known = statistics(content.image) if content.statistics is None else content.statistics
-        _check_squares(known.scale, content.n_voxels)
-        return Channels([known.mean], known.scale, known.scaled_noise, 0.0)
     means, scale, size = [], 0.0, prod(content.image.shape)
     for number in range(content.n_channels):
         values = content.channel(number)
         values = values if values.ndim == 3 else values[None]
-        sums = [row_sums(np.array(plane, dtype=np.float64, order="C")) for plane in values]
-        means.append(mean_of(np.stack(sums), size))
+        rows = [np.array(plane, dtype=np.float64, order="C").sum(axis=-1) for plane in values]
+        means.append(float(np.stack(rows).sum() / size))
         scale = max(scale, *(abs(float(end) - means[-1]) for end in (values.min(), values.max())))
     _check_squares(scale, size)
     scale = scale or 1.0
@@ -141,28 +135,22 @@ def block_sums(content: Content, channels: Channels, counts: NDArray[np.int64]) 
         for start, size in zip(starts, shape, strict=True)
     ]
     starts = [np.zeros(1, dtype=np.int64)] * (3 - len(shape)) + starts
-    n_rows = shape[-2]
+    ends = np.append(starts[2], shape[-1])
     of_plane, of_row = (
         np.repeat(np.arange(len(length)), length.astype(np.int64))
         for length in [np.ones(1), *lengths][-3:-1]
     )
     n_fields = 1 + len(channels.means) + (content.inside is not None)
     totals = np.zeros((n_fields, *(len(start) for start in starts)))
-    of_open = np.empty(0)  # sums of a block that continues in the next box of the same planes
-    for box, values, inside in _boxes_of(content):
-        first, last = of_row[box[1].start], of_row[box[1].stop - 1]
-        sums = np.zeros((n_fields, values.shape[1], last - first + 1, len(starts[2])))
-        if box[1].start > 0 and of_row[box[1].start - 1] == first:
-            sums[:, :, 0] = of_open
-        for piece in pieces(values.shape[1:]):
-            rows = of_row[box[1]][piece[1]] - first
-            for field, total in zip(_fields(values, inside, channels, piece), sums, strict=True):
-                _add_rows(field, rows, np.append(starts[2], shape[-1]), total[piece[0]])
-        of_open = sums[:, :, -1]
-        is_open = box[1].stop < n_rows and of_row[box[1].stop] == last
-        n_done = sums.shape[2] - is_open
-        for plane, block in enumerate(of_plane[box[0]]):
-            totals[:, block, first : first + n_done] += sums[:, plane, :n_done]
+    for planes, values, inside in _slabs_of(content):
+        sums = np.zeros((n_fields, values.shape[1], *totals.shape[2:]))
+        n_rows = max(PIECE_VOXELS // (values.shape[1] * shape[-1]), 1)
+        for start in range(0, shape[-2], n_rows):
+            rows = slice(start, start + n_rows)
+            for field, total in zip(_fields(values, inside, channels, rows), sums, strict=True):
+                _add_rows(field, of_row[rows], ends, total)
+        for plane, block in enumerate(of_plane[planes]):
+            totals[:, block] += sums[:, plane]
     totals = totals.reshape(n_fields, *counts)
     inside, firsts = (
         None if content.inside is None else totals[-1],
@@ -171,34 +159,26 @@ def block_sums(content: Content, channels: Channels, counts: NDArray[np.int64]) 
     return BlockSums(lengths, inside, totals[0], firsts)
 
 
-def _boxes_of(content: Content) -> Iterator[tuple[Box, NDArray, NDArray[np.bool_] | None]]:
-    """Boxes of whole rows, plane by plane, with their voxels (C, P, R, K) and the mask of those
-    inside (P, R, K).
+def _slabs_of(content: Content) -> Iterator[tuple[slice, NDArray, NDArray[np.bool_] | None]]:
+    """Planes of a volume, with their voxels (C, P, R, K) and the mask of those inside (P, R, K); a
+    2-D image is one plane.
     """
-    image, inside = content.image, content.inside
-    for box in image.boxes():
-        own, shape = box[3 - image.ndim :], tuple(each.stop - each.start for each in box)
-        if content.is_plain:
-            values = image.read([each.start for each in own], [each.stop for each in own])
-        else:
-            values = np.stack(
-                [content.channel(number, own) for number in range(content.n_channels)]
-            )
-        yield (
-            box,
-            values.reshape(-1, *shape),
-            None if inside is None else inside[own].reshape(shape),
-        )
+    shape = content.image.shape
+    n_planes = max(PIECE_VOXELS // prod(shape[-2:]), 1) if len(shape) == 3 else 1
+    for start in range(0, shape[0] if len(shape) == 3 else 1, n_planes):
+        planes = slice(start, start + n_planes)
+        own = (planes,) if len(shape) == 3 else ()
+        values = np.stack([content.channel(number, own) for number in range(content.n_channels)])
+        inside = None if content.inside is None else content.inside[own].reshape(-1, *shape[-2:])
+        yield planes, values.reshape(len(values), -1, *shape[-2:]), inside
 
 
 def _fields(
-    values: NDArray, inside: NDArray[np.bool_] | None, channels: Channels, piece: Box
+    values: NDArray, inside: NDArray[np.bool_] | None, channels: Channels, rows: slice
 ) -> Iterator[NDArray[np.float64]]:
-    """The fields to sum over a piece of voxels: squares, each channel, and with a mask 1 inside
-    it.
-    """
-    within = None if inside is None else inside[piece]
-    scaled = [channels.scaled(part[piece], channel, within) for channel, part in enumerate(values)]
+    """The fields to sum over rows of a slab: squares, each channel, and with a mask 1 inside it."""
+    within = None if inside is None else inside[:, rows]
+    scaled = [channels.scaled(each[:, rows], number, within) for number, each in enumerate(values)]
     square = scaled[0] * scaled[0]
     for each in scaled[1:]:
         square += each * each

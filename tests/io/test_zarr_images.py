@@ -1,6 +1,4 @@
-"""Stored volumes: each voxel with its value and place as where they are read whole; one line for
-what cannot be.
-"""
+"""Zarr folders: each voxel with its value and place; one line for what cannot be read."""
 
 import json
 import os
@@ -19,8 +17,7 @@ from tetopt.contents.phantom import load_phantom
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io import zarr_images
-from tetopt.io.images import file_shape, load_image, save_image, sha256
-from tetopt.io.stored_images import coarse_image, open_stored, stored_checksum
+from tetopt.io.images import file_shape, load_image, save_image, sha256, status_checksum
 from tetopt.io.zarr_images import save_zarr
 from tetopt.system import budget
 
@@ -83,7 +80,7 @@ def write_ome(path, levels, axes, after=None, fmt=3, **options):
 
 def assert_refused(path, match, **options):
     with pytest.raises(InputError, match=re.escape(f"{path}: ") + ".*" + match) as caught:
-        open_stored(path, **options)
+        load_image(path, **options)
     assert "\n" not in str(caught.value)
 
 
@@ -93,42 +90,17 @@ def test_ome_zarr_keeps_values_and_place(tmp_path, fmt, dtype):
     voxels = ramp(6, 5, 4, dtype=dtype)
     place = transforms([300.0, 200.0, 100.0], [3.0, 2.0, 1.0])
     path = write_ome(tmp_path / "a.zarr", [(voxels, place)], axes_of("zyx"), fmt=fmt)
-    image = open_stored(path)
-    np.testing.assert_array_equal(image.read((0, 0, 0), image.shape), voxels)
-    np.testing.assert_array_equal(image.box((1, 2, 0), (5, 4, 3)).data, voxels[1:5, 2:4, 0:3])
+    image, part = load_image(path), load_image(path, crop=[(1, 5), (2, 4), (0, 3)])
+    np.testing.assert_array_equal(image.data, voxels)
+    np.testing.assert_array_equal(part.data, voxels[1:5, 2:4, 0:3])
     expected = [[0, 0, 0.1, 0.001], [0, 0.2, 0, 0.002], [0.3, 0, 0, 0.003], [0, 0, 0, 1]]
     np.testing.assert_allclose(image.affine, expected, rtol=1e-15)
-    np.testing.assert_allclose(
-        image.box((1, 2, 0), (5, 4, 3)).affine[:3, 3], image.to_world([1, 2, 0])
-    )
-    assert image.voxels.chunks == (4, 4, 4)
-
-
-@pytest.mark.parametrize("scaling", [(0.5, -3.0), (1.0, 0.0)])
-@pytest.mark.parametrize("dtype", [">i2", "<f8"])
-@pytest.mark.parametrize("kind", [nibabel.Nifti1Image, nibabel.Nifti2Image])
-def test_uncompressed_nifti_is_as_read_whole(tmp_path, kind, dtype, scaling):
-    file = kind(ramp(7, 6, 5, 2, dtype=dtype), np.array(OBLIQUE), dtype=np.dtype(dtype))
-    file.header.set_slope_inter(*scaling)
-    nibabel.save(file, tmp_path / "a.nii")
-    image, whole = (
-        open_stored(tmp_path / "a.nii", volume=1),
-        load_image(tmp_path / "a.nii", volume=1),
-    )
-    # passes go over it as it lies in the file
-    assert list(np.argsort(image.voxels.strides)) == [0, 1, 2]
-    assert image.affine.tobytes() == whole.affine.tobytes()
-    assert image.box((0, 0, 0), image.shape).data.tobytes() == whole.data.tobytes()
-    assert image.read((1, 2, 3), (2, 3, 4)).dtype == image.voxels.dtype
-    part = open_stored(tmp_path / "a.nii", volume=1, crop=[(2, 5), (None, None), (1, 4)])
-    other = load_image(tmp_path / "a.nii", volume=1, crop=[(2, 5), (None, None), (1, 4)])
-    assert part.box((0, 0, 0), part.shape).data.tobytes() == other.data.tobytes()
-    np.testing.assert_array_equal(part.affine, other.affine)
+    np.testing.assert_allclose(part.affine[:3, 3], image.to_world([1, 2, 0]))
 
 
 def test_places_on_the_network_are_refused():
     for path in ("s3://bucket/a.zarr", "https://host/a.zarr", "gs://bucket/a.zarr"):
-        assert_refused(path, "got a URL")
+        assert_refused(Path(path), "got a URL")
 
 
 def test_chunks_that_are_missing(tmp_path):
@@ -139,7 +111,7 @@ def test_chunks_that_are_missing(tmp_path):
     with pytest.warns(
         UserWarning, match="1 of its 2 chunks are missing; their voxels get its fill value, 0"
     ):
-        open_stored(path)
+        load_image(path)
     shutil.rmtree(path / "0" / "c")
     assert_refused(path, "all of its 2 chunks are missing")
 
@@ -151,13 +123,13 @@ def test_a_phantom_by_chunks_is_the_one_in_memory(tmp_path, monkeypatch):
         {"voxel_mm": [2, 2, 3], "blur_mm": 1.0, "noise_sd": 5.0},
     )
     voxels, path = phantom.voxels(**options), tmp_path / "a.zarr"
-    low, high = save_zarr(path, Image.stored(voxels, voxels.affine), voxels, np.int16)
-    image, whole = open_stored(path), phantom.image(**options)
-    stored = image.read((0, 0, 0), image.shape)
+    low, high = save_zarr(path, voxels.affine, voxels, np.int16)
+    image, whole = load_image(path), phantom.image(**options)
+    stored = image.data
     np.testing.assert_array_equal(stored, np.rint(whole.data))
     assert (low, high) == (stored.min(), stored.max())
-    assert image.voxels.chunks == (16, 16, 16)
-    assert image.voxels.dtype == np.int16
+    array = zarr.open(path / "0", mode="r")
+    assert (array.chunks, array.dtype) == ((16, 16, 16), np.int16)
     # sheared, which scale and translation are not
     np.testing.assert_array_equal(image.affine, whole.affine)
     assert [each.name for each in tmp_path.iterdir()] == ["a.zarr"]
@@ -166,15 +138,15 @@ def test_a_phantom_by_chunks_is_the_one_in_memory(tmp_path, monkeypatch):
 def test_what_does_not_fit_leaves_the_old_folder(tmp_path):
     path = tmp_path / "a.zarr"
     image = Image(ramp(4, 4, 4))
-    save_zarr(path, image, image.data, np.int16)
+    save_zarr(path, image.affine, image.data, np.int16)
     with pytest.raises(
         InputError, match="expected values from -32768 to 32767 for int16, got 1 to 64000"
     ):
-        save_zarr(path, image, image.data * 1000.0 - 999.0 * (image.data == 1), np.int16)
-    np.testing.assert_array_equal(open_stored(path).read((0, 0, 0), (4, 4, 4)), image.data)
+        save_zarr(path, image.affine, image.data * 1000.0 - 999.0 * (image.data == 1), np.int16)
+    np.testing.assert_array_equal(load_image(path).data, image.data)
     assert [each.name for each in tmp_path.iterdir()] == ["a.zarr"]
     with pytest.raises(InputError, match="expected a 3-D image for Zarr, got a 2-D one"):
-        save_zarr(path, Image(ramp(4, 4)), ramp(4, 4), np.int16)
+        save_zarr(path, np.eye(3), ramp(4, 4), np.int16)
 
 
 @pytest.mark.parametrize("dtype", ["u1", "i2", "f4", "f8"])
@@ -187,14 +159,16 @@ def test_an_image_written_as_zarr_comes_back(tmp_path, dtype):
     )
     image = Image(data if dtype != "f4" else np.float32(data) / 4, OBLIQUE)
     save_image(tmp_path / "a.zarr", image)
-    stored = open_stored(tmp_path / "a.zarr")
-    assert stored.voxels.dtype == dtype
-    assert stored.box((0, 0, 0), (4, 5, 6)).data.tobytes() == image.data.tobytes()
+    stored = load_image(tmp_path / "a.zarr")
+    assert zarr.open(tmp_path / "a.zarr" / "0", mode="r").dtype == dtype
+    assert stored.data.tobytes() == image.data.tobytes()
     assert stored.affine.tobytes() == image.affine.tobytes()
 
 
 def test_a_full_disk_leaves_the_old_folder(tmp_path):
     class Full:
+        shape = (4, 4, 4)
+
         def __getitem__(self, box):
             raise OSError(28, "No space left on device")
 
@@ -203,7 +177,7 @@ def test_a_full_disk_leaves_the_old_folder(tmp_path):
     before = sha256(tmp_path / "a.zarr")
     for name in ("a.zarr", "b.zarr"):
         with pytest.raises(OSError, match=f"cannot be written: No space left on device.*{name}"):
-            save_zarr(tmp_path / name, image, Full(), np.int16)
+            save_zarr(tmp_path / name, image.affine, Full(), np.int16)
     assert sha256(tmp_path / "a.zarr") == before
     assert [each.name for each in tmp_path.iterdir()] == ["a.zarr"]
 
@@ -297,11 +271,13 @@ def test_only_the_box_that_is_asked_for_is_read(pyramid, tmp_path):
     chunk = path / "0" / "c" / "0" / "1" / "0" / "0"
     chunk.write_bytes(chunk.read_bytes()[:9])
     assert load_image(path, volume=0, crop=[(0, 4), (None, None), (None, None)]).shape == (4, 5, 4)
-    message = rf"^{re.escape(str(path / '0'))}: its voxels 0:6, 0:5, 0:4 cannot be read"
+    message = (
+        rf"^{re.escape(str(path))}: its voxels 0, 0:6, 0:5, 0:4 cannot be read \(.*\); copy it"
+    )
     with pytest.raises(InputError, match=message):
         load_image(path, volume=0)
     with pytest.raises(InputError, match=message.replace("0:6", "4:6")):
-        open_stored(path, volume=0).box((4, 0, 0), (6, 5, 4))
+        load_image(path, volume=0, crop=[(4, 6), (None, None), (None, None)])
 
 
 @pytest.mark.parametrize(
@@ -322,8 +298,6 @@ def test_only_the_box_that_is_asked_for_is_read(pyramid, tmp_path):
 def test_bad_parts_of_a_folder(pyramid, options, match):
     with pytest.raises(InputError, match=re.escape(f"{pyramid[0]}: ") + ".*" + match):
         load_image(pyramid[0], **options)
-    if "slice_" not in options:
-        assert_refused(pyramid[0], match, **options)
 
 
 def test_what_does_not_fit_into_memory_is_not_read(pyramid, monkeypatch):
@@ -342,14 +316,14 @@ def test_shape_of_a_folder_begins_with_space(pyramid, tmp_path):
 
 def test_checksums_of_a_folder(pyramid, tmp_path):
     path = shutil.copytree(pyramid[0], tmp_path / "a.zarr")
-    whole, cheap = sha256(path), stored_checksum(path)
+    whole, cheap = sha256(path), status_checksum(path)
     assert whole == sha256(pyramid[0])
-    assert cheap == stored_checksum(path)
+    assert cheap == status_checksum(path)
     chunk = path / "0" / "c" / "0" / "1" / "0" / "0"
     voxels = chunk.read_bytes()
     chunk.write_bytes(bytes([*voxels[:-1], voxels[-1] ^ 1]))
     assert sha256(path) != whole
-    assert stored_checksum(path) != cheap  # by its time
+    assert status_checksum(path) != cheap  # by its time
     chunk.write_bytes(voxels)
     chunk.rename(chunk.with_name("7"))
     assert sha256(path) != whole  # names count
@@ -357,7 +331,7 @@ def test_checksums_of_a_folder(pyramid, tmp_path):
     sha256(path)
     os.mkfifo(path / "pipe")
     with pytest.raises(InputError, match="pipe: expected a regular file, got a pipe"):
-        stored_checksum(path)
+        status_checksum(path)
     (path / "pipe").unlink()
     (path / "link").symlink_to("nowhere")
     with pytest.raises(InputError, match="link: no such file"):  # not the whole folder
@@ -367,24 +341,11 @@ def test_checksums_of_a_folder(pyramid, tmp_path):
 def test_cheap_checksum_of_a_file(tmp_path):
     path = tmp_path / "a.nii"
     nibabel.save(nibabel.Nifti1Image(ramp(3, 3, 3), np.eye(4)), path)
-    before = stored_checksum(path)
+    before = status_checksum(path)
     os.utime(path, ns=(0, 12345))
-    assert stored_checksum(path) != before
+    assert status_checksum(path) != before
     with pytest.raises(InputError, match="no such file"):
-        stored_checksum(tmp_path / "b.nii")
-
-
-def test_coarse_levels(pyramid, tmp_path):
-    path, voxels = pyramid
-    coarse = coarse_image(path, 119, volume=1)
-    np.testing.assert_array_equal(coarse.data, voxels[1, ::2, ::2, ::2])
-    np.testing.assert_array_equal(
-        coarse.affine, [[0, 0, 2, 10], [0, 4, 0, 20], [6, 0, 0, 30], [0, 0, 0, 1]]
-    )
-    np.testing.assert_array_equal(coarse_image(path, 120, volume=1).data, voxels[1])
-    assert coarse_image(path, 17, volume=1) is None
-    nibabel.save(nibabel.Nifti1Image(ramp(3, 3, 3), np.eye(4)), tmp_path / "a.nii")
-    assert coarse_image(tmp_path / "a.nii", 1000) is None
+        status_checksum(tmp_path / "b.nii")
 
 
 def test_coarse_levels_of_an_oblique_image(tmp_path):
@@ -395,14 +356,29 @@ def test_coarse_levels_of_an_oblique_image(tmp_path):
     ]
     path = write_ome(tmp_path / "a.zarr", levels, axes_of("xyz", "millimeter", turned=None))
     zarr.open(path / "0").attrs["affine"] = OBLIQUE
-    np.testing.assert_array_equal(open_stored(path).affine, OBLIQUE)
-    coarse = coarse_image(path, 8)
-    np.testing.assert_allclose(
-        coarse.to_world([0, 0, 0]), open_stored(path).to_world([0.5, 0.5, 0.5])
+    image, coarse = load_image(path), load_image(path / "1")
+    np.testing.assert_array_equal(image.affine, OBLIQUE)
+    np.testing.assert_allclose(coarse.to_world([0, 0, 0]), image.to_world([0.5, 0.5, 0.5]))
+    np.testing.assert_allclose(coarse.to_world([1, 1, 1]), image.to_world([2.5, 2.5, 2.5]))
+
+
+def test_a_level_is_placed_by_its_image(pyramid, tmp_path):
+    """By its own folder, also with another name of it; the image's metadata count in checksums."""
+    path, voxels = shutil.copytree(pyramid[0], tmp_path / "a.zarr"), pyramid[1]
+    coarse = load_image(path / "1", volume=1)
+    np.testing.assert_array_equal(coarse.data, voxels[1, ::2, ::2, ::2])
+    expected = [[0, 0, 2, 10], [0, 4, 0, 20], [6, 0, 0, 30], [0, 0, 0, 1]]
+    np.testing.assert_array_equal(coarse.affine, expected)
+    assert (
+        load_image(path / "0", volume=1).affine.tolist()
+        == load_image(path, volume=1).affine.tolist()
     )
-    np.testing.assert_allclose(
-        coarse.to_world([1, 1, 1]), open_stored(path).to_world([2.5, 2.5, 2.5])
-    )
+    before = sha256(path / "1"), status_checksum(path / "1")
+    changed(path, set_in("datasets", 1, "coordinateTransformations", transforms([1, 6, 4, 3])))
+    assert sha256(path / "1") != before[0]
+    assert status_checksum(path / "1") != before[1]
+    changed(path, lambda scales, _: scales["datasets"].pop())
+    assert_refused(path / "1", "this Zarr array has no scale", volume=1)
 
 
 def test_no_more_levels_are_opened_than_halving_gives(tmp_path):
@@ -550,7 +526,7 @@ def test_kinds_of_values_and_codecs(tmp_path, options, match):
         assert_refused(path, match)
     else:
         array[:] = np.ones((3, 3, 3), array.dtype)
-        assert open_stored(path).box((0, 0, 0), (3, 3, 3)).data.sum() == 27
+        assert load_image(path).data.sum() == 27
 
 
 def test_a_codec_that_is_missing_is_named(tmp_path):
@@ -568,8 +544,8 @@ def test_arrays_by_themselves(tmp_path):
     assert_refused(tmp_path / "a", 'this Zarr array has no scale; .* attribute "affine"')
     array.attrs["affine"] = OBLIQUE
     assert_refused(tmp_path / "a", r"2 volumes along axis 3 \(2\)")
-    image = open_stored(tmp_path / "a", volume=1)
-    np.testing.assert_array_equal(image.read((0, 0, 0), (3, 4, 5)), voxels[..., 1])
+    image = load_image(tmp_path / "a", volume=1)
+    np.testing.assert_array_equal(image.data, voxels[..., 1])
     np.testing.assert_array_equal(image.affine, OBLIQUE)
     for affine, match in (
         (np.eye(3).tolist(), "expected shape"),
@@ -589,21 +565,17 @@ def test_chunks_that_cannot_be(tmp_path, monkeypatch):
     packed = chunk.read_bytes()
     for damaged in (b"", packed[:7], packed[:-3], b"\0" * len(packed)):
         chunk.write_bytes(damaged)
-        with pytest.raises(InputError, match=r"a\.zarr/0: its voxels 4:8, 0:4, 0:4 cannot be read"):
-            open_stored(path).read((4, 0, 0), (8, 4, 4))
+        assert_refused(path, "its (voxels 0:8, 0:4, 0:4 cannot be read|chunk c/1/0/0 has)")
     chunk.unlink()
     os.mkfifo(chunk)
     assert_refused(path, "its chunk c/1/0/0 is not a regular file")
     chunk.unlink()
-    with pytest.warns(
-        UserWarning, match="1 of its 2 chunks are missing; their voxels get its fill value, nan"
-    ):
-        image = open_stored(path)
-    with pytest.raises(InputError, match="64 voxels are NaN or infinite"):
-        image.box((0, 0, 0), image.shape)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert_refused(path, "64 voxels are NaN or infinite")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        open_stored(path, crop=[(0, 4), (0, 4), (0, 4)])  # which do not need it
+        load_image(path, crop=[(0, 4), (0, 4), (0, 4)])  # which do not need it
     monkeypatch.setattr(zarr_images, "MOST_CHUNKS", 1)
     assert_refused(path, "expected at most 1 chunks, got 2")
     monkeypatch.setattr(budget, "available_bytes", lambda: 100)
@@ -622,12 +594,11 @@ def test_raw_chunks_and_shards_that_are_cut(tmp_path):
     )
     for path in (tmp_path / "raw.zarr", tmp_path / "shards.zarr"):
         np.testing.assert_array_equal(
-            open_stored(path).read((1, 0, 2), (3, 4, 4)), ramp(4, 4, 4)[1:3, :, 2:]
+            load_image(path, crop=[(1, 3), (0, 4), (2, 4)]).data, ramp(4, 4, 4)[1:3, :, 2:]
         )
         chunk = path / "0" / "c" / "0" / "0" / "0"
         chunk.write_bytes(chunk.read_bytes()[:-5])
-        with pytest.raises(InputError, match="cannot be read"):
-            open_stored(path).read((0, 0, 0), (4, 4, 4))
+        assert_refused(path, "cannot be read")
 
 
 def test_metadata_that_is_no_file(tmp_path):
@@ -648,7 +619,7 @@ def test_what_axes_do_not_say(tmp_path):
     path = write_ome(tmp_path / "a.zarr", [(ramp(3, 4, 5), place)], axes, after)
     with warnings.catch_warnings(record=True) as heard:
         warnings.simplefilter("always")
-        image = open_stored(path)
+        image = load_image(path)
     words = " ".join(str(each.message) for each in heard)
     assert "has no orientation: assuming x, y and z are right, anterior and superior" in words
     assert "has no unit on its axes: assuming mm" in words
@@ -665,20 +636,5 @@ def test_orientation_turns_axes_to_ras(tmp_path):
     levels = [(ramp(3, 4, 5), transforms([1, 2, 3], [7, 8, 9]))]
     path = write_ome(tmp_path / "a.zarr", levels, axes_of("xyz", "millimeter", turned))
     np.testing.assert_array_equal(
-        open_stored(path).affine, [[0, -2, 0, -8], [-1, 0, 0, -7], [0, 0, -3, -9], [0, 0, 0, 1]]
+        load_image(path).affine, [[0, -2, 0, -8], [-1, 0, 0, -7], [0, 0, -3, -9], [0, 0, 0, 1]]
     )
-
-
-@pytest.mark.parametrize("name", ["a.nii.gz", "a.mgz", "a.png", "a.zarr.zip", "a.xyz", "A.MHD"])
-def test_files_that_cannot_be_read_in_parts(tmp_path, name):
-    (tmp_path / name).write_bytes(b"something")
-    assert_refused(
-        tmp_path / name,
-        r"cannot be read in parts; unpack or convert it to \.zarr or uncompressed \.nii first",
-    )
-
-
-def test_a_plane_is_no_volume(tmp_path):
-    nibabel.save(nibabel.Nifti1Image(ramp(3, 3), np.eye(4)), tmp_path / "a.nii")
-    assert_refused(tmp_path / "a.nii", "expected a 3-D image, got")
-    assert_refused(tmp_path, "expected a Zarr folder, got another folder")

@@ -1,0 +1,103 @@
+"""Sums over blocks: each block's own voxels, the same bits however the volume is divided."""
+
+import sys
+
+import naive
+import numpy as np
+import pytest
+from shapes import channels as all_channels
+
+import tetopt
+from tetopt.contents.content import content, plain
+from tetopt.start.octree import nearest_octree, octree_mesh
+from tetopt.start.sums import _add_rows, block_sums, channels_of
+
+OBLIQUE = np.array(
+    [[0.9, 0.3, 0.2, -7.0], [-0.25, 1.1, 0.1, 3.0], [0.0, 0.4, -1.5, 11.0], [0.0, 0.0, 0.0, 1.0]]
+)
+THICK = np.diag([0.7, 0.8, 2.5, 1.0])
+
+
+def noisy(shape, dtype, noise=6.0):
+    place = np.stack(
+        np.meshgrid(*[np.arange(s) for s in shape], indexing="ij"), -1
+    ) - 0.4 * np.array(shape)
+    data = 100.0 + 300.0 * ((place**2).sum(-1) < (0.25 * min(shape)) ** 2)
+    return (data + np.random.default_rng(4).normal(0.0, noise, shape)).astype(dtype)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("most", [700, 20_000])
+@pytest.mark.parametrize(
+    ("shape", "dtype", "affine"),
+    [
+        ((47, 39, 31), np.uint16, None),
+        ((40, 33, 45), np.float32, THICK),
+        ((31, 37, 43), np.float64, OBLIQUE),
+        ((36, 30, 40), np.uint8, None),
+    ],
+)
+def test_the_octree_does_not_depend_on_slabs(shape, dtype, affine, most, monkeypatch):
+    """Slabs of several planes, of one, and of a plane cut into rows."""
+    image = tetopt.Image(noisy(shape, dtype), affine)
+    expected = octree_mesh(image, 700)
+    monkeypatch.setattr("tetopt.start.sums.PIECE_VOXELS", most)
+    mesh = octree_mesh(image, 700)
+    np.testing.assert_array_equal(mesh.points, expected.points)
+    np.testing.assert_array_equal(mesh.cells, expected.cells)
+
+
+@pytest.mark.parametrize(
+    ("shape", "counts"), [((17, 20, 23), (4, 8, 5)), ((6, 5, 9), (12, 5, 16)), ((31, 25), (4, 9))]
+)
+@pytest.mark.parametrize("is_masked", [False, True])
+def test_sums_are_those_of_each_block_s_voxels(shape, counts, is_masked, monkeypatch):
+    """Two contrasts, in whole numbers, with and without a mask; also where blocks are smaller
+    than voxels.
+    """
+    monkeypatch.setattr("tetopt.start.sums.PIECE_VOXELS", 3 * shape[-1])
+    rng = np.random.default_rng(5)
+    images = [tetopt.Image(rng.integers(0, 50, shape)) for _ in range(2)]
+    mask = tetopt.Image(rng.random(shape) < 0.8) if is_masked else None
+    source = plain(content(images, mask=mask))
+    channels = channels_of(source)._replace(means=[3.0, -7.0], scale=1.0)
+    sums = block_sums(source, channels, np.array(counts))
+    h = np.stack(
+        [values - mean for values, mean in zip(all_channels(source), channels.means, strict=True)]
+    )
+    inside = np.ones(shape, dtype=bool) if source.inside is None else source.inside
+    for place in np.ndindex(*counts):
+        part = tuple(
+            (np.floor((np.arange(s) + 0.5) * n / s) == i).nonzero()[0]
+            for s, n, i in zip(shape, counts, place, strict=True)
+        )
+        of_block, within = h[:, *np.ix_(*part)], inside[np.ix_(*part)]
+        assert sums.voxels(slice(None))[place] == within.size
+        assert sums.inside is None or sums.inside[place] == within.sum()
+        assert sums.second[place] == (of_block**2 * within).sum()
+        assert [first[place] for first in sums.firsts] == [
+            (each * within).sum() for each in of_block
+        ]
+
+
+@pytest.mark.kernel
+def test_rows_are_added_as_the_twin_does():
+    field = np.random.default_rng(6).normal(size=(2, 5, 7))
+    rows, ends, totals = np.array([0, 0, 1, 1, 2]), np.array([0, 3, 3, 7]), np.full((2, 3, 3), 0.5)
+    expected = naive.row_totals(field, rows, ends, totals)
+    _add_rows(field, rows, ends, totals)
+    np.testing.assert_array_equal(totals, expected)
+
+
+def test_blocks_are_bounded(monkeypatch):
+    """Where the bound counts, leaves are larger."""
+    data, sizes, shortest = noisy((40, 40, 40), np.uint16), tetopt.Sizes(longest=np.inf), []
+    for most in (64, 2**24):
+        monkeypatch.setattr(sys.modules["tetopt.start.octree"], "MOST_BLOCKS", most)
+        mesh = nearest_octree(tetopt.Image(data), 1500, sizes)
+        shortest.append(
+            np.linalg.norm(
+                mesh.points[mesh.cells[:, 1]] - mesh.points[mesh.cells[:, 0]], axis=1
+            ).min()
+        )
+    assert shortest[0] > 1.5 * shortest[1]

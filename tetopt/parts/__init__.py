@@ -1,3 +1,0 @@
-"""Meshes larger than memory, optimised in parts and rounds: shared nodes stay, and are inside a
-part in the next.
-"""
