@@ -13,7 +13,7 @@ export PYTHONDONTWRITEBYTECODE =
 
 SOLVERS = calculix-ccx python3-dolfinx
 
-.PHONY: demo check test test-deep test-mutants dist test-lowest test-pythons test-slow test-random test-solvers test-nojit test-onethread test-plain test-bounds test-hostile test-container test-slurm test-cohort lint bench measured fingerprints docs clean
+.PHONY: demo check test test-deep test-mutants dist test-lowest test-pythons test-slow test-random test-solvers test-nojit test-onethread test-plain test-bounds test-hostile test-container test-cohort lint bench measured fingerprints docs clean
 
 demo: $(VENV)/.demo
 	$(BIN)/tetopt demo -o demo --force
@@ -79,16 +79,16 @@ test-pythons:
 
 # A million random operations of the engine, 500 random whole runs and 500 of labels by the defaults, two hours.
 test-random: $(VENV)/.test
-	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python tests/random/runs.py --seed 1 --runs 500
-	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python tests/random/runs.py --seed 1 --runs 500 --labelled
-	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python tests/random/operations.py --seed 1 --operations 1000000
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python benchmarks/random/runs.py --seed 1 --runs 500
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python benchmarks/random/runs.py --seed 1 --runs 500 --labelled
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python benchmarks/random/operations.py --seed 1 --operations 1000000
 
 test-slow: $(VENV)/.test
 	$(TESTED) -m slow
 
 # 10,000 hostile inputs, of the seed in HOSTILE_SEED; `.ci/run` has 40. What ended badly is kept, and its folder printed.
 test-hostile: $(VENV)/.test
-	PYTHONPATH=.:tests PYTHONUTF8=1 NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python -m hostile --inputs 10000 --workers 2
+	PYTHONPATH=scripts PYTHONUTF8=1 NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python -m fuzz --inputs 10000 --workers 2
 	$(TESTED) -q -s --no-header tests/hostile/test_faults.py tests/hostile/test_kills.py
 
 # CalculiX and dolfinx from Debian, MFEM, gmsh (run beside the tests, never imported by tetopt) and pyfebio from PyPI.
@@ -103,18 +103,10 @@ test-solvers: $(VENV)/.test
 test-container: $(VENV)/.test
 	$(TESTED) -q -m "slow or not slow" --no-header tests/test_container.py
 
-# A SLURM of one node, started by hand in a folder of its own, runs the program and the job array of docs/howto/clusters.md.
-test-slurm: $(VENV)/.test
-	@command -v apt-get >/dev/null || { echo "needs Debian's apt-get; install SLURM and munge, then run: TETOPT_SLURM=1 $(BIN)/python -m pytest tests/slurm"; exit 2; }
-	dpkg -s slurm-wlm munge >/dev/null 2>&1 || { apt-get update -qq && apt-get install -y -qq --no-install-recommends slurm-wlm munge; }
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check dask-jobqueue
-	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt warm-up
-	TETOPT_SLURM=1 $(TESTED) -q -s --no-header tests/slurm
-
 # Two hundred subjects with failures put in, the client killed on the way: a quarter of an hour on two idle cores.
 test-cohort: $(VENV)/.test
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt warm-up
-	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python tests/cohort/campaign.py
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python benchmarks/cohort_campaign.py
 
 # The site, into docs/_build/html, without the network; warnings are errors. The gallery's programs run, for minutes.
 docs: $(VENV)/.test
@@ -132,7 +124,7 @@ lint: $(VENV)/.test
 
 bench: $(VENV)/.test
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python scripts/benchmark.py -o bench.json --force
-	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python tests/benchmarks/benchmark_kernels.py -o bench_kernels.json --force
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python benchmarks/benchmark_kernels.py -o bench_kernels.json --force
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt warm-up
 
 # Every number of docs/measured and of README's table, and these pages: 1.5 hours. DATA is a folder with the images that
@@ -143,7 +135,7 @@ measured: $(VENV)/.test
 
 # Whether meshes are still those of the version that wrote tests/fingerprints.json, to the last bit.
 fingerprints: $(VENV)/.test
-	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python tests/benchmarks/fingerprints.py -o fingerprints.json --against tests/fingerprints.json --force
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python benchmarks/fingerprints.py -o fingerprints.json --against tests/fingerprints.json --force
 
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

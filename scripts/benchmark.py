@@ -4,7 +4,7 @@ writes JSON.
     python scripts/benchmark.py -o bench.json [IMAGE]
 
 IMAGE defaults to the MNI152 T1 from nilearn. Compare ratios within one run: absolute times depend
-on the machine and its load. For single kernels, see `tests/benchmarks/benchmark_kernels.py`.
+on the machine and its load. For single kernels, see `benchmarks/benchmark_kernels.py`.
 """
 
 from __future__ import annotations

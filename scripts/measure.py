@@ -230,20 +230,20 @@ MEASUREMENTS = {
     ),
     "edges": Measurement(
         (
-            "python tests/benchmarks/default_sizes.py $CT $PROSTATE -o edges.json --orders 1 "
+            "python benchmarks/default_sizes.py $CT $PROSTATE -o edges.json --orders 1 "
             "--ratios 1.4 1.15 1.0",
         ),
         listed("edges.json"),
     ),
     "averages": Measurement(
         (
-            "python tests/benchmarks/choose_average.py -o averages.json --dofs 150000 $T1 $CT_SLAB "
+            "python benchmarks/choose_average.py -o averages.json --dofs 150000 $T1 $CT_SLAB "
             "--phantoms ellipsoids_brain --averages mean geometric harmonic hill gauss --force",
         ),
         listed("averages.json"),
     ),
     "curved": Measurement(
-        ("python tests/benchmarks/curved_cells.py -o curved.json $HIPPOCAMPUS",),
+        ("python benchmarks/curved_cells.py -o curved.json $HIPPOCAMPUS",),
         listed("curved.json"),
     ),
     "accuracy": Measurement(

@@ -20,7 +20,7 @@ SOURCES = sorted(
 DOCUMENTS = [
     ROOT / "README.md",
     *sorted((ROOT / "docs").glob("**/*.md")),
-    ROOT / "tests" / "benchmarks" / "README.md",
+    ROOT / "benchmarks" / "README.md",
 ]
 # More than 8 parameters: public functions, whose signature is a contract.
 WIDE = {
@@ -188,7 +188,9 @@ def test_what_is_named_exists():
             for name in names
             if re.search(r"\.(vtu|toml|scn|nii|inp|feb|py|md|json|html)$", name)
         }
-        named = re.findall(r"`((?:tetopt|tests|docs|scripts|phantoms)/[\w./]+)`", text_of(path))
+        named = re.findall(
+            r"`((?:tetopt|tests|benchmarks|docs|scripts|phantoms)/[\w./]+)`", text_of(path)
+        )
         absent = {
             name
             for name in named

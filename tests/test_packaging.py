@@ -101,7 +101,7 @@ def test_the_workflow_runs_what_there_is():
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     for target in re.findall(r"make ([\w-]+)", words):
         assert re.search(rf"^{target}:", makefile, re.M), target
-    for name in re.findall(r"\b(?:tests|scripts|docs)/[\w./]+", words):
+    for name in re.findall(r"\b(?:tests|benchmarks|scripts|docs)/[\w./]+", words):
         assert (ROOT / name).exists() or name.startswith("docs/_build"), name
     systems = {job["runs-on"] for job in jobs.values() if "matrix" not in str(job["runs-on"])}
     systems |= {

@@ -16,7 +16,7 @@ from tetopt.geometry.topology import components
 pytestmark = pytest.mark.deep
 
 ROOT = Path(__file__).resolve().parents[1]
-FOLDERS = [ROOT / "scripts", ROOT / "tests" / "benchmarks", ROOT / "docs"]
+FOLDERS = [ROOT / "scripts", ROOT / "benchmarks", ROOT / "docs"]
 
 
 def script(name):
@@ -128,7 +128,7 @@ def test_choose_sizes(tmp_path, monkeypatch, capsys):
     """Every mesh is measured; a tighter largest edge leaves more E_D and follows the
     displacement better.
     """
-    monkeypatch.syspath_prepend(str(ROOT / "tests" / "benchmarks"))
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     out = tmp_path / "sizes.json"
     words = [
         "-o",
@@ -172,7 +172,7 @@ def test_curved_cells(tmp_path, monkeypatch):
 
 def test_choose_average(tmp_path, monkeypatch, capsys):
     """Every average is solved on every mesh; the stiffer it is, the more energy there is."""
-    monkeypatch.syspath_prepend(str(ROOT / "tests" / "benchmarks"))
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     out = tmp_path / "averages.json"
     words = [
         "-o",

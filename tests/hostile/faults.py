@@ -1,24 +1,22 @@
-"""Each step of writing a file, by number: made to fail once, or to be the last thing that a process
-does.
+"""Each step of writing a file, or each array, by number: made to fail once, or to be the last thing
+that a process does.
 
 As SQLite's tests have it: what happens at step 1, at step 2, and so on, until a run has fewer steps
 than that.
 """
 
 import builtins
-import errno
 import io
 import os
 import sys
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from unittest import mock
 
 import numpy as np
 
-# Of each function of `os` that changes what is in folders, the argument that is a path or an open
-# file.
-STEPS = (
+# Functions of `os` that change what is in folders; the first argument is a path or an open file.
+STEPS = [
     "open",
     "fsync",
     "replace",
@@ -29,8 +27,8 @@ STEPS = (
     "chown",
     "mkdir",
     "rmdir",
-)
-ALLOCATIONS = (
+]
+ALLOCATIONS = [
     "empty",
     "zeros",
     "ones",
@@ -40,86 +38,69 @@ ALLOCATIONS = (
     "arange",
     "concatenate",
     "column_stack",
-)
-FULL_DISK = OSError(errno.ENOSPC, "No space left on device")
+]
 
 
-class Steps:
-    """Counts the steps that touch a folder; before number `at` it calls `act` with the step's name,
-    once.
+class Fault:
+    """Counts what may fail; before number `at` it calls `act` with its name, once."""
 
-    With `is_half`, a write does half of its work before.
-    """
-
-    def __init__(self, folder, at, act):
-        self.folder, self.at, self.act = os.path.realpath(folder), at, act
+    def __init__(self, at, act):
+        self.at, self.act = at, act
         self.count, self.reached = 0, None
 
-    def step(self, name, before=lambda: None):
+    def reach(self, name, before=None):
         self.count += 1
         if self.count == self.at:
             self.reached = name
-            before()
+            if before is not None:
+                before()
             self.act(name)
 
-    def is_inside(self, place):
+
+@contextmanager
+def steps_count(fault, folder):
+    """Within it each step that touches a folder counts; a write that fails is half done."""
+    folder = os.path.realpath(folder)
+
+    def is_inside(place):
         if isinstance(place, int):
             try:
                 place = os.readlink(f"/proc/self/fd/{place}")
             except OSError:
                 return False
         place = os.path.abspath(os.fspath(place))
-        return place == self.folder or place.startswith(self.folder + os.sep)
+        return place == folder or place.startswith(folder + os.sep)
 
-    @contextmanager
-    def watched(self):
-        """Within it the steps count."""
-        with contextlib_stack(
-            *(
-                mock.patch.object(os, name, self._of_system(name))
-                for name in STEPS
-                if hasattr(os, name)
-            ),
-            mock.patch.object(io, "open", self._opening(io.open)),
-            mock.patch.object(builtins, "open", self._opening(builtins.open)),
-        ):
-            yield self
+    def stepped(name, real):
+        def step(place, *others, **options):
+            if is_inside(place):
+                path = f"/proc/self/fd/{place}" if isinstance(place, int) else place
+                is_folder = name in ("open", "fsync") and os.path.isdir(path)
+                fault.reach(f"{name} folder" if is_folder else name)
+            return real(place, *others, **options)
 
-    def _of_system(self, name):
-        real = getattr(os, name)
+        return step
 
-        def stepped(first, *others, **options):
-            if self.is_inside(first):
-                self.step(
-                    f"{name} folder"
-                    if name in ("open", "fsync") and self._is_folder(first)
-                    else name
-                )
-            return real(first, *others, **options)
-
-        return stepped
-
-    def _is_folder(self, place):
-        return os.path.isdir(f"/proc/self/fd/{place}" if isinstance(place, int) else place)
-
-    def _opening(self, real):
-        def opened(file, mode="r", *others, **options):
-            is_written = (
-                not isinstance(file, int) and set(mode) & set("wax+") and self.is_inside(file)
-            )
+    def opened(real):
+        def step(file, mode="r", *others, **options):
+            is_written = not isinstance(file, int) and set(mode) & set("wax+") and is_inside(file)
             if is_written:
-                self.step("open to write")
+                fault.reach("open to write")
             stream = real(file, mode, *others, **options)
-            return _Written(stream, self) if is_written else stream
+            return _Written(stream, fault) if is_written else stream
 
-        return opened
+        return step
+
+    steps = [(os, name, stepped(name, getattr(os, name))) for name in STEPS if hasattr(os, name)]
+    with _patched([*steps, *((module, "open", opened(module.open)) for module in (io, builtins))]):
+        yield fault
 
 
 class _Written:
     """A file whose writes are steps."""
 
-    def __init__(self, stream, steps):
-        self._stream, self._steps = stream, steps
+    def __init__(self, stream, fault):
+        self._stream, self._fault = stream, fault
 
     def __getattr__(self, name):
         return getattr(self._stream, name)
@@ -136,54 +117,36 @@ class _Written:
             self._stream.write(data[: len(data) // 2])
             self._stream.flush()
 
-        self._steps.step("write", half)
+        self._fault.reach("write", half)
         return self._stream.write(data)
 
 
-class Allocations:
-    """Counts arrays that tetopt's own code lays out; number `at` does not fit."""
+@contextmanager
+def arrays_count(fault):
+    """Within it each array counts that tetopt's own code lays out."""
 
-    def __init__(self, at):
-        self.at, self.count, self.reached = at, 0, None
-
-    @contextmanager
-    def watched(self):
-        """Within it they count."""
-        with contextlib_stack(
-            *(mock.patch.object(np, name, self._counted(name)) for name in ALLOCATIONS)
-        ):
-            yield self
-
-    def _counted(self, name):
-        real = getattr(np, name)
-
-        def counted(*arguments, **options):
+    def counted(name, real):
+        def allocated(*arguments, **options):
             caller = sys._getframe(1).f_globals.get("__name__", "")
             if caller.startswith("tetopt"):
-                self.count += 1
-                if self.count == self.at:
-                    self.reached = f"{caller}: {name}"
-                    raise MemoryError(f"Unable to allocate an array ({name})")
+                fault.reach(f"{caller}: {name}")
             return real(*arguments, **options)
 
-        return counted
+        return allocated
+
+    with _patched([(np, name, counted(name, getattr(np, name))) for name in ALLOCATIONS]):
+        yield fault
 
 
 @contextmanager
-def contextlib_stack(*patches):
-    """All of them at once; what is real is looked up before the first is put in place."""
-    from contextlib import ExitStack
-
+def _patched(functions):
     with ExitStack() as stack:
-        for patch in patches:
-            stack.enter_context(patch)
+        for module, name, function in functions:
+            stack.enter_context(mock.patch.object(module, name, function))
         yield
 
 
 def left_in(folder):
     """Names of all files under a folder, with their bytes."""
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in sorted(Path(folder).rglob("*"))
-        if path.is_file()
-    }
+    files = (path for path in sorted(Path(folder).rglob("*")) if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}

@@ -10,7 +10,7 @@ import signal
 import sys
 from pathlib import Path
 
-from hostile.faults import Steps, left_in
+from hostile.faults import Fault, left_in, steps_count
 from models import sample_image, sample_model
 
 import tetopt
@@ -28,22 +28,21 @@ WRITERS = {
 CASES = ("new", "replaced", "through a link")
 
 
-def written(path, k, force):
-    """Write file number `k`, as a command does."""
+def write(path, k, force):
+    """Write file number `k`, as a command does; its bytes."""
     with outputs_of_command():
-        checked_output(path, (Path(path).suffix,), force)
+        checked_output(path, (path.suffix,), force)
         WRITERS[path.name](path, k)
+    return path.read_bytes()
 
 
-def killed(folder, name, case, at):
-    """The step at which a child was killed, None if it came to its end; what is in the folder."""
-    path = folder / name
-    is_old = case in ("replaced", "through a link")
+def kill_at(path, case, at):
+    """The step at which a child that writes was killed, None if it came to its end."""
     if case == "through a link":
-        (folder / "far").mkdir()
-        path.symlink_to(folder / "far" / name)
-    if is_old:
-        written(path, 0, True)
+        (path.parent / "far").mkdir()
+        path.symlink_to(path.parent / "far" / path.name)
+    if case != "new":
+        write(path, 0, True)
     reader, writer = os.pipe()
     child = os.fork()
     if child == 0:
@@ -54,8 +53,8 @@ def killed(folder, name, case, at):
 
         code = 1
         try:
-            with Steps(folder, at, stop).watched():
-                written(path, 1, is_old)
+            with steps_count(Fault(at, stop), path.parent):
+                write(path, 1, case != "new")
             code = 0
         finally:
             os._exit(code)
@@ -65,7 +64,7 @@ def killed(folder, name, case, at):
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
     elif status != 0:
-        raise AssertionError(f"{name}, {case}: the child ended with {status}")
+        raise AssertionError(f"{path.name}, {case}: the child ended with {status}")
     with os.fdopen(reader, "rb") as pipe:
         return pipe.read().decode() or None
 
@@ -75,40 +74,28 @@ def window(folder, name, case):
     all the same.
     """
     wholes = []
-    for k in (0, 1, 2):
+    for k in range(3):
         (folder / f"whole{k}").mkdir(parents=True)
-        written(folder / f"whole{k}" / name, k, False)
-        wholes.append((folder / f"whole{k}" / name).read_bytes())
+        wholes.append(write(folder / f"whole{k}" / name, k, False))
+    states = {None: "none", wholes[0]: "old", wholes[1]: "new"}
     rows = []
     for at in range(1, 1000):
-        place = folder / str(at)
-        place.mkdir()
-        step = killed(place, name, case, at)
-        files = left_in(place)
-        hidden = [each for each in files if Path(each).name.startswith(".")]
-        seen = {Path(each).name: content for each, content in files.items() if each not in hidden}
-        state = {None: "none", wholes[0]: "old", wholes[1]: "new"}.get(
-            seen.pop(name, None), "damaged"
-        )
-        written(place / name, 2, True)
-        again = (place / name).read_bytes() == wholes[2] and (
-            case != "through a link" or (place / name).is_symlink()
-        )
-        rows.append([step, state, len(hidden), sorted(seen), again])
+        path = folder / str(at) / name
+        path.parent.mkdir()
+        step = kill_at(path, case, at)
+        files = {Path(each).name: content for each, content in left_in(path.parent).items()}
+        state = states.get(files.pop(name, None), "damaged")
+        hidden = [each for each in files if each.startswith(".")]
+        others = sorted(set(files) - set(hidden))
+        is_whole = write(path, 2, True) == wholes[2]
+        is_whole &= path.is_symlink() == (case == "through a link")
+        rows.append([step, state, len(hidden), others, is_whole])
         if step is None:
             return rows
     raise AssertionError("no end of steps")
 
 
-def main(folder):
-    """Every file in every case, as JSON."""
-    shown = {
-        f"{name}, {case}": window(folder / name / case, name, case)
-        for name in WRITERS
-        for case in CASES
-    }
-    print(json.dumps(shown))
-
-
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    windows = [(f"{name}, {case}", name, case) for name in WRITERS for case in CASES]
+    folder = Path(sys.argv[1])
+    print(json.dumps({key: window(folder / key, name, case) for key, name, case in windows}))

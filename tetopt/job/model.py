@@ -63,7 +63,7 @@ SET_GROUPS = ("labels", "interfaces", "boundary")  # groups of the sets that eve
 MANY_INTERFACES = 24
 # of the mesh's length: larger displacements are not small, with strains of about 10 %
 SMALL_FRACTION = 0.1
-# CalculiX takes three times as long with one material per cell (tests/benchmarks)
+# CalculiX takes three times as long with one material per cell (benchmarks)
 SLOW_MATERIALS = 30_000
 
 

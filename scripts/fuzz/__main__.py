@@ -1,4 +1,4 @@
-"""`python -m hostile`, with `tests` on the path. What starts threads is told not to, before it
+"""`python -m fuzz`, with `scripts` on the path. What starts threads is told not to, before it
 is imported.
 """
 
@@ -15,7 +15,7 @@ for name in (
 os.environ["NUMBA_THREADING_LAYER"] = "workqueue"  # the one that outlives a fork
 os.environ["MPLBACKEND"] = "agg"
 
-from hostile.campaign import main  # noqa: E402
+from fuzz.campaign import main  # noqa: E402
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -1,8 +1,8 @@
 """A cohort of 200 with failures put in, its client killed on the way: everything is accounted for
 (`make test-cohort`).
 
-python tests/cohort/campaign.py [SUBJECTS [SEED]]. Prints a table, and ends with 1 where a row of it
-is not as it should be. Failures are put in from outside: tetopt knows nothing of them.
+python benchmarks/cohort_campaign.py [SUBJECTS [SEED]]. Prints a table, and ends with 1 where a row
+of it is not as it should be. Failures are put in from outside: tetopt knows nothing of them.
 """
 
 import contextlib

@@ -1,7 +1,7 @@
 """How fast the kernels are on this machine, beside the library call that each replaces; a table and
 a JSON file.
 
-    python tests/benchmarks/benchmark_kernels.py -o bench_kernels.json [IMAGE]
+    python benchmarks/benchmark_kernels.py -o bench_kernels.json [IMAGE]
 
 IMAGE is the MNI152 T1 that nilearn carries unless another is named. Compare ratios within one run.
 """

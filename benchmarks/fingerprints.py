@@ -1,7 +1,7 @@
 """Checksums of meshes over the ground that tetopt covers: the same before and after a change that
 is to change nothing.
 
-    python tests/benchmarks/fingerprints.py -o new.json [--against tests/fingerprints.json] [--only
+    python benchmarks/fingerprints.py -o new.json [--against tests/fingerprints.json] [--only
     NAME ...]
 
 Each row is one run of the command: the sha256 of its points and cells, and of its whole file. They

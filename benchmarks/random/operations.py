@@ -1,7 +1,7 @@
 """Random operations of the fast engine on small random worlds, with everything checked after each
 thousand of them.
 
-    python tests/random/operations.py --seed 1 --operations 1000000
+    python benchmarks/random/operations.py --seed 1 --operations 1000000
 
 Weights of shape and image, angle limits and numbers of nodes change at random between them, so that
 nothing settles.

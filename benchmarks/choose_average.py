@@ -7,7 +7,7 @@ solution, as in `tetopt compare`. "points" is no average, but the modulus of the
 point of a cell: what a solver could have that reads the image itself. The last rows are geometric
 means over images, meshes and nu, relative to the first average.
 
-    python tests/benchmarks/choose_average.py -o averages.json [T1.nii.gz ...]
+    python benchmarks/choose_average.py -o averages.json [T1.nii.gz ...]
 """
 
 from __future__ import annotations

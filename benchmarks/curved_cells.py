@@ -1,7 +1,7 @@
 """What curved edges win: distance from a sphere, and volumes of labels, with straight and with
 curved cells.
 
-    python tests/benchmarks/curved_cells.py -o curved.json [LABELS.nii.gz]
+    python benchmarks/curved_cells.py -o curved.json [LABELS.nii.gz]
 
 The labels of a sphere of 20 mm on voxels of 1 mm are meshed with order 2, and so is the image of
 labels, if named. The distance is the mean over the facets between labels, at the seven points of

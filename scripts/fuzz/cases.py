@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import nibabel
 import numpy as np
-from hostile import mutations as m
-from hostile.mutations import HOSTILE_NAMES, HOSTILE_NUMBERS, one_of
-from hostile.seeds import VOXELS, Seeds, affine
+from fuzz import mutations as m
+from fuzz.mutations import HOSTILE_NAMES, HOSTILE_NUMBERS, one_of
+from fuzz.seeds import VOXELS, Seeds, affine
 
 QUICK = ("--nodes", "50", "--iterations", "1")
 MESH_OUTPUTS = (

@@ -15,7 +15,7 @@ import meshio
 import nibabel
 import numpy as np
 import trimesh
-from hostile.cases import Case
+from fuzz.cases import Case
 
 GOOD = ("done", "refused", "requirement violated")
 BAD = (

@@ -6,7 +6,7 @@ for the simulation itself: graded by the reference's own strain, sqrt(E) times i
 push, which no mesher knows. That mesh says what nodes in other places could do at most. Each is
 compressed and compared with a voxel grid's solution.
 
-    python tests/benchmarks/choose_sizes.py -o sizes.json [T1.nii.gz ...]
+    python benchmarks/choose_sizes.py -o sizes.json [T1.nii.gz ...]
 """
 
 from __future__ import annotations

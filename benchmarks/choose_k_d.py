@@ -5,7 +5,7 @@ Phantoms, and volumes of yours, are meshed at several k_D and node counts; each 
 and compared with a voxel grid's solution, as in `tetopt compare`. The last rows are geometric means
 over everything, relative to k_D = 0.
 
-    python tests/benchmarks/choose_k_d.py -o k_d.json [T1.nii.gz ...]
+    python benchmarks/choose_k_d.py -o k_d.json [T1.nii.gz ...]
 """
 
 from __future__ import annotations

@@ -13,12 +13,12 @@ import time
 from pathlib import Path
 
 if __name__ == "__main__":
-    import hostile.__main__  # noqa: F401 - one thread, before numpy comes
+    import fuzz.__main__  # noqa: F401 - one thread, before numpy comes
 
 import nibabel
 import numpy as np
-from hostile import campaign
-from hostile.cases import Case
+from fuzz import campaign
+from fuzz.cases import Case
 
 SOUND = b"""# vtk DataFile Version 3.0
 x

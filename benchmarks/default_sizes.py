@@ -8,7 +8,7 @@ mesh with four times the linear cells' corners. An error of displacement is the 
 over voxels, over that of the reference less the same with one modulus everywhere. The last rows are
 geometric means over all, relative to the first ratio.
 
-    python tests/benchmarks/default_sizes.py -o sizes.json T1.nii.gz CT.nii.gz --within CT.nii.gz
+    python benchmarks/default_sizes.py -o sizes.json T1.nii.gz CT.nii.gz --within CT.nii.gz
     LABELS.nii.gz 5
 """
 

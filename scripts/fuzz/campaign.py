@@ -24,9 +24,9 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numba.np.ufunc.parallel as numba_threads
-from hostile.cases import KINDS, Case, case_of
-from hostile.judge import BAD, GOOD, Ending, Verdict, listing, page_words, verdict
-from hostile.seeds import SPARSE_SIZE, Seeds, load_seeds, special, write_seeds
+from fuzz.cases import KINDS, Case, case_of
+from fuzz.judge import BAD, GOOD, Ending, Verdict, listing, page_words, verdict
+from fuzz.seeds import SPARSE_SIZE, Seeds, load_seeds, special, write_seeds
 
 from tetopt.cli import app
 
@@ -267,7 +267,7 @@ class Campaign:
             f"outcome: {judged.outcome}: {judged.why}",
             f"input:   {one.case.kind}: {one.case.what}",
             f"command: tetopt {' '.join(shlex.quote(word) for word in one.case.words)}"[:3000],
-            f"again:   PYTHONPATH=.:tests python -m hostile --seed {self.seed} --only "
+            f"again:   PYTHONPATH=scripts python -m fuzz --seed {self.seed} --only "
             f"{one.number} --show",
             f"ended:   exit {ending.code} after {ending.seconds:.1f} s, "
             f"{ending.n_bytes / 1e6:.0f} MB more than before",
@@ -303,7 +303,7 @@ class Campaign:
 
 def main() -> int:
     """Run a campaign from the command line; the exit code is 1 if any case ended badly."""
-    parser = argparse.ArgumentParser(prog="python -m hostile", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m fuzz", description=__doc__)
     parser.add_argument("--inputs", type=int, default=200, help="how many")
     parser.add_argument(
         "--seed",

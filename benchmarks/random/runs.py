@@ -1,8 +1,8 @@
 """Random whole runs of `mesh_image`: the requirements are checked on the mesh by other means than
 the engine's own.
 
-    python tests/random/runs.py --seed 1 --runs 500
-    python tests/random/runs.py --seed 1 --runs 500 --labelled
+    python benchmarks/random/runs.py --seed 1 --runs 500
+    python benchmarks/random/runs.py --seed 1 --runs 500 --labelled
 
 A run may refuse its input, and may violate a requirement, if it says so; it may not do so silently.
 Labelled runs are of volumes with labels, about half of them within a mask, by the default options:
