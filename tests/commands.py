@@ -1,17 +1,52 @@
 """The command as its tests call it."""
 
 import json
+import os
 import re
+import shlex
+import shutil
+from contextlib import chdir
+from pathlib import Path
 
+import pytest
 from models import sample_image
 
 import tetopt
 from tetopt.cli import main
 
 
+def separate(words):
+    """The words of a command line: a string holds what a user types, a path is one word."""
+    words = [words] if isinstance(words, str) else words
+    return [
+        part
+        for word in words
+        for part in (shlex.split(word) if isinstance(word, str) else [str(word)])
+    ]
+
+
 def exit_code(*words):
     """What `tetopt` with these words, or paths, returns."""
-    return main([str(word) for word in words])
+    return main(separate(words))
+
+
+def assert_done(*words):
+    assert exit_code(*words) == 0
+
+
+def in_copy_of(name):
+    """A fixture for a module: each test works in a folder of its own, with copies of the files
+    that the fixture `name` has made; it returns names of what the test adds.
+    """
+
+    @pytest.fixture(autouse=True)
+    def here(request, tmp_path):
+        shutil.copytree(request.getfixturevalue(name), tmp_path, dirs_exist_ok=True)
+        with chdir(tmp_path):
+            before = set(os.listdir())
+            yield lambda: sorted(set(os.listdir()) - before)
+
+    return here
 
 
 def mesh_words(image, folder, *options):
@@ -31,22 +66,28 @@ def labelled_lattice_words(folder):
         folder / "a.nii.gz",
         "--labels",
         folder / "l.nii.gz",
-        "--spacing",
-        "8",
-        "--iterations",
-        "0",
+        "--spacing 8 --iterations 0",
     ]
 
 
 def numbers_in(path):
     """What a JSON file holds."""
-    return json.loads(path.read_text())
+    return json.loads(Path(path).read_text())
 
 
-def assert_refused(capfd, arguments, match, code=2):
-    assert exit_code(*arguments) == code
-    captured = capfd.readouterr()
+def assert_refused(capture, words, said, code=2):
+    """A line says so, a part or pattern of which is known, and nothing is written."""
+    capture.readouterr()
+    files = files_here()
+    assert main(separate(words)) == code
+    captured = capture.readouterr()
     assert captured.out == ""
     assert captured.err.count("\n") == 1, captured.err
     assert captured.err.startswith("tetopt: ")
-    assert re.search(match, captured.err), captured.err
+    assert said in captured.err or re.search(said, captured.err), captured.err
+    assert files_here() == files
+
+
+def files_here():
+    """Those in the folder that a test works in; none in the repository, where others write."""
+    return set() if Path("pyproject.toml").exists() else set(Path().rglob("*"))

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 import warnings
+from contextlib import chdir
 from functools import cache, lru_cache
 from io import BytesIO
 from pathlib import Path
@@ -51,6 +52,13 @@ def wide_lines(monkeypatch):
     users see them.
     """
     monkeypatch.setattr("tetopt.cli.console.LINE_WIDTH", 1000)
+
+
+@pytest.fixture
+def here(tmp_path):
+    """The folder that a test works in, so that its files have names as users type them."""
+    with chdir(tmp_path):
+        yield tmp_path
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -9,10 +9,11 @@ import signal
 import subprocess
 import sys
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import exit_code, mesh_words, numbers_in
+from commands import assert_done, exit_code, numbers_in
 from models import sample_image
 
 import tetopt
@@ -30,26 +31,19 @@ NEEDS_FULL = pytest.mark.skipif(
     not os.path.exists("/dev/full"), reason="the system has no device that is always full"
 )
 LATE_SIGNALS = [signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)]
-QUICK = ["--spacing", "8", "--iterations", "2"]
+MESH = "mesh in/a.nii.gz -o out/a.vtu --json out/a.json --spacing 8 --iterations 2"
 
 
-@pytest.fixture
-def image(tmp_path):
-    """The path of a tiny image, in a folder of its own."""
-    (tmp_path / "in").mkdir()
-    tetopt.save_image(tmp_path / "in" / "a.nii.gz", sample_image(3))
-    return tmp_path / "in" / "a.nii.gz"
+@pytest.fixture(autouse=True)
+def folders(here):
+    """A folder with a tiny image, and one where outputs go."""
+    Path("in").mkdir()
+    Path("out").mkdir()
+    tetopt.save_image("in/a.nii.gz", sample_image(3))
 
 
-@pytest.fixture
-def folder(tmp_path):
-    """Where outputs go."""
-    (tmp_path / "out").mkdir()
-    return tmp_path / "out"
-
-
-def names_in(folder):
-    return sorted(path.name for path in folder.iterdir())
+def written():
+    return sorted(os.listdir("out"))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -68,27 +62,25 @@ def signals_not_ignored():
 
 @NEEDS_SIGNALS
 @pytest.mark.parametrize("number", LATE_SIGNALS)
-def test_a_signal_leaves_the_mesh_reached(
-    image, folder, monkeypatch, capsys, signals_not_ignored, number
-):
+def test_a_signal_leaves_the_mesh_reached(monkeypatch, capsys, signals_not_ignored, number):
     @contextmanager
     def told(*_):
         yield lambda row: signal.raise_signal(number) if row.iteration == 1 else None
 
     monkeypatch.setattr(tetopt.cli.run, "_bar", told)
     before = signal.getsignal(number)
-    assert exit_code(*mesh_words(image, folder, *QUICK, "--iterations", "200")) == 128 + number
+    assert exit_code(f"{MESH} --iterations 200") == 128 + number
     assert signal.getsignal(number) is before
-    assert numbers_in(folder / "a.json")["iterations_done"] < 5
-    assert len(tetopt.load_mesh(folder / "a.vtu").mesh.cells) > 100
+    assert numbers_in("out/a.json")["iterations_done"] < 5
+    assert len(tetopt.load_mesh("out/a.vtu").mesh.cells) > 100
     lines = capsys.readouterr().err.splitlines()
     assert any(line.startswith("interrupted: the current mesh is kept") for line in lines)
     name = "Ctrl-C" if number == signal.SIGINT else number.name
-    assert lines[-1] == f"ended by {name}; written: {folder / 'a.vtu'}, {folder / 'a.json'}"
+    assert lines[-1] == f"ended by {name}; written: out/a.vtu, out/a.json"
 
 
 @NEEDS_SIGNALS
-def test_a_signal_while_the_mesh_is_written_waits_for_it(image, folder, monkeypatch):
+def test_a_signal_while_the_mesh_is_written_waits_for_it(monkeypatch):
     save = tetopt.job.write.save_for_solver
 
     def interrupted(*arguments):
@@ -96,21 +88,19 @@ def test_a_signal_while_the_mesh_is_written_waits_for_it(image, folder, monkeypa
         save(*arguments)
 
     monkeypatch.setattr(tetopt.job.write, "save_for_solver", interrupted)
-    assert exit_code(*mesh_words(image, folder, *QUICK)) == 143
-    assert names_in(folder) == ["a.json", "a.vtu"]
+    assert exit_code(MESH) == 143
+    assert written() == ["a.json", "a.vtu"]
 
 
 @NEEDS_SIGNALS
 @pytest.mark.parametrize("number", LATE_SIGNALS)
-def test_other_commands_end_at_once(folder, monkeypatch, capsys, signals_not_ignored, number):
+def test_other_commands_end_at_once(monkeypatch, capsys, signals_not_ignored, number):
     def interrupted(*_):
         signal.raise_signal(number)
 
     monkeypatch.setattr(tetopt.cli.phantom, "save_image", interrupted)
-    assert (
-        exit_code("phantom", "disc_2d", "-o", folder / "a.nii", "--voxel-mm", "8") == 128 + number
-    )
-    assert names_in(folder) == []
+    assert exit_code("phantom disc_2d -o out/a.nii --voxel-mm 8") == 128 + number
+    assert written() == []
     name = "Ctrl-C" if number == signal.SIGINT else number.name
     assert capsys.readouterr().err == f"ended by {name}; written: nothing\n"
 
@@ -143,13 +133,13 @@ def full_device():
 
 @NEEDS_FULL
 @pytest.mark.parametrize(("names", "code"), [(["stderr"], 0), (["stdout"], 2)])
-def test_full_streams_lose_no_file(image, folder, monkeypatch, capsys, names, code):
+def test_full_streams_lose_no_file(monkeypatch, capsys, names, code):
     with full_device() as stream:
         for name in names:
             monkeypatch.setattr(sys, name, stream)
-        assert exit_code(*mesh_words(image, folder, *QUICK)) == code
+        assert exit_code(MESH) == code
     monkeypatch.undo()
-    assert names_in(folder) == ["a.json", "a.vtu"]
+    assert written() == ["a.json", "a.vtu"]
     if names == ["stdout"]:
         said = capsys.readouterr().err
         assert said.endswith(
@@ -158,15 +148,15 @@ def test_full_streams_lose_no_file(image, folder, monkeypatch, capsys, names, co
         )
 
 
-def test_closed_streams_lose_no_file(image, folder, monkeypatch):
+def test_closed_streams_lose_no_file(monkeypatch):
     """Python has None for a stream that was closed before it began, and a closed one after."""
     closed = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115, closed in the next line
     closed.close()
     for stream in (None, closed):
         monkeypatch.setattr(sys, "stdout", stream)
         monkeypatch.setattr(sys, "stderr", stream)
-        assert exit_code(*mesh_words(image, folder, *QUICK), "--force") == 0
-        assert names_in(folder) == ["a.json", "a.vtu"]
+        assert_done(f"{MESH} --force")
+        assert written() == ["a.json", "a.vtu"]
 
 
 @NEEDS_SIGNALS
@@ -191,21 +181,19 @@ def test_closed_descriptors_are_not_taken_by_files(tmp_path):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="names are of bytes on Linux alone")
 @pytest.mark.parametrize("suffix", ["vtu", "xdmf", "msh", "inp"])
-def test_names_that_are_not_utf_8(image, folder, suffix, capsys):
+def test_names_that_are_not_utf_8(suffix, capsys):
     name = os.fsdecode(b"caf\xe9\x1b[31m\n")
-    os.rename(image, image.with_name(f"{name}.nii.gz"))
-    command = mesh_words(
-        image.with_name(f"{name}.nii.gz"), folder, *QUICK, "--iterations", "0", "--force"
-    )
-    command[command.index("-o") + 1] = folder / f"{name}.{suffix}"
-    assert exit_code(*command, "--young", "3") == 0
-    assert numbers_in(folder / "a.json")["image"] == "caf\\udce9\x1b[31m\n.nii.gz"
+    os.rename("in/a.nii.gz", f"in/{name}.nii.gz")
+    words = "--spacing 8 --iterations 0 --young 3 --json out/a.json -o"
+    out = Path(f"out/{name}.{suffix}")
+    assert_done("mesh", Path(f"in/{name}.nii.gz"), words, out)
+    assert numbers_in("out/a.json")["image"] == "caf\\udce9\x1b[31m\n.nii.gz"
     said = "".join(capsys.readouterr())
     assert "\x1b" not in said
     assert r"caf\udce9\x1b[31m\n" in said
-    assert b"caf\xe9" not in (folder / f"{name}.{suffix}").read_bytes()
+    assert b"caf\xe9" not in out.read_bytes()
     if suffix in ("vtu", "msh"):
-        assert len(tetopt.load_mesh(folder / f"{name}.{suffix}").mesh.cells) > 100
+        assert len(tetopt.load_mesh(out).mesh.cells) > 100
 
 
 # --------------------------------------------------------------------------------------------------
@@ -226,12 +214,12 @@ ARRAY_MEMORY_ERROR = (
         (ARRAY_MEMORY_ERROR((10**6, 10**6), np.dtype(float)), "not enough memory: .*7.28 TiB"),
     ],
 )
-def test_short_memory_is_a_line(folder, monkeypatch, capsys, error, words):
+def test_short_memory_is_a_line(monkeypatch, capsys, error, words):
     def short(*_):
         raise error
 
     monkeypatch.setattr(tetopt.cli.phantom, "save_image", short)
-    assert exit_code("phantom", "disc_2d", "-o", folder / "a.nii", "--voxel-mm", "8") == 2
+    assert exit_code("phantom disc_2d -o out/a.nii --voxel-mm 8") == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert re.search(words, said)
@@ -241,77 +229,68 @@ def test_short_memory_is_a_line(folder, monkeypatch, capsys, error, words):
     "error",
     [OSError(28, "No space left on device", "a.inp"), MemoryError("to lay out"), KeyError(7)],
 )
-def test_a_mesh_whose_file_fails_is_kept(image, folder, monkeypatch, capsys, error):
+def test_a_mesh_whose_file_fails_is_kept(monkeypatch, capsys, error):
     def failing(*_):
         raise error
 
     monkeypatch.setattr(tetopt.job.write, "save_for_solver", failing)
-    command = ["mesh", image, "-o", folder / "a.inp", *QUICK]
+    command = "mesh in/a.nii.gz -o out/a.inp --spacing 8 --iterations 2"
     if isinstance(error, KeyError):  # a fault of ours, which is not hidden
         with pytest.raises(KeyError):
-            exit_code(*command)
+            exit_code(command)
     else:
-        assert exit_code(*command) == 2
-    assert (
-        f"the optimised mesh is in {folder / 'a.vtu'}: continue from there"
-        in capsys.readouterr().err
-    )
-    assert tetopt.load_mesh(folder / "a.vtu").cell_data["mean"].max() > 0.0
+        assert exit_code(command) == 2
+    assert "the optimised mesh is in out/a.vtu: continue from there" in capsys.readouterr().err
+    assert tetopt.load_mesh("out/a.vtu").cell_data["mean"].max() > 0.0
 
 
-def test_a_mesh_whose_folder_has_gone_is_kept_elsewhere(
-    image, folder, tmp_path, monkeypatch, capsys
-):
+def test_a_mesh_whose_folder_has_gone_is_kept_elsewhere(tmp_path, monkeypatch, capsys):
     """Whatever else fails: the model of the mesh, then the mesh beside its name."""
     save = tetopt.job.write.save_for_solver
 
     def gone(*arguments):
-        shutil.rmtree(folder)
+        shutil.rmtree("out")
         save(*arguments)
 
     (tmp_path / "tmp").mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "tmp"))
     monkeypatch.setattr(tetopt.job.write, "save_for_solver", gone)
-    assert exit_code("mesh", image, "-o", folder / "a.vtu", *QUICK) == 2
+    assert exit_code(MESH) == 2
     (kept,) = (tmp_path / "tmp").rglob("*.vtu")
     said = capsys.readouterr().err.splitlines()
     assert (
-        f"{folder / 'a.vtu'}: cannot be written: No such file or directory; the optimised mesh "
+        f"out/a.vtu: cannot be written: No such file or directory; the optimised mesh "
         f"is in {kept}" in said[-1]
     )
     assert kept.parent.stat().st_mode & 0o077 == 0
     assert tetopt.load_mesh(kept).cell_data["mean"].max() > 0.0
 
 
-def test_what_was_written_before_an_error_is_said(image, folder, monkeypatch, capsys):
+def test_what_was_written_before_an_error_is_said(monkeypatch, capsys):
     def full(*_):
-        raise OSError(28, "No space left on device", str(folder / "a.json"))
+        raise OSError(28, "No space left on device", "out/a.json")
 
     monkeypatch.setattr(tetopt.job.run, "save_json", full)
-    assert exit_code(*mesh_words(image, folder, *QUICK)) == 2
+    assert exit_code(MESH) == 2
     said = capsys.readouterr().err.splitlines()
     assert said[-2:] == [
-        f"tetopt: {folder / 'a.json'}: No space left on device",
-        f"written before the error: {folder / 'a.vtu'}",
+        "tetopt: out/a.json: No space left on device",
+        "written before the error: out/a.vtu",
     ]
 
 
-def test_a_mesh_that_the_disk_cannot_take_is_refused_before_the_run(
-    image, folder, monkeypatch, capsys
-):
+def test_a_mesh_that_the_disk_cannot_take_is_refused_before_the_run(monkeypatch, capsys):
     monkeypatch.setattr("shutil.disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9, 5000))
     monkeypatch.setattr(tetopt.job.meshing, "watched", None)
-    assert exit_code("mesh", image, "-o", folder / "a.vtu", *QUICK) == 2
-    assert (
-        "a.vtu: needs at least 8640 bytes, but only 5000 are free; free some space first"
-        in capsys.readouterr().err
-    )
+    assert exit_code(MESH) == 2
+    words = "a.vtu: needs at least 8640 bytes, but only 5000 are free; free some space first"
+    assert words in capsys.readouterr().err
 
 
-def test_numbers_that_fail_lose_no_mesh(image, folder, monkeypatch):
+def test_numbers_that_fail_lose_no_mesh(monkeypatch):
     monkeypatch.setattr(tetopt.job.write, "run_summary", failing(MemoryError()))
-    assert exit_code(*mesh_words(image, folder, *QUICK)) == 2
-    assert names_in(folder) == ["a.vtu"]
+    assert exit_code(MESH) == 2
+    assert written() == ["a.vtu"]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -363,10 +342,8 @@ def measured_run(tmp_path_factory):
         folder / "l.nii",
         "--mask",
         folder / "m.nii",
-        "--edge-size",
-        "9",
+        "--edge-size 9 --nodes 60 --iterations 3",
     ]
-    words += ["--nodes", "60", "--iterations", "3"]
     once = []
 
     class Remembered(MeshSearch):
@@ -389,14 +366,14 @@ def measured_run(tmp_path_factory):
 @pytest.mark.parametrize(
     ("name", "error"), list(zip(MEASURES, 4 * ERRORS, strict=False)), ids=MEASURES
 )
-def test_a_measure_that_fails_is_a_line(measured_run, folder, monkeypatch, capsys, name, error):
+def test_a_measure_that_fails_is_a_line(measured_run, monkeypatch, capsys, name, error):
     """All other numbers are written, and the mesh as it is without the failure."""
     words, whole = measured_run
     where, keys = MEASURES[name]
     monkeypatch.setattr(where, name, failing(error))
-    assert exit_code(*words, "-o", folder / "a.vtu", "--json", folder / "a.json") == 1
-    assert names_in(folder) == ["a.json", "a.vtu"]
-    numbers, said = numbers_in(folder / "a.json"), capsys.readouterr().err
+    assert exit_code(*words, "-o out/a.vtu --json out/a.json") == 1
+    assert written() == ["a.json", "a.vtu"]
+    numbers, said = numbers_in("out/a.json"), capsys.readouterr().err
     assert keys <= {key for key, value in numbers.items() if value is None}
     more = {"fields": {"contrasts"}, "label_contacts": {"contact_totals"}}.get(name, set())
     assert (set(numbers) | more) - {"thickness"} == set(whole)
@@ -417,7 +394,7 @@ def test_a_measure_that_fails_is_a_line(measured_run, folder, monkeypatch, capsy
         ]
         assert len(lines) == 1
         assert reason in lines[0]
-    loaded = tetopt.load_mesh(folder / "a.vtu")
+    loaded = tetopt.load_mesh("out/a.vtu")
     assert len(loaded.mesh.cells) == whole["size"]["n_cells"]
     assert ("mean" in loaded.cell_data) == (name != "fields")
     assert "label" in loaded.cell_data
@@ -433,15 +410,13 @@ main(sys.argv[1:])
 
 
 @NEEDS_SIGNALS
-def test_a_process_that_is_killed_while_it_measures_leaves_the_mesh(image, folder):
+def test_a_process_that_is_killed_while_it_measures_leaves_the_mesh():
     """As the system does where memory is short, or a fault of compiled code."""
-    words = ["mesh", image, "-o", folder / "a.vtu", *QUICK]
-    done = subprocess.run(
-        [sys.executable, "-c", KILLED, *map(str, words)], capture_output=True, check=False
-    )
+    command = [sys.executable, "-c", KILLED, *MESH.split()]
+    done = subprocess.run(command, capture_output=True, check=False)
     assert done.returncode == -signal.SIGKILL
-    assert names_in(folder) == ["a_optimised_1.vtu"]
-    assert len(tetopt.load_mesh(folder / "a_optimised_1.vtu").mesh.cells) > 100
+    assert written() == ["a_optimised_1.vtu"]
+    assert len(tetopt.load_mesh("out/a_optimised_1.vtu").mesh.cells) > 100
 
 
 def test_a_second_signal_gives_up():

@@ -2,64 +2,63 @@
 types them.
 """
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import pyvista
 import trimesh
-from commands import exit_code, numbers_in
+from commands import assert_done, assert_refused, exit_code, numbers_in
+from numpy.testing import assert_allclose
 
 import tetopt
+from tetopt import Image, lattice_mesh, save_mesh
 from tetopt.measure.fidelity import cell_labels
 
-pytestmark = pytest.mark.full
+pytestmark = [pytest.mark.full, pytest.mark.usefixtures("here")]
 
 
 def block_mesh(labels):
     """An image of labels, a mesh with a block of cells in each voxel, and the label of each
     cell.
     """
-    image = tetopt.Image(labels)
-    mesh = tetopt.lattice_mesh(image, "five-tet", blocks=image.shape)
+    image = Image(labels)
+    mesh = lattice_mesh(image, "five-tet", blocks=image.shape)
     return image, mesh, cell_labels(image, mesh)
 
 
-@pytest.fixture
-def touching(tmp_path):
+@pytest.fixture(autouse=True)
+def touching(here):
     """Two voxels of label 1 that share an edge, among 0: labels, their mesh, and the mesh of
     label 1 alone.
     """
     labels = np.zeros((4, 4, 4))
     labels[1, 1, 1] = labels[2, 2, 1] = 1
     image, mesh, of_cell = block_mesh(labels)
-    tetopt.save_image(tmp_path / "labels.nii.gz", image)
-    tetopt.save_mesh(tmp_path / "all.vtu", mesh, {"label": of_cell})
+    tetopt.save_image("labels.nii.gz", image)
+    save_mesh("all.vtu", mesh, {"label": of_cell})
     used, cells = np.unique(mesh.cells[of_cell == 1], return_inverse=True)
-    tetopt.save_mesh(tmp_path / "ones.vtu", tetopt.Mesh(mesh.points[used], cells.reshape(-1, 4)))
-    return tmp_path
+    save_mesh("ones.vtu", tetopt.Mesh(mesh.points[used], cells.reshape(-1, 4)))
 
 
-def test_a_boundary_that_is_no_manifold(touching, capsys):
+def test_a_boundary_that_is_no_manifold(capsys):
     """It is a fault, also where the mask's voxels touch like that; of an interface that no run
     smoothed it is said.
     """
-    check = ["--check", "--json", touching / "q.json", "--force"]
-    assert exit_code("quality", touching / "ones.vtu", *check) == 1
-    problems = numbers_in(touching / "q.json")["problems"]
+    check = "--check --json q.json --force"
+    assert exit_code(f"quality ones.vtu {check}") == 1
+    problems = numbers_in("q.json")["problems"]
     assert problems[-1].startswith(
         "edges where the boundary has more than two facets; nodes: 1, the first"
     )
     assert problems[-1] in capsys.readouterr().err
 
-    beside = ["--image", touching / "labels.nii.gz", "--mask", touching / "labels.nii.gz"]
-    assert exit_code("quality", touching / "ones.vtu", *check, *beside) == 1
-    assert numbers_in(touching / "q.json")["problems"] == problems[-1:]
+    assert exit_code(f"quality ones.vtu {check} --image labels.nii.gz --mask labels.nii.gz") == 1
+    assert numbers_in("q.json")["problems"] == problems[-1:]
     assert capsys.readouterr().err.count("more than two facets") == 1
 
-    assert (
-        exit_code("quality", touching / "all.vtu", *check, "--image", touching / "labels.nii.gz")
-        == 0
-    )
-    numbers = numbers_in(touching / "q.json")
+    assert_done(f"quality all.vtu {check} --image labels.nii.gz")
+    numbers = numbers_in("q.json")
     assert numbers["problems"] == []
     (remark,) = numbers["remarks"]
     assert remark.startswith(
@@ -73,20 +72,17 @@ def test_a_boundary_that_is_no_manifold(touching, capsys):
 # Surfaces
 
 
-@pytest.fixture
-def slabs(tmp_path):
+@pytest.fixture(autouse=True)
+def slabs(here):
     """Slabs of labels 1, 2, 4 and 1 again, each 4 x 3 voxels wide and one or two thick, 2 mm a
     voxel.
     """
     labels = np.zeros((4, 3, 6))
     labels[:] = [1, 1, 2, 4, 4, 1]
-    mesh = tetopt.lattice_mesh(
-        tetopt.Image(labels, np.diag([2.0, 2.0, 2.0, 1.0])), "five-tet", blocks=(4, 3, 6)
-    )
-    of_cell = cell_labels(tetopt.Image(labels, np.diag([2.0, 2.0, 2.0, 1.0])), mesh)
-    tetopt.save_mesh(tmp_path / "slabs.vtu", mesh, {"label": of_cell})
-    (tmp_path / "names.csv").write_text("label,name\n2,bone\n4,left lung\n")
-    return tmp_path
+    mesh = lattice_mesh(Image(labels, np.diag([2.0, 2.0, 2.0, 1.0])), "five-tet", blocks=(4, 3, 6))
+    of_cell = cell_labels(Image(labels, np.diag([2.0, 2.0, 2.0, 1.0])), mesh)
+    save_mesh("slabs.vtu", mesh, {"label": of_cell})
+    Path("names.csv").write_text("label,name\n2,bone\n4,left lung\n")
 
 
 SLAB = 4 * 3 * 4.0  # mm2
@@ -96,7 +92,7 @@ def labels_in(path):
     """Places of the corners, labels inside and outside of each triangle, by readers that share
     no code with ours.
     """
-    if path.suffix == ".ply":
+    if path.endswith(".ply"):
         read = trimesh.load_mesh(path, process=False)
         corners = read.vertices[read.faces]
         sides = [
@@ -114,28 +110,20 @@ def labels_in(path):
 
 @pytest.mark.parametrize("suffix", [".ply", ".vtp", ".vtk"])
 @pytest.mark.parametrize("has_boundary", [False, True])
-def test_all_interfaces_with_the_labels_of_both_sides(slabs, suffix, has_boundary, capsys):
+def test_all_interfaces_with_the_labels_of_both_sides(suffix, has_boundary, capsys):
     """Each lies in its plane, in its area, and faces out of its smaller label; so does the
     boundary.
     """
-    out, more = slabs / f"all{suffix}", ["--boundary"] * has_boundary
-    command = [
-        "surface",
-        slabs / "slabs.vtu",
-        "--interfaces",
-        *more,
-        "-o",
-        out,
-        "--json",
-        slabs / "a.json",
-    ]
-    assert exit_code(*command, "--label-names", slabs / "names.csv") == 0
+    out, more = f"all{suffix}", "--boundary" * has_boundary
+    assert_done(
+        f"surface slabs.vtu --interfaces {more} -o {out} --json a.json --label-names names.csv"
+    )
     corners, sides = labels_in(out)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2.0
     for (inside, outside), z, up in (((1, 2), 3.0, 1), ((2, 4), 5.0, 1), ((1, 4), 9.0, -1)):
         mine = (sides == (inside, outside)).all(axis=1)
-        np.testing.assert_allclose(corners[mine][..., 2], z)
-        np.testing.assert_allclose(normals[mine].sum(axis=0), [0.0, 0.0, up * SLAB])
+        assert_allclose(corners[mine][..., 2], z)
+        assert_allclose(normals[mine].sum(axis=0), [0.0, 0.0, up * SLAB])
     outer = sides[:, 1] == -1
     assert set(sides[outer, 0]) == ({1, 2, 4} if has_boundary else set())
     centre = np.array([3.0, 2.0, 5.0])
@@ -145,7 +133,7 @@ def test_all_interfaces_with_the_labels_of_both_sides(slabs, suffix, has_boundar
     )
     assert (sides[:, 0] != sides[:, 1]).all()
 
-    numbers = numbers_in(slabs / "a.json")
+    numbers = numbers_in("a.json")
     rows = {
         (row["label_inside"], row["label_outside"]): row["area_mm2"]
         for row in numbers["interfaces"]
@@ -164,23 +152,23 @@ def test_all_interfaces_with_the_labels_of_both_sides(slabs, suffix, has_boundar
 
 
 @pytest.mark.parametrize("suffix", [".stl", ".ply", ".vtp", ".vtk"])
-def test_one_interface(slabs, suffix):
+def test_one_interface(suffix):
     """Out of the label that is named first, by number or name."""
     for sides, up in (("2,4", 1.0), ("left lung,bone", -1.0)):
-        out = slabs / f"one{suffix}"
-        command = ["surface", slabs / "slabs.vtu", "--interface", sides, "-o", out, "--force"]
-        assert exit_code(*command, "--label-names", slabs / "names.csv") == 0
+        out = f"one{suffix}"
+        words = f"surface slabs.vtu --interface '{sides}' -o {out} --force"
+        assert_done(f"{words} --label-names names.csv")
         surface = pyvista.read(out)
         corners = np.asarray(surface.points, dtype=np.float64)[surface.regular_faces]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2.0
-        np.testing.assert_allclose(normals.sum(axis=0), [0.0, 0.0, up * SLAB], atol=1e-5)
-        np.testing.assert_allclose(corners[..., 2], 5.0)
+        assert_allclose(normals.sum(axis=0), [0.0, 0.0, up * SLAB], atol=1e-5)
+        assert_allclose(corners[..., 2], 5.0)
 
 
 @pytest.mark.parametrize("suffix", [".stl", ".ply", ".vtp", ".vtk"])
-def test_the_whole_boundary(slabs, suffix, capsys):
-    out = slabs / f"b{suffix}"
-    assert exit_code("surface", slabs / "slabs.vtu", "--boundary", "-o", out) == 0
+def test_the_whole_boundary(suffix, capsys):
+    out = f"b{suffix}"
+    assert_done(f"surface slabs.vtu --boundary -o {out}")
     assert "watertight, normals out" in capsys.readouterr().out
     surface = pyvista.read(out)
     assert surface.volume == pytest.approx(4 * 3 * 6 * 8.0)
@@ -189,9 +177,11 @@ def test_the_whole_boundary(slabs, suffix, capsys):
     assert closed.area == pytest.approx(108 * 4.0)
 
 
-def test_one_label_has_no_interfaces(slabs, capsys):
-    mesh = tetopt.load_mesh(slabs / "slabs.vtu").mesh
-    tetopt.save_mesh(slabs / "one.vtu", mesh, {"label": np.ones(len(mesh.cells), dtype=int)})
-    assert exit_code("surface", slabs / "one.vtu", "--interfaces", "-o", slabs / "x.ply") == 2
-    assert "all cells have one label, so there are no interfaces" in capsys.readouterr().err
-    assert not (slabs / "x.ply").exists()
+def test_one_label_has_no_interfaces(capsys):
+    mesh = tetopt.load_mesh("slabs.vtu").mesh
+    save_mesh("one.vtu", mesh, {"label": np.ones(len(mesh.cells), dtype=int)})
+    assert_refused(
+        capsys,
+        "surface one.vtu --interfaces -o x.ply",
+        "all cells have one label, so there are no interfaces",
+    )

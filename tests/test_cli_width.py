@@ -97,12 +97,7 @@ def mesh(tmp_path_factory):
 
 def test_a_run_prints_ten_rows_and_quality_all_of_them(mesh, monkeypatch, capsys):
     monkeypatch.chdir(mesh)
-    assert (
-        exit_code(
-            "mesh", "a.nii.gz", "-o", "a.vtu", "--spacing", "6", "--iterations", "0", "--force"
-        )
-        == 0
-    )
+    assert exit_code("mesh a.nii.gz -o a.vtu --spacing 6 --iterations 0 --force") == 0
     said = capsys.readouterr()
     lines = said.out.splitlines()
     table = lines[
@@ -111,9 +106,9 @@ def test_a_run_prints_ten_rows_and_quality_all_of_them(mesh, monkeypatch, capsys
     assert 8 <= len(table) <= 10
     assert not [line for line in table if "error (" in line or "bad cells" in line]
     assert max(map(len, [*lines, *said.err.splitlines()])) <= 100
-    assert exit_code("quality", "a.vtu", "--image", "a.nii.gz") == 0
+    assert exit_code("quality a.vtu --image a.nii.gz") == 0
     assert "rho error (iv), worst" not in capsys.readouterr().out
-    assert exit_code("quality", "a.vtu", "--image", "a.nii.gz", "--all") == 0
+    assert exit_code("quality a.vtu --image a.nii.gz --all") == 0
     out = capsys.readouterr().out
     assert "rho error (iv), worst" in out
     assert "bad cells: slivers" in out

@@ -61,7 +61,7 @@ FILES = {"mask", "labels", "start"}  # options that are files
 DRAWN = ("image", "labels")  # of the kinds; pictures take longer than all else
 LONG = ("order 2", "target error")  # several runs each
 OF_FORMAT = {
-    ".inp": {"young": "1 + 0.01*h", "loads": "compress:5%"},
+    ".inp": {"young": "1+0.01*h", "loads": "compress:5%"},
     ".feb": {"young": "2", "loads": ["hold:superior"]},
 }
 

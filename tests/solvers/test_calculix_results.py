@@ -47,7 +47,7 @@ def test_from_image_to_solver_and_back(tmp_path, units):
     """
     image = tetopt.load_phantom("two_spheres").image(voxel_mm=4.0)
     tetopt.save_image(tmp_path / "a.nii.gz", image)
-    mapping = ["--young", "0.5 + h/7", "--nu", "0.3"]
+    mapping = ["--young", "0.5+h/7", "--nu", "0.3"]
     mesh = [
         "mesh",
         tmp_path / "a.nii.gz",
