@@ -27,6 +27,10 @@ class Remark(UserWarning):
     """A warning of what may be as intended: callers that know that it is ignore this category."""
 
 
+class Note(UserWarning):
+    """A warning that runs report as a note: what was left out or renamed, and why."""
+
+
 def warn(message: str, category: type[UserWarning] = UserWarning) -> None:
     """Issue a warning that names the first line outside tetopt, at whatever call depth."""
     n_inside, frame = 0, inspect.currentframe()

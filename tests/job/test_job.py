@@ -9,6 +9,7 @@ import pytest
 
 import tetopt
 from tetopt import InputError, Job
+from tetopt.cli.app import main
 from tetopt.job.options import JobOptions, RunOptions, given_options, kinds_of, option_of
 
 FILES = {"images": "a.nii", "output": "a.vtu"}
@@ -77,6 +78,24 @@ def test_numbers_of_numpy_are_texts_that_are_read_back_to_the_last_bit():
     )
     assert (job.young, job.bins, float(job.background)) == ("3.5", "4", float(np.float32(0.1)))
     assert [float(each) for each in job.weights.split(",")] == [2.0, 2 / 3]
+
+
+def test_a_job_opens_no_file_and_its_plan_refuses_missing_ones(tmp_path, capsys):
+    files = {"images": "a.nii.gz", "labels": "l.nii.gz", "output": tmp_path / "a.vtu"}
+    missing = {"young": tmp_path / "missing.csv", "label_size": tmp_path / "missing.toml"}
+    for name, path in missing.items():
+        job = Job(**files, **{name: str(path)})  # though there is no such file
+        for read in (tetopt.plan, tetopt.run):
+            with pytest.raises(InputError, match=f"{path.name}: no such file"):
+                read(job)
+    words = ["a.nii.gz", "--labels", "l.nii.gz", "-o", str(tmp_path / "a.vtu")]
+    for name, path in missing.items():
+        assert main(["mesh", *words, f"--{name.replace('_', '-')}", str(path)]) == 2
+        said = capsys.readouterr().err
+        assert said.startswith("tetopt: ")
+        assert f"{path.name}: no such file" in said
+        assert said.count("tetopt:") == 1
+    assert Job(**files, **{name: str(path) for name, path in missing.items()}).young is not None
 
 
 def test_json_gives_the_job_back():

@@ -21,22 +21,30 @@ from tetopt.io.frd import read_frd
 from tetopt.io.images import sha256
 from tetopt.io.text import counted
 from tetopt.io.vtk import VTK_SUFFIXES
-from tetopt.job.events import note, progress, warning
-from tetopt.job.inputs import check_part, listed, read_mesh, texts_of, voxels_of
+from tetopt.job.events import note, progress, warning, warnings_heard
+from tetopt.job.inputs import check_part, listed, read_mesh, voxels_of
 from tetopt.job.model import (
-    REACTIONS_TEXT,
+    check_mapping_files,
     check_solver_options,
+    choices_of,
+    converted_model,
     large_words,
-    loads_of,
-    model_of_file,
     save_for_solver,
     with_chosen_sets,
-    without_stale_results,
 )
 from tetopt.job.options import ALL_LABELS, LabelChoice, LabelledPart, SolverOptions
 from tetopt.mesh import Mesh
 from tetopt.model.fields import is_stress
-from tetopt.model.file import MATERIAL_FIELDS, MeshFile, with_cells, without_results
+from tetopt.model.file import (
+    MATERIAL_FIELDS,
+    REACTIONS_TEXT,
+    MeshFile,
+    loads_in,
+    texts_of,
+    with_cells,
+    without_results,
+    without_stale_results,
+)
 from tetopt.model.labels import kept_labels, labels_of
 from tetopt.model.model import Model
 from tetopt.model.sets import (
@@ -97,15 +105,19 @@ def convert_file(
     check_part(image, part, part.labels)
     loaded = read_mesh(mesh)
     check_unfolded(loaded.mesh, source=str(mesh))
-    loaded = (
-        without_stale_results(loaded, solver) if results is None else with_results(loaded, results)
-    )
+    if results is None:
+        with warnings_heard():
+            is_stale = choices_of(solver).is_new
+            loaded = without_stale_results(loaded, is_stale=is_stale)
+    else:
+        loaded = with_results(loaded, results)
     solver, is_surface = (
         replace(solver, order=_order_of(loaded, solver, output)),
         format_of(output).is_surface,
     )
     loaded = _with_straight_edges(loaded) if solver.order == 1 else loaded
     check_solver_options(output, solver, has_materials="young" in loaded.cell_data)
+    check_mapping_files(solver)
     if image is None and solver.average is not None:
         raise InputError(
             f"`average`: {solver.average} averages over voxels and needs an image; pass `image`"
@@ -130,7 +142,7 @@ def convert_file(
             name: rows for name, rows in loaded.cell_data.items() if name not in MATERIAL_FIELDS
         }
         loaded = loaded._replace(cell_data=kept)
-    model = with_chosen_sets(model_of_file(loaded, voxels, solver, about, box), output, solver)
+    model = with_chosen_sets(converted_model(loaded, voxels, solver, about, box), output, solver)
     save_for_solver(output, model, solver)
     files = {"mesh": mesh.name, "output": output.name, "units": solver.units, "space": solver.space}
     files |= {} if results is None else {"results": results.name}
@@ -144,7 +156,8 @@ def _loads_of_file(loaded: MeshFile, choice: LabelChoice) -> list[str] | None:
     """Return the loads of a mesh's file; without some of its labels, their sets would be others:
     warn instead.
     """
-    loads = loads_of(loaded)
+    with warnings_heard():
+        loads = loads_in(loaded)
     if choice == ALL_LABELS or not loads:
         return loads
     warning(

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any, Literal, NamedTuple
 
-from tetopt.errors import warn
+from tetopt.errors import Note, warn
 
 # a stage of every run
 KERNEL_WORDS = "preparing the kernels (the first run compiles them, half a minute)"
@@ -74,6 +75,19 @@ def listened(listener: Listener | None) -> Iterator[None]:
         yield
     finally:
         _LISTENER.reset(token)
+
+
+@contextmanager
+def warnings_heard() -> Iterator[None]:
+    """Report Python's warnings within this context as events."""
+    caught: list[warnings.WarningMessage] = []
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            yield
+    finally:
+        for each in caught:
+            (note if issubclass(each.category, Note) else warning)(str(each.message))
 
 
 def ended_words(ended: str, kept: str, followed: str = "") -> str:

@@ -52,7 +52,6 @@ from tetopt.measure.fidelity import cell_labels
 from tetopt.measure.requirements import warn_of_other_mask
 from tetopt.model.file import (
     MASK_TEXT,
-    TEXTS_KEPT,
     MeshFile,
     count_of_other_voxels,
     own_mask,
@@ -638,14 +637,6 @@ def warn_of_other_image(
         of_box = f": its box was {words}" if words else ""
         warning(f"{mesh_path} was built from a different image, not {image_path}{of_box}")
     return is_other
-
-
-def texts_of(loaded: MeshFile, *, is_other: bool = False) -> dict[str, Any]:
-    """Return the texts of a mesh's file to keep in another file; with another image, only that
-    on the mesh's mask.
-    """
-    kept = (MASK_TEXT,) if is_other else TEXTS_KEPT
-    return {name: text for name in kept if (text := loaded.text(name)) is not None}
 
 
 def checked_outputs(folder: Path, names: Iterable[str], force: bool) -> dict[str, Path]:

@@ -139,7 +139,7 @@ def _check_initial(task: Task, initial: Mesh) -> None:
         return
 
     def build(early: SolverOptions) -> Model:
-        return model_with(task, initial, early, task.source.about, is_told=False)
+        return model_with(task, initial, early, task.source.about)
 
     check_early(job.output, job, initial.ndim, task.source.low, build)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -14,31 +14,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 import tetopt
-from tetopt.errors import InputError, Remark, error_words
+from tetopt.errors import InputError, error_words
 from tetopt.geometry.check import beyond_box
 from tetopt.image import Image
 from tetopt.io.formats import FIELDS, FORMATS, file_bytes, format_of, save_mesh, save_model
 from tetopt.io.vtk import VTK_SUFFIXES
-from tetopt.job.events import note, warning
+from tetopt.job.events import note, warning, warnings_heard
 from tetopt.job.inputs import label_table
 from tetopt.job.options import ModelOptions, SolverOptions
 from tetopt.mesh import Mesh
 from tetopt.model.averages import DEFAULT_AVERAGE, parse_average
-from tetopt.model.build import build_model
+from tetopt.model.build import Choices, model_of_file
 from tetopt.model.fields import cell_fields, is_result
-from tetopt.model.file import (
-    MATERIAL_FIELDS,
-    MeshFile,
-    completed,
-    loads_in,
-    moduli_in,
-    sets_beside,
-    without_results,
-)
-from tetopt.model.labels import TABLE_TEXT, labels_of, table_of_words, table_words
+from tetopt.model.file import MeshFile
+from tetopt.model.labels import TABLE_TEXT, labels_of, table_of_words
 from tetopt.model.loads import FACET_FORCES, check_steps, known_set, parse_load
-from tetopt.model.mappings import parse_any_mapping
-from tetopt.model.materials import DEFAULT_NU, Spacing
+from tetopt.model.mappings import MAPPED_OPTIONS, named_file, parse_any_mapping
+from tetopt.model.materials import Spacing
 from tetopt.model.model import SPACES, STRESS_UNITS, Model, odd_units
 from tetopt.model.sets import (
     BOUNDARY_SET,
@@ -55,7 +47,6 @@ from tetopt.model.sets import (
 )
 from tetopt.system.files import kept_places
 
-REACTIONS_TEXT = r"reactions(_step\d+)?"  # texts of a solved mesh's file
 MEAN_FIELD = r"mean(_\d+)?"  # of the image, and of further contrasts
 SET_GROUPS = ("labels", "interfaces", "boundary")  # groups of the sets that every mesh has
 # Each adds an array on the nodes of a VTU or VTK file; sets of labels can be rebuilt from the
@@ -68,7 +59,7 @@ SLOW_MATERIALS = 30_000
 
 
 def check_solver_options(output: Path, solver: SolverOptions, has_materials: bool = False) -> None:
-    """Check the options that do not depend on the mesh, before the work starts.
+    """Check the options that depend on neither mesh nor file, before the work starts.
 
     Raises
     ------
@@ -110,28 +101,37 @@ def check_solver_options(output: Path, solver: SolverOptions, has_materials: boo
 
 
 def check_model_options(options: ModelOptions, has_materials: bool) -> None:
-    """Check the options that depend on neither mesh nor file; `has_materials` is that of the mesh's
-    file, or an image.
+    """Check the options that depend on neither mesh nor file, which `check_mapping_files` reads;
+    `has_materials` is that of the mesh's file, or an image.
 
     Raises
     ------
     InputError
         An invalid mapping, average, number of bins or order; options that need moduli without any.
     """
-    for name, mapping in (
-        ("young", options.young),
-        ("nu", options.nu),
-        ("density", options.density),
-    ):
-        if mapping is not None:
-            _check_mapping(mapping, name)
-            if options.young is None and not has_materials:
-                raise InputError(f"`{name}`: needs `young`")
+    for name, text in mappings_in(options):
+        if named_file(text) is None:
+            _check_mapping(text, name)
+        if options.young is None and not has_materials:
+            raise InputError(f"`{name}`: needs `young`")
     parse_average(options.average or DEFAULT_AVERAGE)
     parsed_bins(options.bins)
     parsed_groups(options.written_sets)
     if options.order not in (None, 1, 2):
         raise InputError(f"`order`: expected 1 or 2, got {options.order}")
+
+
+def check_mapping_files(options: ModelOptions) -> None:
+    """Raise InputError for a mapping's file that cannot be read, or is invalid."""
+    for name, text in mappings_in(options):
+        if named_file(text) is not None:
+            _check_mapping(text, name)
+
+
+def mappings_in(options: ModelOptions) -> list[tuple[str, str]]:
+    """Return the options' mappings, by name."""
+    texts = ((name, getattr(options, name)) for name in MAPPED_OPTIONS)
+    return [(name, text) for name, text in texts if text is not None]
 
 
 def _check_mapping(text: str, name: str) -> None:
@@ -168,40 +168,33 @@ def parsed_groups(text: str | None) -> tuple[str, ...]:
     return tuple(words)
 
 
-def solver_model(
-    mesh: Mesh,
-    image: Image | None,
-    solver: ModelOptions,
-    cell_data: dict[str, NDArray],
-    about: dict[str, Any],
-    known_sets: Sets,
-) -> Model:
-    """Build the model of a mesh with the sets `known_sets`, with the options' materials and
-    loads.
-    """
-    young, nu, density = moduli_in(cell_data, solver.young, solver.nu, solver.density)
-    is_of_file = solver.young is None and "young" in cell_data
-    if not is_of_file and nu is None and "nu" in cell_data:
-        note(f"ignored nu in the mesh's file; nu comes from `young`, or is {DEFAULT_NU:g}")
-    fields = {name: values for name, values in cell_data.items() if name not in MATERIAL_FIELDS}
-    bins, spacing = parsed_bins(solver.bins)
-    model = build_model(
-        mesh,
-        image,
-        young=young,
-        nu=nu,
-        density=density,
-        average=solver.average or DEFAULT_AVERAGE,
-        sets=solver.sets or (),
-        loads=solver.loads or (),
-        bins=bins,
-        spacing=spacing,
-        order=solver.order or 1,
-        cell_data=fields,
-        known_sets=known_sets,
-        about={"tetopt": tetopt.__version__, **about},
+def choices_of(options: ModelOptions) -> Choices:
+    """Return what the options choose for a model."""
+    bins, spacing = parsed_bins(options.bins)
+    return Choices(
+        options.young,
+        options.nu,
+        options.density,
+        options.average or DEFAULT_AVERAGE,
+        options.sets or (),
+        options.loads or (),
+        bins,
+        spacing,
+        options.order or 1,
     )
-    return model._replace(is_nonlinear=isinstance(solver, SolverOptions) and solver.nonlinear)
+
+
+def solver_model(
+    loaded: MeshFile,
+    image: Image | None,
+    options: ModelOptions,
+    about: dict[str, Any],
+    box: Box | None,
+) -> Model:
+    """Build the model of a mesh, with its data, sets and texts, with the options."""
+    about = {"tetopt": tetopt.__version__, **about}
+    model = model_of_file(loaded, image, choices_of(options), about, box)
+    return model._replace(is_nonlinear=isinstance(options, SolverOptions) and options.nonlinear)
 
 
 def large_words(mesh: Mesh, moved: float, how: str) -> str | None:
@@ -217,58 +210,6 @@ def large_words(mesh: Mesh, moved: float, how: str) -> str | None:
         f"the largest displacement, {moved:.4g} mm, is {moved / size:.0%} of the mesh's "
         f"length, {how}"
     )
-
-
-def without_stale_results(loaded: MeshFile, solver: ModelOptions) -> MeshFile:
-    """Return the mesh's file without a solver's results if moduli, densities or loads change;
-    note the results.
-    """
-    if not any((solver.young, solver.nu, solver.density, solver.bins, solver.loads)):
-        return loaded
-    names = [
-        name for data in (loaded.cell_data, loaded.point_data) for name in data if is_result(name)
-    ]
-    texts = {
-        name: text
-        for name, text in loaded.field_data.items()
-        if re.fullmatch(REACTIONS_TEXT, name) is None
-    }
-    if not names and len(texts) == len(loaded.field_data):
-        return loaded
-    note(
-        "dropped results computed with other moduli or loads: "
-        f"{', '.join(dict.fromkeys(names)) or 'reactions'}; "
-        "tetopt fem computes them again"
-    )
-    return without_results(loaded)._replace(field_data=texts)
-
-
-def loads_of(loaded: MeshFile) -> list[str]:
-    """Return the loads in a file of tetopt's, see `tetopt.model.file.loads_in`; note dropped
-    loads.
-    """
-    loads, lost = loads_in(loaded)
-    if lost:
-        note(lost)
-    return loads
-
-
-def all_sets(
-    mesh: Mesh,
-    box: Box | None,
-    fields: dict[str, NDArray],
-    own: Sets,
-    names: Mapping[int, str],
-    former: Mapping[int, str] | None = None,
-    kept: Iterable[str] = (),
-    is_told: bool = True,
-) -> Sets:
-    """Call `tetopt.model.file.sets_beside`, and note each renamed set of the mesh."""
-    sets, renamed = sets_beside(mesh, box, fields, own, names, former, kept)
-    if is_told:
-        for old, new in renamed.items():
-            note(f'renamed set "{old}" from the input mesh to "{new}" (name already in use)')
-    return sets
 
 
 def with_chosen_sets(model: Model, output: Path, options: ModelOptions) -> Model:
@@ -313,7 +254,7 @@ def with_chosen_sets(model: Model, output: Path, options: ModelOptions) -> Model
     return model._replace(sets=Sets(facets, cells))
 
 
-def model_of_file(
+def converted_model(
     loaded: MeshFile,
     image: Image | None,
     options: ModelOptions,
@@ -324,31 +265,30 @@ def model_of_file(
     """Build the model of a mesh's file, keeping the file's own data, with the options; warn of
     implausible units.
     """
-    mesh, fields = (
-        loaded.mesh,
-        loaded.cell_data | ({} if image is None else cell_fields(loaded.mesh, image)),
-    )
-    if image is not None and (outside := float((beyond_box(mesh, image) > 1.0).mean())) > 0.0:
-        if outside == 1.0:
-            raise InputError(
-                "mesh and image: no node lies in the image's box; do both use the same world "
-                "coordinates?"
-            )
-        of_nodes = f"{outside:.1%} of the nodes lie outside the image or its mask"
-        warning(f"{of_nodes}: cells there take the nearest voxel's value")
-    table, former = label_table(options.label_names, loaded), label_table(None, loaded)
-    of_loads = {parse_load(text, mesh.ndim).set_name for text in options.loads or ()}
-    sets = all_sets(mesh, box, fields, loaded.sets, table.names, former.names, of_loads)
-    words = {TABLE_TEXT: table_words(table)} if table.names or table.colours else {}
-    model = solver_model(mesh, image, options, fields, about | words, sets)
+    if image is not None:
+        _check_place(loaded.mesh, image)
+        fields = loaded.cell_data | cell_fields(loaded.mesh, image)
+        loaded = loaded._replace(cell_data=fields)
+    table = label_table(options.label_names, loaded)
+    about = about | ({TABLE_TEXT: table} if table.names or table.colours else {})
+    with warnings_heard():
+        model = solver_model(loaded, image, options, about, box)
     if has_units:
         warn_of_units(model)
-    model, lost = completed(
-        model, loaded, is_of_file=options.young is None and options.bins is None
-    )
-    if lost:
-        note(lost)
     return model
+
+
+def _check_place(mesh: Mesh, image: Image) -> None:
+    """Raise InputError for a mesh outside the image; warn of one partly outside."""
+    outside = float((beyond_box(mesh, image) > 1.0).mean())
+    if outside == 1.0:
+        raise InputError(
+            "mesh and image: no node lies in the image's box; do both use the same world "
+            "coordinates?"
+        )
+    if outside > 0.0:
+        of_nodes = f"{outside:.1%} of the nodes lie outside the image or its mask"
+        warning(f"{of_nodes}: cells there take the nearest voxel's value")
 
 
 def check_early(
@@ -379,8 +319,7 @@ def check_early(
     loaded = [load.set_name for load in loads]
     is_certain = not any(name in names or name.startswith(INTERFACE_PREFIX) for name in loaded)
     # the final mesh may have cells of further labels, and larger sides
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", Remark)
+    with warnings.catch_warnings(action="ignore"):
         model = build(replace(solver, sets=None, loads=solver.loads if is_certain else None))
     warn_of_units(model._replace(loads=tuple(loads)))
     known = model.sets

@@ -27,7 +27,7 @@ from tetopt.io.formats import FORMATS
 from tetopt.io.images import checked_bounds, file_shape, parse_crop, parse_slice, smaller_words
 from tetopt.io.label_tables import NO_TABLE, LabelTable
 from tetopt.job.inputs import balance_of, checked_outputs, label_sizes_of, number_of, read_companion
-from tetopt.job.model import check_solver_options
+from tetopt.job.model import check_mapping_files, check_solver_options
 from tetopt.job.options import JobOptions, Method, stated_part
 from tetopt.model.mappings import named_file
 from tetopt.model.tissues import groups_of
@@ -190,7 +190,15 @@ def plan(job: JobOptions) -> Plan:
     checked_output(job.output, tuple(FORMATS), job.force)
     if job.json_path is not None:
         checked_output(job.json_path, (".json",), job.force)
+    check_files(job)
     return resolved(job)._replace(pictures=_pictures(job))
+
+
+def check_files(job: JobOptions) -> None:
+    """Raise InputError for a file of mappings or of sizes that cannot be read, or is invalid."""
+    check_mapping_files(job)
+    if job.label_size is not None:
+        label_sizes_of(job.label_size)
 
 
 def resolved(job: JobOptions) -> Plan:
@@ -290,7 +298,7 @@ def _check_numbers(job: JobOptions) -> None:
             "`nodes_max`: needs `target_error`; without it, `nodes` is the number of nodes"
         )
     _limits(changed(job, sizing=None, label_size=None))
-    if job.label_size is not None:
+    if job.label_size is not None and named_file(job.label_size) is None:
         label_sizes_of(job.label_size)
 
 

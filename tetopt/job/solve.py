@@ -13,18 +13,18 @@ from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io.formats import save_model
 from tetopt.io.images import sha256
-from tetopt.job.events import warning
-from tetopt.job.inputs import check_part, read_mesh, texts_of, voxels_of
+from tetopt.job.events import warning, warnings_heard
+from tetopt.job.inputs import check_part, read_mesh, voxels_of
 from tetopt.job.model import (
+    check_mapping_files,
     check_model_options,
+    converted_model,
     large_words,
-    loads_of,
-    model_of_file,
     with_chosen_sets,
 )
 from tetopt.job.options import LabelledPart, ModelOptions, stated_part
 from tetopt.model.averages import DEFAULT_AVERAGE
-from tetopt.model.file import MeshFile, without_results
+from tetopt.model.file import MeshFile, loads_in, texts_of, without_results
 from tetopt.model.loads import MOST_COMPRESSION_PERCENT, count_of_steps
 from tetopt.model.model import Model, locking_words
 from tetopt.model.sets import box_of, box_text
@@ -123,6 +123,7 @@ def _check_options(
     if image is None and model.average is not None:
         raise InputError("`average`: averages over an image's voxels; pass `image`")
     check_model_options(model, has_materials=True)
+    check_mapping_files(model)
 
 
 def _filled(
@@ -138,7 +139,8 @@ def _filled(
             model, loads=[f"compress:{PAPER_PERCENT if compress is None else compress!r}%"]
         )
     elif not model.loads:
-        model = replace(model, loads=loads_of(loaded))
+        with warnings_heard():
+            model = replace(model, loads=loads_in(loaded))
     if model.young is None and "young" not in loaded.cell_data:
         raise InputError(
             "the mesh's file has no moduli: pass `young`, such as `young` 3.5, or `image`"
@@ -174,7 +176,7 @@ def _model(
         box = box_of(whole)
     about |= {} if box is None else {"box": box_text(box)}
     model = _filled(model, loaded, whole, compress)
-    return model_of_file(
+    return converted_model(
         loaded, voxels, model, about, box, has_units=model.young != INTENSITY_MAPPING
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from functools import partial
 from itertools import islice
@@ -13,10 +14,9 @@ from numpy.typing import NDArray
 from tetopt.contents.content import continued
 from tetopt.engine.interfaces import crowded_nodes
 from tetopt.engine.loop import MeshingResult
-from tetopt.job.events import note
-from tetopt.job.inputs import label_table
+from tetopt.errors import Note, warn
+from tetopt.job.events import warnings_heard
 from tetopt.job.model import (
-    all_sets,
     drop_early,
     keep_early,
     save_anyway,
@@ -31,7 +31,7 @@ from tetopt.job.task import Meshed, Shapes, Task
 from tetopt.measure.measures import fidelity, measured_each
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields, is_result
-from tetopt.model.file import MASK_TEXT
+from tetopt.model.file import MASK_TEXT, MeshFile
 from tetopt.model.labels import TABLE_TEXT, LabelTable, coloured, table_of_labels, table_words
 from tetopt.model.model import Model
 from tetopt.model.sets import Sets, box_of, label_set_names, surviving_sets
@@ -46,8 +46,6 @@ def model_with(
     mesh: Mesh,
     solver: SolverOptions,
     about: dict[str, Any],
-    is_told: bool = True,
-    labels: NDArray[np.int64] | None = None,
     fields: dict[str, NDArray] | None = None,
 ) -> Model:
     """Build the model of a mesh with the options; `fields` of its cells are computed if not
@@ -55,29 +53,35 @@ def model_with(
     """
     source, started = task.source, task.started
     if fields is None:
-        fields = source.fields(mesh, labels)
-    own = Sets({}, {}) if started is None else surviving_sets(started.mesh, started.sets, mesh)
-    if started is not None and is_told:
-        lost = [name for kind in (0, 1) for name in started.sets[kind] if name not in own[kind]]
-        if source.labels is not None:  # whose sets are rebuilt
-            names = label_table(None, started).names
-            of_labels = label_set_names(names, names).values()
-            lost = [
-                name
-                for name in lost
-                if not name.startswith(("label_", "interface_")) and name not in of_labels
-            ]
-        if lost:
-            note(f"dropped sets whose cells or faces changed during remeshing: {', '.join(lost)}")
-        has_results = any(is_result(name) for name in (*started.cell_data, *started.point_data))
-        if "young" in started.cell_data or started.text("loads") is not None or has_results:
-            note(
-                "moduli, loads and results of the input mesh are not kept; pass `young` and `loads`"
-            )
-    known_sets = all_sets(
-        mesh, box_of(source.contrasts[0]), fields, own, source.table.names, is_told=is_told
-    )
-    return solver_model(mesh, source.image, solver, fields, about, known_sets)
+        fields = source.fields(mesh)
+    own = Sets({}, {})
+    if started is not None:
+        own = surviving_sets(started.mesh, started.sets, mesh)
+        _warn_of_losses(started, own, source.labels is not None)
+    loaded = MeshFile(mesh, fields, {}, n_turned=0, sets=own)
+    return solver_model(loaded, source.image, solver, about, box_of(source.contrasts[0]))
+
+
+def _warn_of_losses(started: MeshFile, own: Sets, has_labels: bool) -> None:
+    """Warn of what the input mesh's file has and the model of a new mesh, with the sets `own` of
+    it, has not.
+    """
+    lost = [name for kind in (0, 1) for name in started.sets[kind] if name not in own[kind]]
+    if has_labels:  # whose sets are rebuilt
+        names = started.label_table.names
+        rebuilt = set(label_set_names(names, names).values())
+        lost = [
+            name
+            for name in lost
+            if not name.startswith(("label_", "interface_")) and name not in rebuilt
+        ]
+    if lost:
+        words = f"dropped sets whose cells or faces changed during remeshing: {', '.join(lost)}"
+        warn(words, Note)
+    has_results = any(is_result(name) for name in (*started.cell_data, *started.point_data))
+    if "young" in started.cell_data or started.text("loads") is not None or has_results:
+        words = "moduli, loads and results of the input mesh are not kept"
+        warn(f"{words}; pass `young` and `loads`", Note)
 
 
 def saved(task: Task, outcome: Meshed, failed: dict[str, str]) -> tuple[Model, dict[str, Any]]:
@@ -100,22 +104,15 @@ def saved(task: Task, outcome: Meshed, failed: dict[str, str]) -> tuple[Model, d
     early = keep_early(result.mesh, result.labels, places)
     fields = _measured_fields(source, result, failed)
     try:
-        whole = model_with(task, result.mesh, job, about, labels=result.labels, fields=fields)
+        with warnings_heard():
+            whole = model_with(task, result.mesh, job, about, fields)
         model = with_chosen_sets(whole, job.output, job)
         save_for_solver(job.output, model, job)
     except Exception as error:  # the mesh may have taken hours
 
         def bare() -> Model:
-            options = SolverOptions()
-            return model_with(
-                task,
-                result.mesh,
-                options,
-                about,
-                is_told=False,
-                labels=result.labels,
-                fields=fields,
-            )
+            with warnings.catch_warnings(action="ignore"):
+                return model_with(task, result.mesh, SolverOptions(), about, fields)
 
         kept, early = early, None
         save_anyway(job.output, result.mesh, bare, error, kept)

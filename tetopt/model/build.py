@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tetopt.contents.content import Content, continued
 from tetopt.contents.domain import mask_text
 from tetopt.engine.loop import MeshingResult
-from tetopt.errors import InputError, warn
+from tetopt.errors import InputError, Note, warn
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image
 from tetopt.measure.requirements import warn_of_other_mask
@@ -28,7 +28,6 @@ from tetopt.model.fields import cell_fields
 from tetopt.model.file import (
     MASK_TEXT,
     MATERIAL_FIELDS,
-    TEXTS_KEPT,
     MeshFile,
     completed,
     count_of_other_voxels,
@@ -36,7 +35,8 @@ from tetopt.model.file import (
     moduli_in,
     own_mask,
     sets_beside,
-    without_results,
+    texts_of,
+    without_stale_results,
     words_of_other_box,
 )
 from tetopt.model.labels import (
@@ -177,69 +177,130 @@ def build_model(
     >>> tetopt.build_model(mesh, young="1=10,*=2", cell_data=data).materials.young.tolist()
     [2.0, 10.0]
     """
-    loaded, loads = None, tuple(loads)
+    choices = Choices(young, nu, density, average, tuple(sets), tuple(loads), bins, spacing)
     if isinstance(mesh, MeshingResult):
         mesh, image, order, cell_data = _of_result(mesh, image, order, cell_data)
     image, whole, about = _voxels(image, mesh, about or {})
-    if isinstance(mesh, MeshFile):
-        loaded, is_of_file = (
-            _to_be_kept(mesh, [young, nu, density, bins], loads),
-            young is None and bins is None,
-        )
-        mesh, order = loaded.mesh, loaded.order if order is None else order
-        if cell_data is None:
-            cell_data = loaded.cell_data | ({} if image is None else cell_fields(mesh, image))
-        young, nu, density = moduli_in(cell_data, young, nu, density)
-        cell_data = {
-            name: values for name, values in cell_data.items() if name not in MATERIAL_FIELDS
-        }
-        loads = loads or _said(loads_in(loaded))
-        box = loaded.box if box is None else box
-        about = _texts_of(loaded, box) | about
-    if (order := 1 if order is None else order) not in (1, 2):
-        raise InputError(f"order: expected 1 or 2, got {order}")
-    parse_average(average)
+    loaded = mesh if isinstance(mesh, MeshFile) else None
+    mesh = mesh.mesh if isinstance(mesh, MeshFile) else mesh
     if image is not None and image.ndim != mesh.ndim:
         raise InputError(
             f"image: expected a {mesh.ndim}-D image, like the mesh, got a {image.ndim}-D one"
         )
-    cell_data = cell_fields(mesh, image) if cell_data is None else dict(cell_data)
-    labels = labels_of(cell_data, len(mesh.cells))
-    about = _with_table_in_words(about, labels)
-    mean = means if (means := cell_data.get("mean")) is not None and means.ndim == 1 else None
-    cells = _ModelCells(mesh, image, mean, labels, table_of_words(about.get(TABLE_TEXT)).names)
+    if loaded is not None:
+        loaded = without_stale_results(loaded, is_stale=choices.is_new)
+        box = loaded.box if box is None else box
+        table, of_box = loaded.label_table, {} if box is None else {"box": box_text(box)}
+        of_labels = {TABLE_TEXT: table} if table.names or table.colours else {}
+        about = texts_of(loaded) | of_labels | of_box | about
+        order = loaded.order if order is None else order
+        choices = choices._replace(loads=choices.loads or tuple(loads_in(loaded)))
+    box = box_of(whole) if box is None and whole is not None else box
+    choices = choices._replace(order=1 if order is None else order)
+    if loaded is None:
+        fields = cell_fields(mesh, image) if cell_data is None else dict(cell_data)
+        cells = _cells_of(mesh, image, fields, about)
+        if known_sets is None:
+            known_sets = standard_sets(mesh, box, cells.labels, cells.names)
+        return _model(cells, choices, fields, about, known_sets)
+    if cell_data is None:
+        cell_data = loaded.cell_data | ({} if image is None else cell_fields(mesh, image))
+    return model_of_file(
+        loaded._replace(cell_data=cell_data), image, choices, about, box, known_sets
+    )
+
+
+class Choices(NamedTuple):
+    """What the user chooses for a model, as in `build_model`."""
+
+    young: Any = None
+    nu: Any = None
+    density: Any = None
+    average: str = DEFAULT_AVERAGE
+    sets: Sequence[str] = ()
+    loads: Sequence[str] = ()
+    bins: int | None = None
+    spacing: Spacing = "equal"
+    order: int = 1
+
+    @property
+    def is_new(self) -> bool:
+        """True if results that were computed with a file's own moduli and loads no longer hold."""
+        mappings = (self.young, self.nu, self.density, self.bins)
+        return bool(self.loads) or any(each is not None for each in mappings)
+
+
+def model_of_file(
+    loaded: MeshFile,
+    image: Image | None,
+    choices: Choices,
+    about: dict[str, Any],
+    box: Box | None,
+    known_sets: Sets | None = None,
+) -> Model:
+    """Build the model of a mesh's file: what the choices leave open is the file's, except loads.
+
+    The file's data of cells include those that the image gives. Warns of the file's data that are
+    left out or renamed.
+    """
+    mesh, fields = loaded.mesh, loaded.cell_data
+    young, nu, density = moduli_in(fields, choices.young, choices.nu, choices.density)
+    if nu is None and "nu" in fields:
+        warn(f"ignored nu in the mesh's file; nu comes from `young`, or is {DEFAULT_NU:g}", Note)
+    fields = {name: rows for name, rows in fields.items() if name not in MATERIAL_FIELDS}
+    cells = _cells_of(mesh, image, fields, about)
     if known_sets is None:
-        box = box_of(whole) if box is None and whole is not None else box
-        known_sets = _sets(cells, box, cell_data, loaded, loads)
-    all_sets = with_requested(mesh, known_sets, sets, mean)
-    table, nodal, at_gauss = None, None, None
-    if young is not None:
-        nodal, at_gauss = _varying_moduli(young, mesh, image, average, order, bins)
-        table = _materials(cells, young, nu, density, average)
-        table = (
-            table
-            if bins is None
-            else binned(table, volumes(mesh.points, mesh.cells), bins, spacing)
+        of_loads = {parse_load(text, mesh.ndim).set_name for text in choices.loads}
+        former = loaded.label_table.names
+        known_sets, renamed = sets_beside(
+            mesh, box, fields, loaded.sets, cells.names, former, of_loads
         )
+        for old, new in renamed.items():
+            warn(f'renamed set "{old}" from the input mesh to "{new}" (name already in use)', Note)
+    is_of_file = choices.young is None and choices.bins is None
+    choices = choices._replace(young=young, nu=nu, density=density)
+    model = _model(cells, choices, fields, about, known_sets)
+    return completed(model, loaded, is_of_file=is_of_file)
+
+
+def _model(
+    cells: _ModelCells,
+    choices: Choices,
+    cell_data: dict[str, NDArray],
+    about: dict[str, Any],
+    known_sets: Sets,
+) -> Model:
+    """Build a model whose sets are those known and the chosen ones."""
+    mesh, order, bins = cells.mesh, choices.order, choices.bins
+    if order not in (1, 2):
+        raise InputError(f"order: expected 1 or 2, got {order}")
+    parse_average(choices.average)
+    all_sets = with_requested(mesh, known_sets, choices.sets, cells.mean)
+    table, nodal, at_gauss = None, None, None
+    if choices.young is not None:
+        nodal, at_gauss = _varying_moduli(cells, choices)
+        table = _materials(cells, choices)
+        if bins is not None:
+            table = binned(table, volumes(mesh.points, mesh.cells), bins, choices.spacing)
     elif bins is not None:
         raise InputError("bins: the model has no moduli to group; give `young`")
-    elif density is not None:
+    elif choices.density is not None:
         raise InputError("density: a material also needs a modulus; give `young`")
-    parsed = parse_loads(loads, mesh, all_sets)
-    if any(load.kind == "gravity" for load in parsed):
+    loads = parse_loads(choices.loads, mesh, all_sets)
+    if any(load.kind == "gravity" for load in loads):
         density_of(table)  # raises InputError without a density
-    model = Model(
+    about = _with_table_in_words(about, cells.labels)
+    return Model(
         mesh,
         cell_data,
         all_sets,
         table,
-        parsed,
+        loads,
         order,
         node_young=nodal,
         gauss_young=at_gauss,
         about=about,
     )
-    return model if loaded is None else _said(completed(model, loaded, is_of_file=is_of_file))
 
 
 def _of_result(
@@ -291,98 +352,58 @@ def _voxels(
     return (whole if whole is None else continued(whole, within)), whole, about
 
 
-def _said(answer: tuple[Any, str]) -> Any:
-    """Return the value of an answer; warn of its note on dropped data."""
-    if answer[1]:
-        warn(answer[1])
-    return answer[0]
-
-
-def _to_be_kept(loaded: MeshFile, mappings: list[Any], loads: Iterable[str]) -> MeshFile:
-    """Return the file without solver results if moduli, densities or loads change."""
-    return (
-        without_results(loaded)
-        if loads or any(mapping is not None for mapping in mappings)
-        else loaded
-    )
-
-
-def _texts_of(loaded: MeshFile, box: Box | None) -> dict[str, Any]:
-    """Return the texts of a mesh's file that the model keeps."""
-    texts: dict[str, Any] = {
-        name: text for name in TEXTS_KEPT if (text := loaded.text(name)) is not None
-    }
-    if loaded.label_table.names or loaded.label_table.colours:
-        texts[TABLE_TEXT] = loaded.label_table
-    return texts if box is None else texts | {"box": box_text(box)}
+def _table_of(about: dict[str, Any]) -> LabelTable:
+    """Return the label table among a model's texts."""
+    table = about.get(TABLE_TEXT)
+    return table if isinstance(table, LabelTable) else table_of_words(table)
 
 
 def _with_table_in_words(about: dict[str, Any], labels: NDArray[np.int64] | None) -> dict[str, Any]:
     """Return the texts with a label table in JSON's types, in which all labels of cells have a
     colour.
     """
-    table = about.get(TABLE_TEXT)
-    if table is None and labels is None:
+    if about.get(TABLE_TEXT) is None and labels is None:
         return dict(about)
-    known = table if isinstance(table, LabelTable) else table_of_words(table)
-    return about | {TABLE_TEXT: table_words(known if labels is None else coloured(known, labels))}
+    table = _table_of(about)
+    return about | {TABLE_TEXT: table_words(table if labels is None else coloured(table, labels))}
 
 
-def _sets(
-    cells: _ModelCells,
-    box: Box | None,
-    cell_data: dict[str, NDArray],
-    loaded: MeshFile | None,
-    loads: Iterable[str],
-) -> Sets:
-    """Return the standard sets and those of the mesh's file."""
-    if loaded is None:
-        return standard_sets(cells.mesh, box, cells.labels, cells.names)
-    of_loads = {parse_load(text, cells.mesh.ndim).set_name for text in loads}
-    former = loaded.label_table.names
-    sets, renamed = sets_beside(
-        cells.mesh, box, cell_data, loaded.sets, cells.names, former, of_loads
-    )
-    for old, new in renamed.items():
-        warn(f'renamed set "{old}" from the input mesh to "{new}" (name already in use)')
-    return sets
-
-
-def _materials(cells: _ModelCells, young: Any, nu: Any, density: Any, average: str) -> Materials:
+def _materials(cells: _ModelCells, choices: Choices) -> Materials:
     """Build materials from mappings; ratio and density default to columns of the file that the
     modulus names.
     """
+    young, nu, density = choices.young, choices.nu, choices.density
     if nu is None:
         nu = young if isinstance(young, str) and has_column(young, "nu") else DEFAULT_NU
     if density is None and isinstance(young, str) and has_column(young, "density"):
         density = young
-    moduli = _values(young, "young", cells, average)
+    moduli = _values(young, "young", cells, choices.average)
     ratios = _values(nu, "nu", cells)
     masses = None if density is None else _values(density, "density", cells)
     return materials(moduli, ratios, len(cells.mesh.cells), masses)
 
 
 def _varying_moduli(
-    young: Any, mesh: Mesh, image: Image | None, average: str, order: int, bins: int | None
+    cells: _ModelCells, choices: Choices
 ) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
     """Return `node_young` and moduli at Gauss points from a mapping of the intensity; None if
     the average has none.
     """
+    young, average, order = choices.young, choices.average, choices.order
     mapping: Any = parse_any_mapping(young) if isinstance(young, str) else young
     place = parse_average(average).place
-    if image is None or not (callable(mapping) or np.ndim(mapping) == 2):
+    if cells.image is None or not (callable(mapping) or np.ndim(mapping) == 2):
         return None, None
-    if place == "nodes" and bins is not None:
+    if place == "nodes" and choices.bins is not None:
         raise InputError(
             "bins: moduli that vary within cells cannot be grouped; use an average other than "
             f"{average}"
         )
-    return (
-        node_young(image, mesh, mapping) if place == "nodes" else None,
-        element_young(image, mesh, mapping, average, order)
-        if place == "gauss" and order == 2 and bins is None
-        else None,
-    )
+    if place == "nodes":
+        return node_young(cells.image, cells.mesh, mapping), None
+    if place == "gauss" and order == 2 and choices.bins is None:
+        return None, element_young(cells.image, cells.mesh, mapping, average, order)
+    return None, None
 
 
 class _ModelCells(NamedTuple):
@@ -393,6 +414,16 @@ class _ModelCells(NamedTuple):
     mean: NDArray[np.float64] | None  # (M,)
     labels: NDArray[np.int64] | None  # (M,)
     names: dict[int, str]  # of labels
+
+
+def _cells_of(
+    mesh: Mesh, image: Image | None, cell_data: dict[str, NDArray], about: dict[str, Any]
+) -> _ModelCells:
+    """Return a mesh's cells with the means, labels and names of labels in their data."""
+    mean = cell_data.get("mean")
+    mean = mean if mean is not None and mean.ndim == 1 else None
+    labels = labels_of(cell_data, len(mesh.cells))
+    return _ModelCells(mesh, image, mean, labels, _table_of(about).names)
 
 
 def _values(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from typing import Any, NamedTuple
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from tetopt.contents.align import SAME_BOX_VOXELS, other_box, resample_mask
 from tetopt.contents.domain import INSIDE_FRACTION, mask_of
-from tetopt.errors import InputError
+from tetopt.errors import InputError, Note, warn
 from tetopt.geometry.quadratic import numbered_edges
 from tetopt.geometry.topology import compact
 from tetopt.image import Image
@@ -44,6 +45,7 @@ MODULUS_ROUNDING = 1e-9
 MASK_TEXT = "mask"
 # those that are kept in a new file
 TEXTS_KEPT = ("image", "image_sha256", "inputs", "options", "violated", MASK_TEXT)
+REACTIONS_TEXT = r"reactions(_step\d+)?"  # texts of a solved mesh's file
 
 
 class MeshFile(NamedTuple):
@@ -179,6 +181,14 @@ def text_in(field_data: dict[str, NDArray], name: str) -> str | None:
     return str(values.ravel()[0]) if values.dtype.kind == "U" and values.size else None
 
 
+def texts_of(loaded: MeshFile, *, is_other: bool = False) -> dict[str, Any]:
+    """Return the texts of a mesh's file to keep in another file; with another image, only that
+    on the mesh's mask.
+    """
+    kept = (MASK_TEXT,) if is_other else TEXTS_KEPT
+    return {name: text for name in kept if (text := loaded.text(name)) is not None}
+
+
 def words_of_other_box(loaded: MeshFile, image: Image, tolerance: float = SAME_BOX_VOXELS) -> str:
     """Return `tetopt.contents.align.other_box` of the box in a mesh's file; "" if it has none."""
     box = loaded.box
@@ -273,22 +283,24 @@ def sets_beside(
     return merged_sets(standard_sets(mesh, box, labels, names, own.facets), own)
 
 
-def loads_in(loaded: MeshFile) -> tuple[list[str], str]:
-    """Return the loads in a file of tetopt's as text, in RAS+ and kPa, if their sets still
-    exist; and otherwise why they were dropped.
+def loads_in(loaded: MeshFile) -> list[str]:
+    """Return the loads in a file of tetopt's as text, in RAS+ and kPa; none, with a warning, if
+    their sets no longer exist.
     """
     try:
         words = json_of(loaded.text("loads") or "[]")
         loads = [parse_load(text, loaded.mesh.ndim) for text in words]
     except (ValueError, TypeError, AttributeError):  # written by another program
-        return [], ""
+        return []
     if lost := [
         load.set_name for load in loads if load.set_name and load.set_name not in loaded.sets.facets
     ]:
-        return [], f"dropped the file's loads: it no longer has the sets {', '.join(lost)}"
+        words = f"dropped the file's loads: it no longer has the sets {', '.join(lost)}"
+        warn(words, Note)
+        return []
     units = STRESS_UNITS.get(loaded.text("units") or "", STRESS_UNITS["kPa"])
     turned = [half_turned(load) if loaded.space == "lps" else load for load in loads]
-    return [load_words(scaled(load, units.kPa, units.mm)) for load in turned], ""
+    return [load_words(scaled(load, units.kPa, units.mm)) for load in turned]
 
 
 def moduli_in(
@@ -306,25 +318,23 @@ def moduli_in(
     return np.asarray(cell_data["young"], dtype=np.float64), stated["nu"], stated["density"]
 
 
-def completed(model: Model, loaded: MeshFile, *, is_of_file: bool) -> tuple[Model, str]:
+def completed(model: Model, loaded: MeshFile, *, is_of_file: bool) -> Model:
     """Add the data that only the mesh's file has: data of nodes and, if the moduli are the
-    file's, moduli that vary within cells and the binning error. Also return a note on data that
-    do not fit.
+    file's, moduli that vary within cells and the binning error. Warn of data that do not fit.
     """
     model = model._replace(
         point_data={name: rows for name, rows in loaded.point_data.items() if name != NODE_MODULI}
     )
     if (table := model.materials) is None or not is_of_file:
-        return model, ""
+        return model
     if (moduli := loaded.point_data.get(NODE_MODULI)) is not None:
         model = model._replace(node_young=checked_young(moduli[: len(model.mesh.points)]))
     table = table._replace(binning=_binning_error(loaded))
     at_gauss = _gauss_moduli(model, loaded)
-    lost = at_gauss is None and model.order == 2 and GAUSS_MODULI in loaded.cell_data
-    words = (
-        f"dropped {GAUSS_MODULI} from the mesh's file: it does not match the cells and their moduli"
-    )
-    return model._replace(materials=table, gauss_young=at_gauss), words if lost else ""
+    if at_gauss is None and model.order == 2 and GAUSS_MODULI in loaded.cell_data:
+        words = "it does not match the cells and their moduli"
+        warn(f"dropped {GAUSS_MODULI} from the mesh's file: {words}", Note)
+    return model._replace(materials=table, gauss_young=at_gauss)
 
 
 def _binning_error(loaded: MeshFile) -> BinningError | None:
@@ -407,3 +417,20 @@ def without_results(loaded: MeshFile) -> MeshFile:
         for data in (loaded.cell_data, loaded.point_data)
     )
     return loaded._replace(cell_data=cell_data, point_data=point_data)
+
+
+def without_stale_results(loaded: MeshFile, *, is_stale: bool) -> MeshFile:
+    """Return the mesh's file without results and reactions if they hold no longer; warn of them."""
+    if not is_stale:
+        return loaded
+    names = [name for data in (loaded.cell_data, loaded.point_data) for name in data]
+    names = list(dict.fromkeys(filter(is_result, names)))
+    texts = {
+        name: text
+        for name, text in loaded.field_data.items()
+        if re.fullmatch(REACTIONS_TEXT, name) is None
+    }
+    if names or len(texts) < len(loaded.field_data):
+        what = f"{', '.join(names) or 'reactions'}; tetopt fem computes them again"
+        warn(f"dropped results computed with other moduli or loads: {what}", Note)
+    return without_results(loaded)._replace(field_data=texts)
