@@ -15,8 +15,8 @@ COPY pyproject.toml README.md LICENSE ./
 COPY phantoms ./phantoms
 COPY tetopt ./tetopt
 RUN python -m pip install --no-cache-dir --disable-pip-version-check ".[cohort,itk]"
-# Next to the installed package, from where any user copies them to a cache, or to a temporary folder.
-RUN tetopt warm-up
+# Kept where any user may read them; tetopt runs only those in a folder that is the user's own, so each run starts with a copy.
+RUN NUMBA_CACHE_DIR=$PWD/kernels tetopt warm-up && chmod -R a+rX kernels
 
 WORKDIR /
-ENTRYPOINT ["python", "-P", "-m", "tetopt.bids"]
+ENTRYPOINT ["sh", "-c", "export NUMBA_CACHE_DIR=$(mktemp -d) && (umask 077 && cp -r /opt/tetopt/kernels/. $NUMBA_CACHE_DIR); exec python -P -m tetopt.bids \"$@\"", "tetopt"]

@@ -19,7 +19,7 @@ from tetopt import (
 from tetopt.cli.console import print_line
 from tetopt.cli.run import compiling
 from tetopt.contents.content import content
-from tetopt.system.cache import BESIDE, place_cache, share_with_all
+from tetopt.system.cache import place_cache
 from tetopt.system.kernels import link, roots
 
 BALL_VOXELS = 24  # along each axis of the meshed image: an octree of 300 nodes needs this many
@@ -38,8 +38,6 @@ def warm_up_command() -> int:
         link(roots(), progress)
         for n in (3, 2):
             _mesh_balls(n)
-    if place.folder == BESIDE:
-        share_with_all(BESIDE)
     seconds = time.perf_counter() - begin
     print_line(f"all kernels are ready after {seconds:.0f} s, stored in {place.folder}")
     return 0

@@ -2,7 +2,7 @@
 for this process.
 
 numba runs the code that it reads there. World-writable folders are therefore not used, whoever owns
-them, and the code is in subfolders that nobody but their owner can write to.
+them, and the code is in subfolders that nobody but their owner can enter.
 """
 
 from __future__ import annotations
@@ -56,11 +56,7 @@ def place_cache() -> Place:
 
 
 def own_folder(name: str) -> Path | None:
-    """Return the subfolder of this name, created if missing, as a copy of the one in `BESIDE` if
-    there is one.
-
-    The latter has the kernels that `tetopt warm-up` compiled for all users, or for a read-only
-    container.
+    """Return the subfolder of this name, which only this user may enter; create it if missing.
 
     Raises
     ------
@@ -69,55 +65,13 @@ def own_folder(name: str) -> Path | None:
     """
     if (place := place_cache().folder) is None:
         return None
-    folder, shipped = place / name, BESIDE / name
-    if not folder.exists():
-        new = Path(tempfile.mkdtemp(prefix="tetopt-", dir=place))
-        if shipped.is_dir():
-            # it may not be read, or not be trusted: kernels are compiled again
-            with contextlib.suppress(OSError):
-                _check_trusted(shipped)
-                shutil.copytree(shipped, new, dirs_exist_ok=True)
-            new.chmod(0o700)
-        try:
-            new.rename(folder)
-        except OSError:  # another process was faster
-            shutil.rmtree(new)
-    _check_trusted(folder)
+    folder = place / name
+    folder.mkdir(mode=0o700, exist_ok=True)
+    status = os.lstat(folder)  # which does not follow links
+    is_private = stat.S_ISDIR(status.st_mode) and not status.st_mode & 0o077
+    if os.name == "posix" and not (is_private and status.st_uid == os.geteuid()):
+        raise PermissionError(f"another user could have written those in {folder}; remove it")
     return folder
-
-
-def share_with_all(folder: Path) -> None:
-    """Let all users read a folder, but only its owner write to it."""
-    for path in [folder, *folder.rglob("*")]:
-        path.chmod(0o755 if path.is_dir() else 0o644)
-
-
-def _check_trusted(folder: Path) -> None:
-    """Raise PermissionError if another user could have written to a folder that others can
-    enter, or to its files.
-    """
-    is_closed = os.lstat(folder).st_mode & 0o077 == 0
-    for path in [folder, *(() if is_closed else folder.rglob("*"))]:
-        if (words := _distrust(os.lstat(path))) is not None:
-            raise PermissionError(
-                f"another user could have written those in {folder} ({path.name} {words})"
-            )
-
-
-def _distrust(status: os.stat_result) -> str | None:
-    """Return why a file or folder is not trusted, in words; None if it is.
-
-    Trusted owners are this user, root and the owner of the package: they may run code in this
-    process anyway. The status comes from `os.lstat`, because links are not followed.
-    """
-    if os.name != "posix":
-        return None
-    if stat.S_ISLNK(status.st_mode):
-        return "is a link"
-    if status.st_uid not in (os.geteuid(), 0, os.stat(__file__).st_uid):
-        return f"belongs to user {status.st_uid}"
-    is_open = status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-    return "is writable by users other than its owner" if is_open else None
 
 
 def _user_cache() -> Path:
