@@ -5,9 +5,6 @@ segmentation.
 __version__ = "0.1.0"
 
 import os
-from importlib import import_module
-from inspect import isfunction
-from typing import Any
 
 import lazy_loader
 
@@ -20,13 +17,5 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 place_cache()
 
 # the names are in __init__.pyi
-_loaded, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-
-
-def __getattr__(name: str) -> Any:
-    """Return a public name, loading its module on first use: `tetopt --help` needs no kernels."""
-    value = _loaded(name)
-    if isfunction(value):  # whoever calls it by this name may give it anything
-        value = import_module("tetopt.system.public").checked(value)
-    globals()[name] = value
-    return value
+# and loaded on first use: `tetopt --help` needs no kernels
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tetopt.errors import InputError
 from tetopt.interop import notebook
-from tetopt.system.public import unmasked
+from tetopt.system.arrays import unmasked
 
 # determinant of the axes' directions, below which they do not span the space
 SINGULAR_DETERMINANT = 1e-6

@@ -15,7 +15,7 @@ from tetopt.geometry.quadratic import curved_volumes, numbered_edges, quadratic,
 from tetopt.geometry.simplex import volumes
 from tetopt.interop import conversions, notebook
 from tetopt.interop.conversions import MESHIO_KINDS, VTK_KINDS, Fields
-from tetopt.system.public import checked_simplices, unmasked
+from tetopt.system.arrays import simplex_arrays, unmasked
 
 if TYPE_CHECKING:
     import meshio
@@ -67,7 +67,7 @@ class Mesh:
     def __init__(
         self, points: ArrayLike, cells: ArrayLike, midpoints: ArrayLike | None = None
     ) -> None:
-        points, cells = checked_simplices("mesh", points, cells)
+        points, cells = simplex_arrays("mesh", points, cells)
         n = points.shape[1]
         v = volumes(points, cells)
         if (v <= 0.0).any():

@@ -453,8 +453,16 @@ def undivided(what: Content, values: NDArray) -> NDArray:
 
 
 def plain(image: Image | Content) -> Content:
-    """Content of a single image; a content is returned unchanged."""
-    return image if isinstance(image, Content) else Content(image)
+    """Content of a single image; a content is returned unchanged; TypeError for anything else."""
+    if isinstance(image, Content):
+        return image
+    if not isinstance(image, Image):
+        got = type(image).__name__
+        raise TypeError(
+            f"image: expected Image or Content, got {got}; use tetopt.load_image(path) or "
+            "tetopt.Image(array, affine)"
+        )
+    return Content(image)
 
 
 def own_image(image: Image | Content) -> Image:

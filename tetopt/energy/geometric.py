@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from tetopt.geometry.simplex import Cells, Points, squared_edges, volumes
 from tetopt.geometry.vectors import cross, difference, dot
+from tetopt.system.arrays import simplex_arrays
 from tetopt.system.kernel_cache import njit
 
 
@@ -58,7 +59,7 @@ def E_G(points: Points, cells: Cells) -> float:
     >>> [round(tetopt.E_G(points, np.array([[0, 1, 2]])), 3) for points in (equilateral, flatter)]
     [0.108, 0.126]
     """
-    return float(cell_E_G(points, cells).sum())
+    return float(cell_E_G(*simplex_arrays("E_G:", points, cells)).sum())
 
 
 @njit(cache=True)

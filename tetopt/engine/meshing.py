@@ -15,6 +15,7 @@ from collections.abc import Callable, Generator, Iterator
 from difflib import get_close_matches
 from functools import partial
 from math import ceil, prod
+from operator import index
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -220,6 +221,7 @@ def mesh_image(
     >>> result.history[-1].E < 1
     True
     """
+    nodes = None if nodes is None else index(nodes)
     if labels is not None or mask is not None:
         if isinstance(image, Content):
             raise InputError(

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import edge_pairs, facet_areas, volumes
 from tetopt.geometry.topology import Facets, facets, linked
+from tetopt.system.arrays import simplex_arrays, unmasked
 
 # The facet opposite each local node, its nodes turned to face out of a positively oriented cell.
 OUTWARD_FACETS = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
@@ -139,6 +140,7 @@ def extract_surface(
     >>> surface = tetopt.extract_surface(mesh.points, mesh.cells, is_ball)
     >>> tetopt.save_surface("ball.stl", surface)
     """
+    points, cells = simplex_arrays("extract_surface:", points, cells)
     skin = _skin(points, _chosen_cells(points, cells, chosen))
     fan = _fans(skin.partner)
     at = np.empty((fan.max() + 1, 3))
@@ -160,7 +162,7 @@ def _chosen_cells(points: NDArray, cells: NDArray, chosen: ArrayLike) -> NDArray
             f"surface: expected tetrahedra in space, got cells of {cells.shape[1]} nodes; mesh a "
             "3-D image"
         )
-    chosen = np.asarray(chosen)
+    chosen = unmasked("surface", chosen)
     if chosen.dtype == np.bool_:
         if chosen.shape != (len(cells),):
             raise InputError(

@@ -21,8 +21,8 @@ from numpy.typing import ArrayLike, NDArray
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import oriented
 from tetopt.interop.notebook import in_kernel
+from tetopt.system.arrays import unmasked
 from tetopt.system.extras import install_hint
-from tetopt.system.public import unmasked
 
 if TYPE_CHECKING:
     from vtkmodules.vtkCommonDataModel import vtkFieldData, vtkUnstructuredGrid

@@ -20,7 +20,7 @@ from tetopt.io.text import plain
 from tetopt.io.vtk import LEGACY_VERSION, written_bytes, xml_bytes
 from tetopt.model.model import SPACES, STRESS_UNITS, Model, half_turn
 from tetopt.model.sets import MOST_LETTERS, SET_NAME
-from tetopt.system.public import checked_simplices
+from tetopt.system.arrays import simplex_arrays
 
 if TYPE_CHECKING:
     import pyvista
@@ -117,7 +117,7 @@ def _checked(path: Path, surface: Surface, labels: Labels | None) -> tuple[Surfa
     """Return the surface and labels as arrays; InputError for triangles or labels that do not
     fit.
     """
-    points, triangles = checked_simplices(f"{path}: surface", surface.points, surface.triangles, 3)
+    points, triangles = simplex_arrays(f"{path}: surface", surface.points, surface.triangles, 3)
     if points.shape[1] != 3:
         raise InputError(f"{path}: expected points in space, got shape {points.shape}")
     arrays, range_ = checked_fields(f"{path}: labels", labels, len(triangles)), np.iinfo(np.int32)

@@ -21,9 +21,9 @@ from tetopt.job.options import JobOptions, SizeOptions, kinds_of, near_hint, opt
 from tetopt.job.plan import resolved
 from tetopt.model.mappings import MAPPED_OPTIONS
 from tetopt.system.incoming import json_of
-from tetopt.system.public import LARGEST_INTEGER
 
 Record = TypeVar("Record")
+LARGEST_INTEGER = 2**63 - 1  # numpy's largest: no count here exceeds it
 FIRST = ("images", "output", "nodes", "mask", "labels", *kinds_of(SizeOptions))  # as users set them
 SHOWN_LETTERS = 80  # characters of a value in a message
 UNIT_WORDS = {"MM": " in mm", "GB": " in GB", "S": " in seconds"}  # units of numbers, by metavar

@@ -37,6 +37,7 @@ from tetopt.geometry.simplex import centroids, volumes
 from tetopt.geometry.topology import Facets, components, facets, lexicographic_order
 from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
+from tetopt.system.arrays import unmasked
 from tetopt.system.kernel_cache import njit
 from tetopt.system.slabs import over_slabs, sum_over_slabs
 
@@ -725,7 +726,7 @@ def checked_cell_labels(of_cell: ArrayLike, mesh: Mesh) -> NDArray[np.int64]:
     """One label for each cell, (M,) int64; raise InputError unless all are whole numbers from 0
     to `LARGEST_LABEL`.
     """
-    values = np.asarray(of_cell)
+    values = unmasked("of_cell", of_cell)
     if values.shape != (len(mesh.cells),):
         raise InputError(
             f"of_cell: expected one label for each of the mesh's {len(mesh.cells)} cells, got "

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from tetopt.geometry.quadratic import curved_volumes, quadratic
 from tetopt.geometry.simplex import Cells, Points, dihedral_angles, rho, squared_edges, volumes
 from tetopt.interop import notebook
+from tetopt.system.arrays import simplex_arrays
 
 BAD_SHAPE = 0.3  # n rho below which a cell counts as bad: 1 is the regular simplex
 SHORT_EDGE = 0.25  # of the longest: a shorter edge makes a flat cell a wedge
@@ -254,6 +255,7 @@ def quality(points: Points, cells: Cells, midpoints: Points | None = None) -> Qu
     >>> numbers.n_nodes, numbers.min_dihedral > 12
     (300, True)
     """
+    points, cells = simplex_arrays("quality:", points, cells)
     n = points.shape[1]
     # Block by block, as the temporaries take 600 bytes per cell.
     blocks = [

@@ -67,6 +67,7 @@ from tetopt.model.materials import (
 )
 from tetopt.model.model import Model
 from tetopt.model.sets import Box, Sets, box_of, box_text, standard_sets, with_requested
+from tetopt.system.arrays import unmasked
 
 
 def build_model(
@@ -437,7 +438,7 @@ def _values(
             "tetopt.ByLabel(dict)"
         )
     if not callable(mapping) and not isinstance(mapping, ByLabel) and np.ndim(mapping) < 2:
-        return np.asarray(mapping, dtype=np.float64)
+        return unmasked(name, mapping).astype(np.float64)
     if isinstance(mapping, ByLabel):
         return by_label(mapping, cells.labels, cells.names)
     if cells.image is not None:  # map each voxel, then average, as in Eq. (2)

@@ -93,7 +93,7 @@ def lattice_mesh(
         raise InputError("lattice: give exactly one of nodes, spacing and blocks")
     lengths = image.spacing * image.shape
     if nodes is not None:
-        blocks = near_cubes(kind, lengths, nodes)
+        blocks = near_cubes(kind, lengths, index(nodes))
     elif spacing is not None:
         blocks = _blocks_for_spacing(lengths, spacing)
     blocks = _checked_blocks(kind, blocks, n)

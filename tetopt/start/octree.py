@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from math import prod
+from operator import index
 from typing import NamedTuple
 
 import numpy as np
@@ -141,7 +142,7 @@ def octree_mesh(image: Image | Content, nodes: int, sizes: Sizes | None = None) 
     >>> numbers.n_nodes, round(numbers.max_edge / numbers.min_edge, 1)
     (303, 3.3)
     """
-    content = plain(image)
+    content, nodes = plain(image), index(nodes)
     limits = _block_limits(content, nodes, sizes)
     _check_enough(content, nodes, sizes, limits)
     mesh = _octree_within(content, nodes, limits)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from numbers import Real
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -146,6 +147,13 @@ class Sizes(NamedTuple):
         >>> sizes.at(place).tolist(), sizes.prepared(3).at(place).tolist()
         ([20.0], [14.0])
         """
+        names = ("smallest", "edge_size", "gradation", "coarsest", "longest")
+        lengths = {name: each for name in names if (each := getattr(self, name)) is not None}
+        if wrong := [name for name, each in lengths.items() if not isinstance(each, Real)]:
+            got = type(lengths[wrong[0]]).__name__
+            raise TypeError(f"sizes: {wrong[0]}: expected a number, got {got}")
+        plain: dict[str, Any] = {name: float(each) for name, each in lengths.items()}
+        self = self._replace(**plain)
         if not 0.0 <= self.smallest < np.inf:
             raise InputError(f"smallest: expected 0 mm or more, got {self.smallest}")
         for name, value in (("edge_size", self.edge_size), ("longest", self.longest)):
