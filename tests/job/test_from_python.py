@@ -11,12 +11,12 @@ from commands import exit_code, numbers_in
 
 import tetopt
 from tetopt import InputError
-from tetopt.job.convert import convert_file
+from tetopt.commands.boundary import SurfacePart, write_surface
+from tetopt.commands.conversion import convert_file
+from tetopt.commands.judgement import judge
+from tetopt.commands.simulation import solve_file
 from tetopt.job.events import listened
-from tetopt.job.judge import judge
 from tetopt.job.options import LabelledPart, ModelOptions, SolverOptions
-from tetopt.job.solve import solve_file
-from tetopt.job.surface import SurfacePart, write_surface
 from tetopt.system.files import save_json
 
 

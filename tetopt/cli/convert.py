@@ -9,12 +9,12 @@ from typing import Annotated
 from tetopt.cli.console import print_line, show_event
 from tetopt.cli.options import NumberOptions, mesh_and_image
 from tetopt.cli.solver import print_model
+from tetopt.commands.conversion import convert_file
+from tetopt.commands.voxel_fields import is_image_name, write_on_image
 from tetopt.errors import InputError
 from tetopt.io.formats import FORMATS, format_of
 from tetopt.io.images import OUTPUT_SUFFIXES
-from tetopt.job.convert import convert_file
 from tetopt.job.events import Event, listened
-from tetopt.job.on_image import is_image_name, write_on_image
 from tetopt.job.options import (
     LabelChoice,
     LabelledPart,

@@ -13,9 +13,9 @@ from rich.markup import escape
 from tetopt import InputError
 from tetopt.cli.console import print_table
 from tetopt.cli.options import FilesArgument, NumberOptions, mesh_and_image
+from tetopt.commands.simulation import PAPER_PERCENT, SolvedModel, solve_file
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.options import LabelledPart, ModelOptions, Option
-from tetopt.job.solve import PAPER_PERCENT, SolvedModel, solve_file
 from tetopt.model.mappings import ByLabel, parse_any_mapping
 from tetopt.report.tables import new_table, nodes_in_words
 from tetopt.system.files import checked_output

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from tetopt.cli.console import print_fidelity, print_line, print_table, print_verdict
 from tetopt.cli.options import FilesArgument, NumberOptions, mesh_and_image
-from tetopt.job.judge import Judgement, judge
+from tetopt.commands.judgement import Judgement, judge
 from tetopt.job.options import LabelNamesOption, MaskedPart, Option
 from tetopt.job.source import Source, whose_variance
 from tetopt.measure.fidelity import ImageFit

@@ -9,9 +9,9 @@ from rich.markup import escape
 
 from tetopt.cli.console import print_line, print_table
 from tetopt.cli.options import MeshArgument, NumberOptions
+from tetopt.commands.boundary import SurfacePart, write_surface
 from tetopt.io.surfaces import SURFACE_SUFFIXES
 from tetopt.job.options import Option
-from tetopt.job.surface import SurfacePart, write_surface
 from tetopt.report.tables import new_table
 from tetopt.system.files import checked_output
 

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import tetopt
+from tetopt.commands.beside import image_and_labels
 from tetopt.errors import InputError
 from tetopt.io.formats import save_mesh
 from tetopt.io.images import sha256
 from tetopt.job.events import note
-from tetopt.job.inputs import image_and_labels
 from tetopt.measure.fidelity import image_fit
 from tetopt.measure.quality import Quality, quality
 from tetopt.model.fields import cell_fields

@@ -6,13 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
+from tetopt.commands.beside import image_and_labels
 from tetopt.energy.sampling import cell_moments
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io.formats import save_mesh
 from tetopt.io.images import sha256
 from tetopt.job.events import note
-from tetopt.job.inputs import checked_outputs, image_and_labels, label_table
+from tetopt.job.inputs import checked_outputs, label_table
 from tetopt.measure.segmentation import thresholded
 from tetopt.model.fields import cell_fields
 from tetopt.model.labels import table_of_labels

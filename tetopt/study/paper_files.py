@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from tetopt.commands.beside import image_and_labels
 from tetopt.contents.labels import checked_labels
 from tetopt.contents.phantom import load_phantom
 from tetopt.energy.sampling import cell_moments, cell_of_voxel
@@ -21,7 +22,7 @@ from tetopt.image import Image
 from tetopt.io.images import sha256
 from tetopt.io.mni import mni_path, mni_tissue
 from tetopt.job.events import note
-from tetopt.job.inputs import checked_outputs, image_and_labels
+from tetopt.job.inputs import checked_outputs
 from tetopt.job.options import WHOLE_BOX
 from tetopt.measure.segmentation import dice, segment, thresholded
 from tetopt.mesh import Mesh

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.commands.beside import check_part, voxels_of
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io.formats import save_model
 from tetopt.io.images import sha256
 from tetopt.job.events import warning, warnings_heard
-from tetopt.job.inputs import check_part, read_mesh, voxels_of
+from tetopt.job.inputs import read_mesh
 from tetopt.job.model import (
     check_mapping_files,
     check_model_options,

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.commands.conversion import with_results
 from tetopt.contents.labels import is_label_map
 from tetopt.energy.sampling import overlap_of
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io.images import OUTPUT_SUFFIXES, save_image, save_voxels
-from tetopt.job.convert import with_results
 from tetopt.job.events import note, progress, warning
 from tetopt.job.inputs import read_companion, read_mesh
 from tetopt.job.options import VoxelOptions

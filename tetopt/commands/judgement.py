@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
+from tetopt.commands.beside import check_part
 from tetopt.contents.labels import LARGEST_LABEL
 from tetopt.energy.sampling import cell_moments
 from tetopt.engine.loop import MeshingResult
@@ -18,13 +19,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.check import check_mesh, manifold_problems, scaled_jacobians
 from tetopt.job.advice import Problem, agreed, sentences, tell, unmet
 from tetopt.job.events import warning
-from tetopt.job.inputs import (
-    check_part,
-    label_table,
-    read_companion,
-    read_mesh,
-    warn_of_other_image,
-)
+from tetopt.job.inputs import label_table, read_companion, read_mesh, warn_of_other_image
 from tetopt.job.options import WHOLE_IMAGE, ImagePart, MaskedPart, SourceOptions
 from tetopt.job.request import checksum
 from tetopt.job.source import Source, read_source

@@ -11,13 +11,14 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.commands.beside import cell_field
 from tetopt.errors import InputError
 from tetopt.geometry.manifold import OUTSIDE_LABEL, LabelSurfaces, label_surfaces, surface_ridges
 from tetopt.geometry.surface import Surface, extract_surface
 from tetopt.geometry.topology import facets, largest_component
 from tetopt.io.surfaces import LABELLED_SUFFIXES, SurfaceCheck, checked_surface, save_surface
 from tetopt.job.events import note, violated, warning
-from tetopt.job.inputs import cell_field, label_table, read_mesh
+from tetopt.job.inputs import label_table, read_mesh
 from tetopt.job.options import LabelNamesOption, Option, SpaceOption
 from tetopt.measure.fidelity import FacetSurface, surface_areas
 from tetopt.model.file import MeshFile

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.commands.beside import check_part, voxels_of
 from tetopt.contents.align import SMALL_COMPONENT_FRACTION
 from tetopt.errors import InputError
 from tetopt.geometry.check import check_unfolded
@@ -22,7 +23,7 @@ from tetopt.io.images import sha256
 from tetopt.io.text import counted
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.events import note, progress, warning, warnings_heard
-from tetopt.job.inputs import check_part, listed, read_mesh, voxels_of
+from tetopt.job.inputs import listed, read_mesh
 from tetopt.job.model import (
     check_mapping_files,
     check_solver_options,

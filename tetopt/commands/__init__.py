@@ -1,0 +1,1 @@
+"""What other commands than `tetopt mesh` do with a mesh's file."""
