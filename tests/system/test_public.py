@@ -85,7 +85,9 @@ def test_a_mesh_of_anything(arrays):
 
 
 @pytest.mark.parametrize(
-    "value", ["x.nii", Path("x.nii"), None, [1, 2], [[1, 2], [3]], 500, True, 10**5000, dict, {1}]
+    "value",
+    ["x.nii", Path("x.nii"), None, [1, 2], [[1, 2], [3]], 500, True, 10**5000, dict, {1}],
+    ids=lambda value: type(value).__name__,
 )
 def test_an_image_of_anything(value):
     with pytest.raises(tetopt.InputError, match="image data: "):
@@ -93,6 +95,8 @@ def test_an_image_of_anything(value):
 
 
 def test_hidden_numbers_of_masked_arrays_are_not_used():
+    labels = tetopt.Image(np.ones((6, 7, 8)))
+
     def masked(shape):
         return np.ma.masked_array(np.ones(shape), np.ones(shape))
 
@@ -102,7 +106,7 @@ def test_hidden_numbers_of_masked_arrays_are_not_used():
         lambda: tetopt.field_on_image(MESH, masked((4, 3)), IMAGE),
         lambda: tetopt.warped_image(MESH, masked((4, 3)), IMAGE),
         lambda: tetopt.build_model(MESH, young=masked(1)),
-        lambda: tetopt.label_contacts(IMAGE, MESH, masked(1)),
+        lambda: tetopt.label_contacts(labels, MESH, masked(1)),
     ):
         with pytest.raises(tetopt.InputError, match=r"got \d+ masked values"):
             call()
