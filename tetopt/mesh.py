@@ -111,8 +111,7 @@ class Mesh:
         return sizes
 
     def straight_pieces(self) -> tuple[Mesh, int]:
-        """Split cells with curved edges into straight ones, on which surfaces and overlaps are
-        measured.
+        """Split cells with curved edges into straight ones, for surfaces and overlaps.
 
         Returns
         -------
@@ -164,8 +163,7 @@ class Mesh:
         off_screen: bool | None = None,
         **look: Any,
     ) -> Any:
-        """Show the mesh in 3-D with pyvista, with straight edges: in a window, in a notebook, or as
-        a picture.
+        """Show the mesh in 3-D, with straight edges: in a window, in a notebook, or as a picture.
 
         Parameters
         ----------
@@ -221,8 +219,7 @@ class Mesh:
     def to_pyvista(
         self, cell_data: Fields | None = None, point_data: Fields | None = None
     ) -> pyvista.UnstructuredGrid:
-        """Convert the mesh to pyvista, with straight edges and data; a 2-D mesh lies in the plane z
-        = 0.
+        """Convert the mesh to pyvista, with straight edges and data; in 2-D at z = 0.
 
         Parameters
         ----------
@@ -288,8 +285,7 @@ class Mesh:
     def to_meshio(
         self, cell_data: Fields | None = None, point_data: Fields | None = None
     ) -> meshio.Mesh:
-        """Convert the mesh to meshio, with data, as one block of triangles or tetrahedra with
-        straight edges.
+        """Convert the mesh to meshio, with data, as one block of cells with straight edges.
 
         Parameters
         ----------
@@ -318,8 +314,7 @@ class Mesh:
 
     @classmethod
     def from_meshio(cls, mesh: meshio.Mesh) -> Mesh:
-        """Make a mesh of the tetrahedra of a meshio mesh, block by block; if it has none, of its
-        triangles.
+        """Make a mesh of the tetrahedra of a meshio mesh or, if it has none, of its triangles.
 
         Cells are chosen, reoriented and dropped as in `from_pyvista`.
 
@@ -370,8 +365,7 @@ class Mesh:
 
     @classmethod
     def from_skfem(cls, mesh: skfem.Mesh) -> Mesh:
-        """Make a mesh of a scikit-fem mesh of triangles or tetrahedra; quadratic cells keep only
-        their corners.
+        """Make a mesh of a scikit-fem mesh; quadratic cells keep only their corners.
 
         Cells are reoriented and nodes dropped as in `from_pyvista`.
 

@@ -44,8 +44,7 @@ LEAST_CLASS_FRACTION = 0.001
 
 
 def resample_mask(mask: Image, image: Image, name: str = "mask") -> Image:
-    """Resample a mask to the image's voxels: nearest neighbour by the affines if the grids differ,
-    0 outside its box.
+    """Resample a mask to the image's voxels by nearest neighbour; 0 outside its box.
 
     Parameters
     ----------
@@ -101,8 +100,7 @@ def resample_mask(mask: Image, image: Image, name: str = "mask") -> Image:
 def resample_labels(
     labels: Image, image: Image, name: str = "labels", *, may_miss: bool = False
 ) -> Image:
-    """Resample labels to the image's voxels: nearest neighbour by the affines if the grids differ,
-    0 outside their box.
+    """Resample labels to the image's voxels by nearest neighbour; 0 outside their box.
 
     Parameters
     ----------

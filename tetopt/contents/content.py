@@ -172,8 +172,7 @@ class Content(NamedTuple):
         return self.n_contrasts + (0 if self.codes is None else len(self.codes))
 
     def channel(self, number: int, part: tuple[slice, ...] = ()) -> NDArray:
-        """One channel, or a part of it; those of labels are computed, as each would take four bytes
-        a voxel.
+        """One channel, or a part of it; those of labels are computed on demand.
 
         Parameters
         ----------

@@ -159,8 +159,7 @@ def signed_distance(shape: Shape, points: ArrayLike) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, eq=False)
 class Phantom:
-    """A box with a background and shapes painted over it in order; the module's docstring describes
-    the file.
+    """A box with a background and shapes painted over it in order, as a file describes it.
 
     `load_phantom` makes phantoms and checks everything. Arrays are read-only.
 
@@ -328,8 +327,7 @@ class Phantom:
         seed: int | None = None,
         supersample: int = 4,
     ) -> PhantomVoxels:
-        """The voxels of `image`, rendered box by box on demand, so that they need not fit into
-        memory.
+        """The voxels of `image`, rendered box by box on demand.
 
         Parameters
         ----------

@@ -18,8 +18,7 @@ BYTE_SCALE, PERCENT = 255.0, 100.0  # whole numbers between them are probabiliti
 
 
 def resample_tissue(tissue: Image, image: Image, name: str = "tissue") -> Image:
-    """Return a tissue's probabilities on the image's voxels, interpolated linearly if their grid
-    differs.
+    """Return a tissue's probabilities on the image's voxels, interpolated linearly.
 
     Whole numbers with a maximum of 101 to 255, as in unscaled byte files, are divided by 255, with
     a warning.
@@ -59,8 +58,7 @@ def resample_tissue(tissue: Image, image: Image, name: str = "tissue") -> Image:
 
 
 def tissue_labels(tissues: Sequence[Image]) -> Image:
-    """Return the most probable tissue of each voxel: 1 to K in the given order, 0 where the
-    remainder to 1 is larger.
+    """Return the most probable tissue of each voxel: 1 to K, 0 where the remainder to 1 is larger.
 
     Warns of probabilities that sum to more than 1, and of tissues that are the most probable
     nowhere.

@@ -164,8 +164,7 @@ class MeshingResult(NamedTuple):
     order: int = 1
 
     def plot(self, values: ArrayLike | None = None, **options: Any) -> Any:
-        """Show the mesh in 3-D with pyvista, like `Mesh.plot`; by default in the colours of its
-        labels, if any.
+        """Show the mesh in 3-D with pyvista, like `Mesh.plot`; labels in their colours.
 
         A label has the colour of its number, as in all pictures and files; ``plot(result.labels,
         cmap="tab20")`` uses a colour map instead.

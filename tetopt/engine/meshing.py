@@ -121,8 +121,7 @@ def mesh_image(
     iterations: int | None = None,
     **options: Any,
 ) -> MeshingResult:
-    """Mesh an image's box with nodes where the image has detail; or make a uniform mesh, or improve
-    yours.
+    """Mesh an image's box with nodes where the image has detail; or uniformly, or improve a mesh.
 
     Parameters
     ----------

@@ -44,8 +44,7 @@ BALANCE_ROUNDING = 1e-12
 
 
 class Solution(NamedTuple):
-    """Solution of one step of a model, in mm, kPa, mN and uJ (in 2-D per mm of thickness) and the
-    model's axes.
+    """Solution of one step of a model in its axes; mm, kPa, mN and uJ (in 2-D per mm of thickness).
 
     Parameters
     ----------
@@ -407,8 +406,7 @@ class SolutionFields(NamedTuple):
 
 @on_one_blas_thread
 def solution_fields(mesh: Mesh, solution: Solution, step: int = 1) -> SolutionFields:
-    """Convert displacement, strain and stress to fields on cells (means) and nodes, for a mesh's
-    file.
+    """Convert displacement, strain and stress to fields on cells (means) and nodes of a mesh.
 
     Displacement is in mm; stress and von Mises stress are in kPa; tensors are stored row by row.
     Names for steps after the first end in "_step2" and so on.

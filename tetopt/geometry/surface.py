@@ -99,8 +99,7 @@ class _Sheets(NamedTuple):
 def extract_surface(
     points: NDArray[np.float64], cells: NDArray[np.integer], chosen: ArrayLike
 ) -> Surface:
-    """The boundary of the chosen tetrahedra: closed, two triangles at each edge, one fan at each
-    node.
+    """Boundary of tetrahedra: closed, two triangles at each edge, one fan at each node.
 
     Where chosen cells touch only in a node or an edge, the sheets of the surface are separated. The
     flattest keeps its place; the others move into the narrower of their two sides, the narrowest

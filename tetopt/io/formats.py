@@ -89,8 +89,7 @@ def register_format(
     has_node_moduli: bool = False,
     has_large: bool = False,
 ) -> None:
-    """Register a format for writing models in this process, for `save_model`, `run` and the
-    command.
+    """Register a format for `save_model`, `run` and the command, in this process.
 
     Parameters
     ----------
@@ -222,8 +221,7 @@ def save_mesh(
     point_data: dict[str, NDArray] | None = None,
     order: int = 1,
 ) -> None:
-    """Write a mesh and its data in the format of the file's suffix (`FORMATS`), whole or not at
-    all.
+    """Write a mesh and its data in the format of the file's suffix, whole or not at all.
 
     Points are in world coordinates, mm (RAS+); cells are positively oriented and of order 1 or 2.
     In VTK's formats each entry of `about` becomes a string in the field data, as JSON unless it is

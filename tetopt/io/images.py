@@ -254,8 +254,7 @@ def _sides_words(sides: Sequence[int]) -> str:
 
 
 def save_image(path: str | Path, image: Image) -> None:
-    """Write a NIfTI file (.nii or .nii.gz), whole or not at all, with the full affine as sform, in
-    mm; or OME-Zarr.
+    """Write NIfTI, with the full affine as sform, or OME-Zarr, in mm, whole or not at all.
 
     Whole numbers are stored as 8-, 16- or 32-bit integers if they fit, others as float32 or
     float64. An axis with more voxels than NIfTI-1 supports makes it a NIfTI-2 file.

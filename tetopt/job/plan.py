@@ -159,8 +159,7 @@ def stated_options(plan: Plan, ndim: int) -> dict[str, Any]:
 
 
 def plan(job: JobOptions) -> Plan:
-    """Plan a job: check it, and fill in the defaults that do not depend on the image; no voxel is
-    read.
+    """Check a job, and fill in defaults that do not depend on the image; no voxel is read.
 
     Parameters
     ----------

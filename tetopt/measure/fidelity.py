@@ -239,8 +239,7 @@ class MaskFidelity(NamedTuple):
 
 
 def cell_labels(labels: Image, mesh: Mesh) -> NDArray[np.int64]:
-    """The label of each cell: the most frequent one among its voxels, the smallest of equally
-    frequent ones.
+    """Label of each cell: the most frequent one of its voxels, the smallest of several.
 
     A cell without voxel centre has the label of the voxel nearest to its centroid.
 

@@ -122,8 +122,7 @@ class LabelInterface(NamedTuple):
 def label_interfaces(
     labels: Image, mesh: Mesh, of_cell: ArrayLike, mask: Image | None = None
 ) -> list[LabelInterface]:
-    """Measure the smoothness, connectivity and manifoldness of the surface of each label of an
-    image.
+    """Measure smoothness, connectivity and manifoldness of the surface of each label.
 
     Parameters
     ----------

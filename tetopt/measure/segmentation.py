@@ -22,8 +22,7 @@ from tetopt.mesh import Mesh
 
 
 def segment(image: Image | Content, mesh: Mesh, classes: int) -> Image:
-    """Segment an image into classes 0 to classes - 1 of increasing mean, from the classes of its
-    cells.
+    """Segment an image into classes, numbered by increasing mean from 0, by its cells.
 
     Parameters
     ----------

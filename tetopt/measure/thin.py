@@ -180,8 +180,7 @@ def _by_pair(
 def label_thickness(
     what: Content, mesh: Mesh, of_cell: ArrayLike
 ) -> dict[int, tuple[Thickness | None, Thickness | None]]:
-    """Measure the local thickness of each label, between its voxels' smooth surfaces and between
-    its cells' facets.
+    """Measure the local thickness of each label, of its voxels' smooth surfaces and of its cells.
 
     Parameters
     ----------

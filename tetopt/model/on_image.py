@@ -31,8 +31,7 @@ At = Literal["cells", "nodes"]
 def field_on_image(
     mesh: Mesh, values: ArrayLike, image: Image, *, at: At | None = None, outside: float = np.nan
 ) -> NDArray[np.float64]:
-    """Evaluate a field of a mesh, such as a solver's displacement, at the voxel centres of an
-    image.
+    """Evaluate a field of a mesh, such as a displacement, at the voxel centres of an image.
 
     Each voxel belongs to one cell, exactly as in sampling (`cell_of_voxel`). It gets the value of
     that cell or, for values at nodes, what the shape functions of order 1 or 2 give at its centre.

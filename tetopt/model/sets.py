@@ -45,8 +45,7 @@ RESERVED_NAME = re.compile(r"label_\d+|interface_.*|material_\d+|unnamed|all_cel
 
 
 class Sets(NamedTuple):
-    """Sets by name; all names differ by more than case, because some formats have one list of names
-    for everything.
+    """Sets by name; all names differ by more than case, as some formats have one list of names.
 
     Parameters
     ----------

@@ -36,8 +36,7 @@ MOST_ACROSS = 20.0  # cells across a label
 
 
 class LabelSize(NamedTuple):
-    """The size of a label's cells, mm: a length, or a multiple of the local thickness between
-    bounds.
+    """Size of a label's cells, mm: a length, or a bounded multiple of the local thickness.
 
     Parameters
     ----------

@@ -292,8 +292,7 @@ class Sizes(NamedTuple):
         return np.maximum(target, self.smallest)
 
     def around(self, points: NDArray, cells: NDArray) -> NDArray[np.float64]:
-        """The target at nodes; without one, the size that grows from other targets at the
-        gradation.
+        """The target at nodes; without one, the size that grows from other targets.
 
         Parameters
         ----------

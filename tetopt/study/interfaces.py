@@ -55,8 +55,7 @@ def interfaces(
     labels: Image | None = None,
     smoothing: float = 1.0,
 ) -> Surfaces:
-    """Extract all interfaces between the classes of an image, or between given labels, and the box
-    around them.
+    """Extract all interfaces between classes or labels of an image, and the box around them.
 
     Without labels: the volume is smoothed by a Gaussian of 0.75 voxel, exact multi-Otsu gives the
     thresholds of the classes, and each threshold's isosurface is an interface. They are level sets
