@@ -14,6 +14,7 @@ from tetopt.contents.noise import noise_level
 from tetopt.start import octree
 from tetopt.start.clip import lost_fraction
 from tetopt.start.octree import octree_mesh
+from tetopt.system import budget
 
 OBLIQUE = np.array(
     [[0.9, 0.3, 0.2, -7.0], [-0.25, 1.1, 0.1, 3.0], [0.0, 0.4, -1.5, 11.0], [0.0, 0.0, 0.0, 1.0]]
@@ -299,19 +300,6 @@ def test_a_wall_that_no_octree_keeps_has_the_one_that_loses_least():
     assert lost(content, octree_mesh(content, 600)) < octree.MOST_LOST
 
 
-def test_without_room_for_finer_octrees_the_initial_mesh_warns(monkeypatch):
-    def full(_, what, remedy):
-        if remedy == "use fewer nodes":  # of an octree finer than the first
-            raise tetopt.InputError(f"{what}: expected no more memory than there is; {remedy}")
-
-    content = shell(34, 13.0)
-    monkeypatch.setattr(octree, "check_memory", full)
-    with pytest.warns(
-        UserWarning, match="nodes: expected no more memory .* walls of the mask with fewer nodes"
-    ):
-        octree_mesh(content, 300)
-
-
 def test_a_mask_that_finer_octrees_hardly_keep_better_has_the_nearest_number_of_nodes(monkeypatch):
     content = shell(60, 25.0)
     monkeypatch.setattr(octree, "FINER_STEPS", 2)
@@ -320,16 +308,25 @@ def test_a_mask_that_finer_octrees_hardly_keep_better_has_the_nearest_number_of_
     np.testing.assert_array_equal(mesh.points, octree_mesh(content, 300).points)
 
 
-def test_the_memory_of_a_finer_octree_ends_the_search_not_the_run(monkeypatch):
-    content = shell(26, 9.0)
-    monkeypatch.setattr(octree, "bytes_of", lambda content, nodes: 1e18 * (nodes > 900))
-    mesh = octree_mesh(content, 200)
-    assert len(mesh.points) == 588  # of 314, 206, 514, 588 and 958
-    monkeypatch.setattr(
-        octree, "check_memory", lambda *words: (_ for _ in ()).throw(tetopt.InputError("no memory"))
-    )
-    with pytest.raises(tetopt.InputError, match="no memory"):
-        octree_mesh(content, 500)
+def test_the_same_mesh_at_half_of_the_free_memory_or_a_refusal(monkeypatch):
+    """Of a wall, for which finer octrees are tried: each of their steps that memory ends, ends all.
+
+    With a byte less than a step takes, no coarser octree stands in; with what the largest takes,
+    the mesh is that of all memory.
+    """
+    content, needs = shell(26, 9.0), set()
+    with monkeypatch.context() as patch:
+        patch.setattr(octree, "check_memory", lambda n_bytes, *words: needs.add(int(n_bytes)))
+        expected = octree_mesh(content, 200)
+    for need in sorted(needs):
+        monkeypatch.setattr(budget, "available_bytes", lambda need=need: need - 1)
+        with pytest.raises(tetopt.InputError, match=r"octree: .* of memory, but only"):
+            octree_mesh(content, 200)
+    for free in (max(needs) + 1, 2 * max(needs)):
+        monkeypatch.setattr(budget, "available_bytes", lambda free=free: free)
+        mesh = octree_mesh(content, 200)
+        assert mesh.points.tobytes() == expected.points.tobytes()
+        assert mesh.cells.tobytes() == expected.cells.tobytes()
 
 
 def test_a_run_that_loses_a_wall_asks_for_more_nodes(monkeypatch):

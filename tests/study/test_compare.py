@@ -120,19 +120,6 @@ def test_numbers_are_those_of_the_meshes(run, head):
                 assert row["volume"] == pytest.approx((true == row["label"]).sum() * 4.0**3)
 
 
-def test_the_reference_is_as_fine_as_memory_allows(monkeypatch):
-    """The default where there is room, less of it with a note where there is not."""
-    said = []
-    monkeypatch.setattr(compare, "note", said.append)
-    for free, dofs in ((10**12, 300_000), (480_000_000, 80_000), (0, 1_000)):
-        monkeypatch.setattr(compare, "available_bytes", lambda free=free: free)
-        assert compare.default_dofs() == dofs
-    assert said == [
-        "reference: 80000 instead of 300000 unknowns, as only 0.48 GB is free",
-        "reference: 1000 instead of 300000 unknowns, as only 0 MB is free",
-    ]
-
-
 def test_a_cell_without_a_label_of_its_own_has_that_of_most_voxels(head):
     image, labels = (tetopt.load_image(head / name) for name in ("image.nii.gz", "labels.nii.gz"))
     mapping, _ = compare.default_mapping(image)

@@ -11,10 +11,7 @@ import pytest
 from attacks import KINDS, content, outside, planted
 
 from tetopt.errors import InputError
-from tetopt.system.files import save_text
-from tetopt.system.work_directory import check, create, discard, locked
-
-NAMES = ("state.json", "mesh-*.npz")
+from tetopt.system.work_directory import check, create, locked
 
 
 @pytest.fixture
@@ -83,32 +80,6 @@ def test_runs_of_other_keys_share_it(work):
             with pytest.raises(InputError, match=f"^{work}: {words}"), locked(work, keys):
                 pass
     assert (work / "tetopt-lock").read_text() == (work / "b.lock").read_text() == ""
-
-
-def test_what_is_removed_is_tetopts(work, monkeypatch):
-    """With what a killed run was writing; a link leads nowhere."""
-    elsewhere = outside(work.parent)
-    with monkeypatch.context() as patch:
-        patch.setattr("os.unlink", lambda *_: None)
-        patch.setattr("os.replace", lambda *_: 1 / 0)
-        with pytest.raises(ZeroDivisionError):
-            save_text(work / "mesh-2.npz", "half")
-    (work / "mesh-3.npz").symlink_to(elsewhere / "notes.txt")
-    assert len(content(work)) == 4
-    mine = {"thesis.txt": b"mine", ".thesis.txt.12345678.txt": b"half", "mesh-4.npz": stat.S_IFDIR}
-    (work / "thesis.txt").write_text("mine")
-    (work / ".thesis.txt.12345678.txt").write_text("half")
-    (work / "mesh-4.npz").mkdir()
-    before = content(elsewhere)
-    assert discard(work, NAMES) == sorted(mine)
-    assert content(work) == {**mine, "tetopt-lock": b""}
-    assert content(elsewhere) == before
-    check(work)
-    (work / "thesis.txt").unlink()
-    (work / ".thesis.txt.12345678.txt").unlink()
-    (work / "mesh-4.npz").rmdir()
-    assert discard(work, NAMES) == []
-    assert not work.exists()
 
 
 def test_a_lock_that_is_a_link_empties_no_file(work, tmp_path):

@@ -78,6 +78,7 @@ _NIBABEL_HEADER_ERRORS = (
     OverflowError,
     MGHError,
 )
+PLANES_BYTES = 2**28  # of an uncompressed file, read at a time for a crop of it
 GZIP_LEVEL = 1  # nibabel's compression level
 MOST_OF_NIFTI_1 = 32767  # voxels along an axis, of 16 bits; NIfTI-2 allows more
 HEAD_BYTES_NIFTI = 1024  # read from a file: the longest header has 540
@@ -180,6 +181,13 @@ def load_image(
             level = zarr_levels(path, notes)[0]
             check_spacing(spacing_mm, np.linalg.norm(level.affine[:3, :3], axis=0))
             image = _part_of_zarr(level, volume, slice_, crop, notes)
+        elif (
+            crop is not None
+            and slice_ is None
+            and check_beginning(path).endswith(_NIBABEL_SUFFIXES)
+        ):
+            image = _crop_of_nibabel(path, volume, crop, notes)
+            check_spacing(spacing_mm, image.spacing)
         else:
             image = part_of(Image(*_read(path, volume, notes, spacing_mm)), slice_, crop)
     except InputError as error:
@@ -675,6 +683,34 @@ def _read_nibabel(
     if data.ndim == 2:
         return data, _plane_affine(affine[:3, :2], affine[:3, 3])
     return data, affine
+
+
+def _crop_of_nibabel(path: Path, volume: int | None, crop: Bounds, notes: list[str]) -> Image:
+    """Return a crop of a file, of which only its planes are read, some at a time."""
+    proxy, index, affine = nibabel_voxels(path, volume, notes)
+    if len(proxy.shape) < 3:
+        return part_of(Image(*_read_nibabel(path, volume, [])), None, crop)
+    bounds = checked_bounds(tuple(proxy.shape[:3]), crop)
+    check_room([stop - start for start, stop in bounds], proxy.dtype.itemsize)
+    *within, (first, last) = bounds
+    box = tuple(slice(*ends) for ends in within)
+    n_planes = max(PLANES_BYTES // (math.prod(proxy.shape[:2]) * proxy.dtype.itemsize), 1)
+    if path.name.lower().endswith((".gz", ".mgz")):  # read from its beginning each time
+        n_planes = last - first
+        check_room((*proxy.shape[:2], n_planes), proxy.dtype.itemsize)
+    try:
+        parts = [
+            np.asanyarray(
+                proxy[(slice(None), slice(None), slice(k, min(k + n_planes, last)), *index)]
+            )[box]
+            for k in range(first, last, n_planes)
+        ]
+    except MemoryError as error:
+        raise InputError("its voxels do not fit into memory; crop it to fewer") from error
+    except (OSError, EOFError, zlib.error, ValueError, TypeError, OverflowError) as error:
+        raise InputError(f"{DAMAGED_FILE} ({one_line(error)})") from error
+    data = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=2)
+    return Image(data, shifted_affine(affine, [start for start, _ in bounds]))
 
 
 # By suffix; each returns data and affine for a path and a volume, and adds notes.

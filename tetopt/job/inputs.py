@@ -59,7 +59,6 @@ from tetopt.model.labels import (
 )
 from tetopt.model.mappings import named_file
 from tetopt.start.label_sizes import EVERY_LABEL, LabelSize, parse_label_sizes
-from tetopt.system.budget import available_bytes, memory_words
 from tetopt.system.files import checked_output
 from tetopt.system.incoming import rows_of
 
@@ -67,7 +66,8 @@ from tetopt.system.incoming import rows_of
 OUTSIDE_FRACTION = 0.02
 # headings of the column of sizes in a table
 SIZE_HEADS = ("size", "size_mm", "mm", "edge", "length")
-DIVIDED_BYTES = 300.0  # per voxel of a run with labels, measured
+# voxels, chosen: a run with labels takes 300 bytes per voxel, so up to 20 GB
+MOST_DIVIDED = 2**26
 MASK_LABELS_LISTED = 20  # in a message
 NAMES_LISTED = 8  # as many as fit on a line
 
@@ -152,15 +152,15 @@ def warn_of_other_world(path: Path, other: Path) -> None:
 
 
 def _divisions(image: Image, others: Mapping[Path, Image], across: int | None) -> tuple[int, ...]:
-    """Return the parts of the image's voxels along each axis, with a message; fewer if memory is
-    short.
+    """Return the parts of the image's voxels along each axis, with a message; fewer if there
+    would be more than `MOST_DIVIDED`.
 
     Voxels are not divided along the axis `across` a slice.
     """
     finer = {path: other for path, other in others.items() if other.ndim == image.ndim}
     needed = [1 if axis == across else k for axis, k in enumerate(divisions(image, finer.values()))]
-    factors, n_free = list(needed), available_bytes()
-    while max(factors) > 1 and DIVIDED_BYTES * prod((*image.shape, *factors)) > n_free:
+    factors = list(needed)
+    while max(factors) > 1 and prod((*image.shape, *factors)) > MOST_DIVIDED:
         factors[int(np.argmax(factors))] -= 1
     if max(needed) > 1:
         names = listed(
@@ -169,7 +169,7 @@ def _divisions(image: Image, others: Mapping[Path, Image], across: int | None) -
         note(
             f"{names}: finer than the image, whose voxels are divided by {_times(factors)}"
             + (
-                f" instead of {_times(needed)}, as only {memory_words(n_free)} of memory are free"
+                f" instead of {_times(needed)}, for at most {MOST_DIVIDED} voxels"
                 * (factors != needed)
             )
         )

@@ -30,13 +30,12 @@ from numpy.typing import NDArray
 from tetopt.contents.content import Content, plain
 from tetopt.contents.domain import Region
 from tetopt.contents.smoothing import largest_around
-from tetopt.errors import InputError, warn
+from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.clip import clipped, lost_fraction
 from tetopt.start.lattice import MAX_NODES, near_cubes
 from tetopt.start.leaves import leaf_cells, leaf_nodes
-from tetopt.start.memory import bytes_of
 from tetopt.start.sizes import (
     LONGEST_IN_BLOCK,
     NO_BOUND_MM,
@@ -47,7 +46,7 @@ from tetopt.start.sizes import (
     equilateral_nodes,
 )
 from tetopt.start.sums import BlockSums, Channels, block_starts, block_sums, channels_of, halved
-from tetopt.system.budget import at_most, check_memory
+from tetopt.system.budget import MemoryShortage, at_most, check_memory
 
 # Ratios of the undivided blocks' nodes to the requested number, tried in turn, the largest blocks
 # first.
@@ -69,7 +68,6 @@ FINER_STEPS, FINER_RATIO = 5, 1.5
 # but more than the other, as of a rough mask, finer cells are no remedy; a single one loses a wall
 # by chance, as coarse ones do
 SMALL_LOSS, STALLED_FRACTION, STALLED_STEPS = 0.1, 0.9, 2
-MOST_WALL_NODES = 300_000  # of an octree in that search, which takes seconds
 # of what the first octree loses: if a finer one loses no less, it is not worth its nodes
 LESS_LOST = 0.5
 ALWAYS_ALLOWED_NODES = 5000  # allowed even on images with fewer voxels
@@ -310,13 +308,10 @@ def _octree_within(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
     """
     if content.region is None:
         return _octree_of_box(content, nodes, limits)
-    walled = _walled(content, nodes, limits)
-    if walled.shortage:
-        warn(
-            f"{walled.shortage}: the initial mesh has walls of the mask with fewer nodes than it "
-            "would have"
-        )
-    return walled.mesh
+    tried = _finer_octrees(content, nodes, limits, content.region)
+    first = next(tried)
+    least = min(tried, key=lambda octree: octree.lost, default=first)
+    return (least if least.lost <= max(MOST_LOST, LESS_LOST * first.lost) else first).mesh
 
 
 class _Tried(NamedTuple):
@@ -324,27 +319,12 @@ class _Tried(NamedTuple):
 
     mesh: Mesh
     lost: float  # fraction of the mask's volume
-    # what ended the search for one that loses less, if memory or the number of voxels did
-    shortage: str = ""
-
-
-def _walled(content: Content, nodes: int, limits: _BlockLimits) -> _Tried:
-    """`_octree_within` a mask, and what it loses."""
-    assert content.region is not None
-    tried = _finer_octrees(content, nodes, limits, content.region)
-    first = least = last = next(tried)
-    for last in tried:
-        least = min(least, last, key=lambda octree: octree.lost)
-    best = least if least.lost <= max(MOST_LOST, LESS_LOST * first.lost) else first
-    return best._replace(shortage=last.shortage)
 
 
 def _finer_octrees(
     content: Content, nodes: int, limits: _BlockLimits, region: Region
 ) -> Iterator[_Tried]:
-    """Octrees of ever more nodes, while they lose walls, but less than all before, and memory
-    suffices.
-    """
+    """Octrees of ever more nodes, while they lose walls, but less than all before."""
     # The leaves that the region touches have about as many nodes, to a few per cent, as the clipped
     # mesh.
     limits, least, n_stalled = _lighter(content, nodes, limits), np.inf, 0
@@ -355,16 +335,11 @@ def _finer_octrees(
             mesh = _clipped_octree(
                 content, round(nodes * ratio), limits._replace(largest=largest), region
             )
-            if step > 0:
-                check_memory(
-                    bytes_of(content, len(mesh.points)),
-                    f"octree: {len(mesh.points)} nodes",
-                    "use fewer nodes",
-                )
-        except InputError as error:
+        except MemoryShortage:  # or the mesh would depend on free memory
+            raise
+        except InputError:  # cells would be smaller than voxels
             if step == 0:
                 raise
-            yield _Tried(mesh, np.inf, str(error))  # the mesh before, or one without room
             return
         lost = lost_fraction(mesh, content.image, region)
         yield _Tried(mesh, lost)
@@ -381,8 +356,8 @@ def _clipped_octree(content: Content, nodes: int, limits: _BlockLimits, region: 
     for trial in range(MASK_TRIALS):
         try:
             tree = _octree_of_box(content, in_box, limits)
-        except InputError:  # too many nodes for memory
-            if not nearest:
+        except InputError as error:  # cells would be smaller than voxels
+            if not nearest or isinstance(error, MemoryShortage):
                 raise
             break
         try:

@@ -21,7 +21,6 @@ from tetopt.energy.sampling import cell_moments, cell_of_voxel
 from tetopt.errors import InputError
 from tetopt.fem.conditioning import conditioning
 from tetopt.fem.elasticity import box_faces, check_fills_box, compression, push_of
-from tetopt.fem.hexahedra import DOF_BYTES
 from tetopt.fem.reference import (
     Reference,
     averaged,
@@ -46,11 +45,8 @@ from tetopt.study.child import Outcome, run_in_child
 from tetopt.study.compare_report import Measurement, Report, Settings
 from tetopt.study.pipelines import PIPELINES, UNTIMED_STEPS, Pipeline, PipelineInput
 from tetopt.study.program import pipelines_with
-from tetopt.system.budget import available_bytes, memory_words
 
 DEFAULT_REFERENCE_DOFS = 300_000  # 1.4 GB, and 2.5 minutes for both of `Settings.nus`
-LEAST_REFERENCE_DOFS = 1_000  # minimum, however little memory is free
-FREE_FRACTION = 0.8  # usable fraction of the free memory
 
 
 class Comparison(NamedTuple):
@@ -106,7 +102,7 @@ def prepared(image: Image, labels: Image, mapping: ModulusMapping, settings: Set
         As `tetopt.model.mappings.young_from` and `tetopt.fem.reference.reference`.
     """
     fine = young_image(image, mapping)
-    dofs = settings.reference_dofs or default_dofs()
+    dofs = settings.reference_dofs or DEFAULT_REFERENCE_DOFS
     modulus = averaged(fine, reference_shape(image.shape, image.spacing, dofs))
     references = {}
     for nu in settings.nus:
@@ -122,22 +118,6 @@ def prepared(image: Image, labels: Image, mapping: ModulusMapping, settings: Set
         settings.average,
         dofs,
     )
-
-
-def default_dofs() -> int:
-    """Return the size of the reference if none is set: less than the default only if too little
-    memory is free.
-    """
-    free = available_bytes()
-    dofs = max(
-        LEAST_REFERENCE_DOFS, min(DEFAULT_REFERENCE_DOFS, int(FREE_FRACTION * free / DOF_BYTES))
-    )
-    if dofs < DEFAULT_REFERENCE_DOFS:
-        note(
-            f"reference: {dofs} instead of {DEFAULT_REFERENCE_DOFS} unknowns, as only "
-            f"{memory_words(free)} is free"
-        )
-    return dofs
 
 
 # Measures of one mesh.

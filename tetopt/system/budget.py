@@ -32,6 +32,10 @@ GROUP_FOLDER = Path("/sys/fs/cgroup")
 UNLIMITED_BYTES = 1 << 60  # control groups write "no limit" as a number near 2^63
 
 
+class MemoryShortage(InputError):
+    """A step needs more memory than is free."""
+
+
 def memory_words(n_bytes: float) -> str:
     """Format a number of bytes."""
     return f"{n_bytes / BYTES_PER_GB:.3g} GB" if n_bytes >= 1e8 else f"{n_bytes / 1e6:.3g} MB"
@@ -48,7 +52,7 @@ def at_most(count: float, noun: str = "") -> str:
 def check_memory(
     n_bytes: float, what: str, advice: str | Callable[[float], str], limit: float | None = None
 ) -> None:
-    """Raise InputError if the next step needs more memory than is available, or than `limit`,
+    """Raise `MemoryShortage` if the next step needs more memory than is available, or than `limit`,
     bytes.
 
     Parameters
@@ -65,12 +69,12 @@ def check_memory(
     free, room = available_bytes(), inf if limit is None else limit - resident_bytes()
     remedy = advice(min(free, room)) if callable(advice) else advice
     if n_bytes > free:
-        raise InputError(
+        raise MemoryShortage(
             f"{what}: needs about {memory_words(n_bytes)} of memory, but only "
             f"{memory_words(free)} is free; {remedy}"
         )
     if limit is not None and n_bytes > room:
-        raise InputError(
+        raise MemoryShortage(
             f"{what}: needs about {memory_words(n_bytes + limit - room)} of memory in total, but "
             f"only {memory_words(limit)} is allowed; {remedy}"
         )

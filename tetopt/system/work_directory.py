@@ -1,8 +1,5 @@
-"""Work directories: the folders of unfinished runs, made by tetopt, for its owner alone and for one
-run at a time.
-
-A cohort (OUT/.work) and a mesh in parts (MESH.work) each have one. Its lock file tells it from a
-folder of the user's.
+"""Work directories: the folders of unfinished cohorts (OUT/.work), made by tetopt for its owner
+alone. A lock file tells one from a folder of the user's.
 """
 
 from __future__ import annotations
@@ -85,20 +82,3 @@ def _lock(stack: ExitStack, path: Path, what: str, *, is_shared: bool) -> None:
         stack.callback(stream.truncate, 0)
         stream.write(f"process {os.getpid()} on {socket.gethostname()}\n")
         stream.flush()
-
-
-def discard(path: Path, names: Sequence[str]) -> list[str]:
-    """Remove tetopt's files, by patterns of their names, and the folder; return the names of
-    others, which stay.
-    """
-    for name in names:
-        # the second: a killed run was writing it, see `written_whole`
-        for pattern in (name, f".{name}.????????.*"):
-            for file in path.glob(pattern):
-                if not file.is_dir():
-                    file.unlink(missing_ok=True)
-    others = sorted(file.name for file in path.iterdir() if file.name != WORK_LOCK_NAME)
-    if not others:
-        (path / WORK_LOCK_NAME).unlink(missing_ok=True)
-        path.rmdir()
-    return others
