@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from meshes import TWO_TRIANGLES, delaunay_box, random_affine, random_rotation, split_box
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial import Delaunay
 
 from tetopt import Image, InputError, Mesh, cell_moments, cell_of_voxel, lattice_mesh
@@ -67,7 +68,7 @@ def test_centres_on_the_diagonal_of_a_square_go_up(size):
     image = Image(np.zeros((size, size)))
     mesh = placed(image, TWO_TRIANGLES[0] * size - 0.5, TWO_TRIANGLES[1])
     i, j = np.indices((size, size))
-    np.testing.assert_array_equal(cell_of_voxel(image, mesh), np.where(j >= i, 0, 1))
+    assert_array_equal(cell_of_voxel(image, mesh), np.where(j >= i, 0, 1))
 
 
 def test_centres_on_the_walls_of_a_cube_s_six_cells():
@@ -107,13 +108,13 @@ def test_a_centre_on_a_node_goes_to_one_of_its_cells(n):
 def test_owners_on_snapped_meshes_are_the_twin_s(seed, n):
     """Nodes on centres, corners and halves of voxels: every kind of tie."""
     image, mesh = random_case(seed, n, is_snapped=True)
-    np.testing.assert_array_equal(cell_of_voxel(image, mesh), naive.cell_of_voxel(image, mesh))
+    assert_array_equal(cell_of_voxel(image, mesh), naive.cell_of_voxel(image, mesh))
 
 
 @given(seeds, dimensions)
 def test_owners_on_random_meshes_are_the_twin_s(seed, n):
     image, mesh = random_case(seed, n, is_snapped=False)
-    np.testing.assert_array_equal(cell_of_voxel(image, mesh), naive.cell_of_voxel(image, mesh))
+    assert_array_equal(cell_of_voxel(image, mesh), naive.cell_of_voxel(image, mesh))
 
 
 @pytest.mark.parametrize("shape", [(3, 90), (90, 4), (40, 50), (14, 12, 16), (2, 3, 90)])
@@ -124,7 +125,7 @@ def test_owners_with_ties_that_floats_get_wrong_are_the_twin_s(shape):
     rng = np.random.default_rng(2)
     image = Image(np.zeros(shape))
     mesh = placed(image, *split_box(rng, shape, 5 if len(shape) == 3 else 12, 1))
-    np.testing.assert_array_equal(cell_of_voxel(image, mesh), naive.cell_of_voxel(image, mesh))
+    assert_array_equal(cell_of_voxel(image, mesh), naive.cell_of_voxel(image, mesh))
 
 
 @pytest.mark.parametrize(("i", "j"), [(50, 14), (14, 50), (50, 28), (49, 21), (6, 9)])
@@ -140,7 +141,7 @@ def test_owners_on_a_line_between_centres_are_the_twin_s(n, i, j):
     else:
         points = np.vstack([np.column_stack([corners, np.full(4, -0.5)]), [[0, 0, 2.5]]])
         mesh = placed(image, points, np.array([[0, 1, 2, 4], [0, 3, 1, 4]]))
-    np.testing.assert_array_equal(cell_of_voxel(image, mesh), naive.cell_of_voxel(image, mesh))
+    assert_array_equal(cell_of_voxel(image, mesh), naive.cell_of_voxel(image, mesh))
 
 
 @given(seeds, dimensions)
@@ -159,7 +160,7 @@ def test_owners_near_a_tie_are_the_twin_s(seed, n):
         if (orientations(to_ticks(moved, grid), cells) == 1).all():
             index = moved
     mesh = placed(image, index, cells)
-    np.testing.assert_array_equal(cell_of_voxel(image, mesh), naive.cell_of_voxel(image, mesh))
+    assert_array_equal(cell_of_voxel(image, mesh), naive.cell_of_voxel(image, mesh))
 
 
 @given(seeds, dimensions)
@@ -176,7 +177,7 @@ def test_owners_in_cells_far_larger_than_the_image_are_the_twin_s(seed, n):
         owner = cell_of_voxel(image, mesh)
     except InputError:
         return  # a cell flat to within a tick
-    np.testing.assert_array_equal(owner, naive.cell_of_voxel(image, mesh))
+    assert_array_equal(owner, naive.cell_of_voxel(image, mesh))
 
 
 @given(seeds, dimensions)
@@ -219,9 +220,7 @@ def test_counts_and_sums_are_the_image_s(seed, n, is_snapped):
     owner = cell_of_voxel(image, mesh)
     assert moments.n_voxels.sum() == image.data.size
     assert (owner >= 0).all()
-    np.testing.assert_array_equal(
-        np.bincount(owner.ravel(), minlength=len(mesh.cells)), moments.n_voxels
-    )
+    assert_array_equal(np.bincount(owner.ravel(), minlength=len(mesh.cells)), moments.n_voxels)
     data = image.data.astype(np.float64)
     assert moments.n_voxels @ moments.mean == pytest.approx(data.sum(), rel=1e-12)
     squares = moments.n_voxels @ (moments.variance + moments.mean**2)
@@ -236,7 +235,7 @@ def test_counts_with_more_cells_than_voxels():
     moments = cell_moments(image, mesh)
     assert moments.n_voxels.sum() == 12
     assert (moments.n_voxels == 0).sum() >= len(mesh.cells) - 12
-    np.testing.assert_array_equal(cell_of_voxel(image, mesh), naive.cell_of_voxel(image, mesh))
+    assert_array_equal(cell_of_voxel(image, mesh), naive.cell_of_voxel(image, mesh))
 
 
 def test_counts_on_a_long_thin_image():
@@ -257,10 +256,10 @@ def test_moment_sums_are_the_twin_s(seed, n, is_snapped):
     grid = sampling_grid(image, mesh.points)
     sums = moment_sums(grid, to_ticks(image.to_index(mesh.points), grid), mesh.cells)
     twin = naive.moment_sums(image, naive.cell_of_voxel(image, mesh), len(mesh.cells), grid.shift)
-    np.testing.assert_array_equal(sums[:, 0], twin[:, 0])
+    assert_array_equal(sums[:, 0], twin[:, 0])
     if np.array_equal(np.rint(image.data), image.data):
-        np.testing.assert_array_equal(sums, twin)
-    np.testing.assert_allclose(sums, twin, rtol=1e-12, atol=1e-9)
+        assert_array_equal(sums, twin)
+    assert_allclose(sums, twin, rtol=1e-12, atol=1e-9)
 
 
 @pytest.mark.parametrize("high", [1, 46340, 92681, 92682, 3_000_001, 2.0**40, 0.5, 1e-30])
@@ -275,7 +274,7 @@ def test_moment_sums_of_all_sizes_of_numbers(high):
     grid = sampling_grid(image, mesh.points)
     sums = moment_sums(grid, to_ticks(image.to_index(mesh.points), grid), mesh.cells)
     twin = naive.moment_sums(image, naive.cell_of_voxel(image, mesh), len(mesh.cells), grid.shift)
-    np.testing.assert_allclose(sums, twin, rtol=1e-14, atol=1e-14 * high**2)
+    assert_allclose(sums, twin, rtol=1e-14, atol=1e-14 * high**2)
 
 
 @given(seeds, dimensions, st.booleans())
@@ -345,7 +344,7 @@ def test_cells_without_voxel_centres_have_the_centroid_s_value(seed, n):
     index = image.to_index(mesh.points[mesh.cells].mean(axis=1))
     nearest = np.clip(np.rint(index).astype(int), 0, np.array(image.shape) - 1)
     expected = np.array([image.data[tuple(voxel)] for voxel in nearest], dtype=np.float64)
-    np.testing.assert_array_equal(moments.mean[is_empty], expected[is_empty])
+    assert_array_equal(moments.mean[is_empty], expected[is_empty])
     assert (moments.variance[is_empty] == 0).all()
 
 
@@ -364,18 +363,16 @@ def test_a_mesh_partly_outside_counts_what_is_inside(seed, n):
     shift = rng.integers(-6, 7, n) / 2
     mesh = placed(image, index + shift, cells)
     owner = cell_of_voxel(image, mesh)
-    np.testing.assert_array_equal(owner, naive.cell_of_voxel(image, mesh))
+    assert_array_equal(owner, naive.cell_of_voxel(image, mesh))
     moments = cell_moments(image, mesh)
-    np.testing.assert_array_equal(
-        moments.n_voxels, np.bincount(owner[owner >= 0], minlength=len(cells))
-    )
+    assert_array_equal(moments.n_voxels, np.bincount(owner[owner >= 0], minlength=len(cells)))
     # The box is shifted by halves, so its walls may run through centres: those in [low, high) are
     # inside.
     is_inside = np.ones(image.shape, dtype=bool)
     for axis, centres in enumerate(np.indices(image.shape)):
         low, high = shift[axis] - 0.5, shift[axis] - 0.5 + (5, 4, 4)[axis]
         is_inside &= (centres >= low) & (centres < high)
-    np.testing.assert_array_equal(owner >= 0, is_inside)
+    assert_array_equal(owner >= 0, is_inside)
 
 
 # Laws
@@ -388,8 +385,8 @@ def test_the_order_of_the_cells_changes_not_a_bit(seed, n):
     order = rng.permutation(len(mesh.cells))
     other = Mesh(mesh.points, mesh.cells[order])
     for ours, theirs in zip(cell_moments(image, mesh), cell_moments(image, other), strict=True):
-        np.testing.assert_array_equal(ours[order], theirs)
-    np.testing.assert_array_equal(order[cell_of_voxel(image, other)], cell_of_voxel(image, mesh))
+        assert_array_equal(ours[order], theirs)
+    assert_array_equal(order[cell_of_voxel(image, other)], cell_of_voxel(image, mesh))
 
 
 @given(seeds, dimensions)
@@ -400,14 +397,14 @@ def test_the_order_of_nodes_and_corners_changes_no_owner(seed, n):
     # even permutations
     turned = np.roll(mesh.cells, 1, axis=1) if n == 2 else mesh.cells[:, [1, 2, 0, 3]]
     other = Mesh(mesh.points[nodes], np.argsort(nodes)[turned])
-    np.testing.assert_array_equal(cell_of_voxel(image, other), cell_of_voxel(image, mesh))
+    assert_array_equal(cell_of_voxel(image, other), cell_of_voxel(image, mesh))
     ours, theirs = cell_moments(image, mesh), cell_moments(image, other)
-    np.testing.assert_array_equal(ours.n_voxels, theirs.n_voxels)
-    np.testing.assert_allclose(ours.variance, theirs.variance, rtol=1e-10, atol=1e-9)
+    assert_array_equal(ours.n_voxels, theirs.n_voxels)
+    assert_allclose(ours.variance, theirs.variance, rtol=1e-10, atol=1e-9)
     # The centroid of an empty cell may lie half way between voxels, give or take the order of its
     # sum.
     is_full = ours.n_voxels > 0
-    np.testing.assert_allclose(ours.mean[is_full], theirs.mean[is_full], rtol=1e-13)
+    assert_allclose(ours.mean[is_full], theirs.mean[is_full], rtol=1e-13)
 
 
 @given(seeds, dimensions)
@@ -420,7 +417,7 @@ def test_the_world_s_frame_does_not_matter(seed, n):
     motion[:n, n] = rng.uniform(-500, 500, n)
     moved = Image(image.data, motion @ image.affine)
     points = mesh.points @ motion[:n, :n].T + motion[:n, n]
-    np.testing.assert_array_equal(
+    assert_array_equal(
         cell_of_voxel(moved, Mesh(points, oriented(points, mesh.cells))), cell_of_voxel(image, mesh)
     )
 
@@ -469,7 +466,7 @@ def test_ticks_are_the_nearest_and_stay_below_2_to_the_28(seed, n):
     assert (bits, ticks[:, 3 - n :].tolist()) == (grid.bits, twin)
     back = from_ticks(ticks, grid, n)
     assert np.abs(back - index).max() <= 2.0 ** -(grid.bits + 1)
-    np.testing.assert_array_equal(to_ticks(back, grid), ticks)
+    assert_array_equal(to_ticks(back, grid), ticks)
 
 
 # Messages
@@ -525,7 +522,7 @@ def test_owners_on_lattices_are_the_twin_s(shape, kind, blocks):
     image = Image(np.zeros(shape))
     mesh = lattice_mesh(image, kind, blocks=blocks)
     owner = cell_of_voxel(image, mesh)
-    np.testing.assert_array_equal(owner, naive.cell_of_voxel(image, mesh))
+    assert_array_equal(owner, naive.cell_of_voxel(image, mesh))
     assert (owner >= 0).all()
 
 
@@ -585,4 +582,4 @@ def test_a_flip_of_the_array_flips_the_owners_of_a_generic_mesh():
     flip = np.diag([-1.0, 1, 1, 1])
     flip[0, 3] = 6
     flipped = Image(image.data[::-1], flip)
-    np.testing.assert_array_equal(cell_of_voxel(flipped, mesh)[::-1], cell_of_voxel(image, mesh))
+    assert_array_equal(cell_of_voxel(flipped, mesh)[::-1], cell_of_voxel(image, mesh))

@@ -7,6 +7,7 @@ import pytest
 import skfem
 from meshes import with_bent_edges
 from models import ball_mesh
+from numpy.testing import assert_allclose, assert_array_equal
 from skfem.helpers import ddot, sym_grad, trace
 from test_solution import eighth_of_a_shell, uneven
 
@@ -51,16 +52,14 @@ def test_a_linear_displacement_is_reproduced(n):
         constrained(mesh, 3.0, 0.3, np.repeat(is_outer[:, None], n, axis=1), prescribed, order=2)
     )
     assert 0.1 < (~is_outer).mean() < 0.9
-    np.testing.assert_allclose(u, exact, atol=1e-11 * np.abs(exact).max())
+    assert_allclose(u, exact, atol=1e-11 * np.abs(exact).max())
     strain = 0.5 * (slope + slope.T)
-    np.testing.assert_allclose(
+    assert_allclose(
         gauss_strains(mesh, u), np.broadcast_to(strain, (len(cells), *_shape(n), n, n)), atol=1e-9
     )
-    np.testing.assert_allclose(
-        strains(mesh, u), np.broadcast_to(strain, (len(cells), n, n)), atol=1e-9
-    )
+    assert_allclose(strains(mesh, u), np.broadcast_to(strain, (len(cells), n, n)), atol=1e-9)
     at_nodes = node_means(mesh, gauss_strains(mesh, u))
-    np.testing.assert_allclose(at_nodes, np.broadcast_to(strain, (len(nodes), n, n)), atol=1e-9)
+    assert_allclose(at_nodes, np.broadcast_to(strain, (len(nodes), n, n)), atol=1e-9)
 
 
 def _shape(n):
@@ -79,9 +78,9 @@ def test_forces_add_up_to_volumes_and_areas(n):
     assert abs(size / gauss_volumes(Mesh(mesh.points, mesh.cells), 2).sum() - 1.0) > 1e-5
     gravity = np.arange(1.0, n + 1.0)
     weight = weight_forces(mesh, np.full(len(mesh.cells), 2.0), gravity, 2)
-    np.testing.assert_allclose(weight.sum(axis=0), 2e-9 * size * gravity, rtol=1e-12)
+    assert_allclose(weight.sum(axis=0), 2e-9 * size * gravity, rtol=1e-12)
     which, forces = facet_forces(mesh, sets, parse_load("pressure:boundary:-1", n), 2)
-    np.testing.assert_allclose(forces.sum(axis=0), 0.0, atol=1e-9 * np.abs(forces).sum())
+    assert_allclose(forces.sum(axis=0), 0.0, atol=1e-9 * np.abs(forces).sum())
     assert (forces * nodes[which]).sum() / n == pytest.approx(size, rel=1e-12)
     local, weights = facet_weights(mesh, rows, 2)
     assert weights.sum() == pytest.approx(_area(nodes[local], n), rel=1e-4)
@@ -198,7 +197,7 @@ def test_a_curved_hollow_sphere_is_nearer_to_lame():
     assert all(3.0 * ours < theirs for ours, theirs in zip(curved, straight, strict=True))
     assert curved[0] / curved[1] > 3.0
     applied = lame_errors(True, 4)[1].applied
-    np.testing.assert_allclose(applied, 0.2 * np.pi / 4.0, rtol=2e-3)
+    assert_allclose(applied, 0.2 * np.pi / 4.0, rtol=2e-3)
 
 
 @pytest.mark.parametrize("n", N)
@@ -208,7 +207,7 @@ def test_moduli_and_fields_of_curved_cells(n):
     """
     mesh = with_bent_edges(uneven(n)[0], 0.05)
     parts = np.random.default_rng(4).uniform(1.0, 2.0, (len(mesh.cells), n + 1))
-    np.testing.assert_array_equal(
+    assert_array_equal(
         stiffness(mesh, np.full(parts.shape, 2.0), 0.3, 2).data, stiffness(mesh, 2.0, 0.3, 2).data
     )
     stiff, soft = (
@@ -226,12 +225,12 @@ def test_moduli_and_fields_of_curved_cells(n):
     )
     mixed = solve(model._replace(gauss_young=parts))
     assert mixed.young.shape == mixed.strain.shape[:2] == (len(mesh.cells), *_shape(n))
-    np.testing.assert_allclose(mixed.young.mean(axis=0).mean(), parts.mean(), rtol=0.02)
+    assert_allclose(mixed.young.mean(axis=0).mean(), parts.mean(), rtol=0.02)
     assert mixed.strain_energy + mixed.spring_energy == pytest.approx(mixed.work, rel=1e-8)
     fields = solution_fields(mesh, mixed)
     assert fields.point_data["stress_nodes"].shape == (len(elements(model)[0]), n * n)
     at_nodes = solve(model._replace(node_young=np.full(len(mesh.points), 2.0)))
-    np.testing.assert_allclose(at_nodes.u, solve(model).u, rtol=1e-9, atol=1e-12)
+    assert_allclose(at_nodes.u, solve(model).u, rtol=1e-9, atol=1e-12)
 
 
 def test_folded_cells_and_voxel_references_are_refused():

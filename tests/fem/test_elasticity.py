@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from meshes import ALL_SMALL, random_affine, random_rotation, split_box
 from models import cell_energies
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial import cKDTree
 from skfem.helpers import ddot, sym_grad, trace
 
@@ -109,7 +110,7 @@ def test_stiffness_is_the_textbook_s(case, nu):
     mesh = Mesh(*case)
     young = np.random.default_rng(1).uniform(1.0, 9.0, len(mesh.cells))
     expected = textbook_stiffness(mesh, young, nu)
-    np.testing.assert_allclose(
+    assert_allclose(
         stiffness(mesh, young, nu).toarray(), expected, atol=1e-13 * np.abs(expected).max()
     )
 
@@ -127,7 +128,7 @@ def test_stiffness_is_scikit_fem_s(n, order):
     assert len(np.unique(ours)) == len(points)
     dofs = (ours[:, None] * n + np.arange(n)).ravel()
     actual = stiffness(mesh, young, nu, order).toarray()[np.ix_(dofs, dofs)]
-    np.testing.assert_allclose(actual, K, atol=1e-12 * np.abs(K).max())
+    assert_allclose(actual, K, atol=1e-12 * np.abs(K).max())
 
 
 def skfem_stiffness(mesh, young, nu, order):
@@ -182,8 +183,8 @@ def test_stiffness_is_symmetric_and_rigid_motions_are_its_null_space(seed, n, nu
     assert modes.shape == (mesh.points.size, r)
     assert np.linalg.matrix_rank(modes) == r
     null = vectors[:, :r]
-    np.testing.assert_allclose(null @ (null.T @ modes), modes, atol=1e-8)
-    np.testing.assert_allclose(
+    assert_allclose(null @ (null.T @ modes), modes, atol=1e-8)
+    assert_allclose(
         (modes[:, n:] ** 2).sum(axis=0).sum(), n * len(mesh.points) * (n - 1) / 2 * 2 / n
     )
 
@@ -195,17 +196,15 @@ def test_stiffness_adds_up():
     one, two = rng.uniform(1.0, 9.0, (2, len(mesh.cells)))
     total = stiffness(mesh, one + 2.0 * two, 0.4)
     parts = stiffness(mesh, one, 0.4) + 2.0 * stiffness(mesh, two, 0.4)
-    np.testing.assert_allclose(total.toarray(), parts.toarray(), atol=1e-12 * total.max())
+    assert_allclose(total.toarray(), parts.toarray(), atol=1e-12 * total.max())
     pair = Mesh(
         np.vstack([mesh.points, mesh.points + 99.0]),
         np.vstack([mesh.cells, mesh.cells + len(mesh.points)]),
     )
     both = stiffness(pair, np.concatenate([one, two]), 0.4).toarray()
     size = mesh.points.size
-    np.testing.assert_allclose(both[:size, :size], stiffness(mesh, one, 0.4).toarray(), rtol=1e-15)
-    np.testing.assert_allclose(
-        both[size:, size:], stiffness(mesh, two, 0.4).toarray(), atol=1e-9 * both.max()
-    )
+    assert_allclose(both[:size, :size], stiffness(mesh, one, 0.4).toarray(), rtol=1e-15)
+    assert_allclose(both[size:, size:], stiffness(mesh, two, 0.4).toarray(), atol=1e-9 * both.max())
     assert not both[:size, size:].any()
 
 
@@ -238,11 +237,11 @@ def test_patch(name):
     field = mesh.points @ slope.T + shift
     system = constrained(mesh, 7.0, nu, is_boundary, np.where(is_boundary, field, np.nan))
     u = solved(system)
-    np.testing.assert_allclose(u, field, atol=1e-11 * np.abs(field).max())
-    np.testing.assert_array_equal(u[is_boundary], field[is_boundary])
+    assert_allclose(u, field, atol=1e-11 * np.abs(field).max())
+    assert_array_equal(u[is_boundary], field[is_boundary])
     strain = 0.5 * (slope + slope.T)
     expected = np.broadcast_to(strain, (len(mesh.cells), n, n))
-    np.testing.assert_allclose(strains(mesh, u), expected, atol=1e-8)
+    assert_allclose(strains(mesh, u), expected, atol=1e-8)
     force = (system.K @ u.ravel()).reshape(-1, n)
     assert np.abs(force[~is_boundary]).max() < 1e-10 * np.abs(force).max()
 
@@ -265,9 +264,9 @@ def test_uniform_block_between_smooth_plates(sides, nu, method):
     assert pressed.strain_energy == pytest.approx(0.5 * 4.0 * 0.01**2 * np.prod(sides), rel=1e-9)
     expected = np.zeros(n)
     expected[-1] = 4.0 * 0.01 * np.prod(sides[:-1])
-    np.testing.assert_allclose(pressed.reaction, expected, atol=1e-8 * expected[-1])
+    assert_allclose(pressed.reaction, expected, atol=1e-8 * expected[-1])
     along = np.diag([nu * 0.01] * (n - 1) + [-0.01])
-    np.testing.assert_allclose(
+    assert_allclose(
         strains(distorted(mesh, np.random.default_rng(0)), pressed.u),
         np.broadcast_to(along, (len(mesh.cells), n, n)),
         atol=1e-10,
@@ -288,7 +287,7 @@ def test_two_layers_in_series(sides, is_bonded):
     assert pressed.strain_energy == pytest.approx(0.5 * stress * area * 0.06, rel=1e-11)
     assert pressed.reaction[-1] == pytest.approx(stress * area, rel=1e-11)
     along = strains(mesh, pressed.u)[:, -1, -1]
-    np.testing.assert_allclose(along, np.where(is_top, -stress / 2.0, -stress / 12.0), rtol=1e-9)
+    assert_allclose(along, np.where(is_top, -stress / 2.0, -stress / 12.0), rtol=1e-9)
 
 
 @pytest.mark.parametrize("n", [2, 3])
@@ -303,7 +302,7 @@ def test_block_in_a_rigid_frame(n):
     field = np.zeros_like(mesh.points)
     field[:, -1] = -0.01 * mesh.points[:, -1]
     u = solved(constrained(mesh, 3.0, nu, wall, field))
-    np.testing.assert_allclose(u, field, atol=1e-13)
+    assert_allclose(u, field, atol=1e-13)
     modulus = 3.0 / (1.0 - nu**2) if n == 2 else 3.0 * (1.0 - nu) / ((1.0 + nu) * (1.0 - 2.0 * nu))
     assert cell_energies(mesh, 3.0, nu, u).sum() == pytest.approx(
         0.5 * modulus * 1e-4 * 2.0**n, rel=1e-12
@@ -333,20 +332,20 @@ def test_energies_and_forces_balance(seed, n, is_bonded):
     )
     force = (stiffness(mesh, young, 0.4) @ pressed.u.ravel()).reshape(-1, n)
     largest = np.abs(force).max()
-    np.testing.assert_allclose(pressed.reaction, force[low].sum(axis=0), atol=1e-9 * largest)
-    np.testing.assert_allclose(force[high].sum(axis=0), -pressed.reaction, atol=1e-9 * largest)
+    assert_allclose(pressed.reaction, force[low].sum(axis=0), atol=1e-9 * largest)
+    assert_allclose(force[high].sum(axis=0), -pressed.reaction, atol=1e-9 * largest)
     inner = np.setdiff1d(np.arange(len(force)), np.concatenate([low, high]))
     assert np.abs(force[inner]).max() < 1e-9 * largest
     if is_bonded:
-        np.testing.assert_array_equal(pressed.u[high], np.zeros((len(high), n)))
-        np.testing.assert_array_equal(pressed.u[low], np.broadcast_to(push, (len(low), n)))
+        assert_array_equal(pressed.u[high], np.zeros((len(high), n)))
+        assert_array_equal(pressed.u[low], np.broadcast_to(push, (len(low), n)))
     else:  # plates only push along their way, also at the nodes that stop the rigid motion
         direction = push / np.linalg.norm(push)
         plates = np.concatenate([low, high])
         across = force[plates] - np.outer(force[plates] @ direction, direction)
         assert np.abs(across).max() < 1e-8 * largest
-        np.testing.assert_allclose(pressed.u[high] @ direction, 0.0, atol=1e-12)
-        np.testing.assert_allclose(pressed.u[low] @ direction, np.linalg.norm(push), rtol=1e-12)
+        assert_allclose(pressed.u[high] @ direction, 0.0, atol=1e-12)
+        assert_allclose(pressed.u[low] @ direction, np.linalg.norm(push), rtol=1e-12)
 
 
 @given(seeds, dimensions, st.booleans())
@@ -364,11 +363,9 @@ def test_rotated(seed, n, is_bonded):
     plain = compression(mesh, young, 0.3, displacement=push, **options)
     turned = Mesh(mesh.points @ turn.T + 3.0, mesh.cells)
     other = compression(turned, young, 0.3, displacement=turn @ push, **options)
-    np.testing.assert_allclose(other.u @ turn, plain.u, atol=1e-9 * np.abs(plain.u).max())
+    assert_allclose(other.u @ turn, plain.u, atol=1e-9 * np.abs(plain.u).max())
     assert other.strain_energy == pytest.approx(plain.strain_energy, rel=1e-10)
-    np.testing.assert_allclose(
-        other.reaction @ turn, plain.reaction, atol=1e-9 * np.abs(plain.reaction).max()
-    )
+    assert_allclose(other.reaction @ turn, plain.reaction, atol=1e-9 * np.abs(plain.reaction).max())
 
 
 # Refinement
@@ -400,7 +397,7 @@ def refined(mesh, young):
     keys, number = np.unique(pairs @ [n_nodes, 1], return_inverse=True)
     points = 0.5 * (mesh.points[keys // n_nodes] + mesh.points[keys % n_nodes])
     fine = Mesh(points, oriented(points, number.reshape(-1, mesh.ndim + 1)))
-    np.testing.assert_allclose(
+    assert_allclose(
         volumes(fine.points, fine.cells).reshape(len(young), -1),
         np.repeat(volumes(mesh.points, mesh.cells)[:, None] / len(ends), len(ends), axis=1),
         rtol=1e-9,
@@ -449,7 +446,7 @@ def test_multigrid_and_factorisation_agree(sides, is_bonded):
     direct = squeezed(mesh, image, young, 0.45, is_bonded=is_bonded, method="direct")
     amg = squeezed(mesh, image, young, 0.45, is_bonded=is_bonded, method="amg")
     assert len(amg.system.free) > 2000
-    np.testing.assert_allclose(amg.u, direct.u, atol=1e-8 * np.abs(direct.u).max())
+    assert_allclose(amg.u, direct.u, atol=1e-8 * np.abs(direct.u).max())
     assert amg.strain_energy == pytest.approx(direct.strain_energy, rel=1e-12)
 
 
@@ -461,7 +458,7 @@ def test_a_multigrid_cycle_is_symmetric_and_positive(is_bonded):
     system = squeezed(mesh, image, 2.0, 0.4, is_bonded=is_bonded).system
     cycle = multigrid(system)
     dense = np.column_stack([cycle @ unit for unit in np.eye(len(system.free))])
-    np.testing.assert_allclose(dense, dense.T, atol=1e-12 * np.abs(dense).max())
+    assert_allclose(dense, dense.T, atol=1e-12 * np.abs(dense).max())
     assert np.linalg.eigvalsh(dense)[0] > 0.0
     assert np.linalg.eigvals(dense @ system.K_ff.toarray()).real.min() > 0.1  # near the inverse
 
@@ -477,7 +474,7 @@ def test_auto_takes_multigrid_for_large_meshes(monkeypatch):
     squeezed(mesh, image, 2.0, 0.4)
     assert called == []
     monkeypatch.setattr(elasticity, "DIRECT_DOFS", {2: 0, 3: len(direct.system.free) - 1})
-    np.testing.assert_allclose(squeezed(mesh, image, 2.0, 0.4).u, direct.u, atol=1e-10)
+    assert_allclose(squeezed(mesh, image, 2.0, 0.4).u, direct.u, atol=1e-10)
     assert called == [1]
 
 
@@ -516,9 +513,7 @@ def test_faces_of_any_affine(seed, n):
     assert sorted([low.tolist(), high.tolist()]) == sorted(e.tolist() for e in ends)
     assert len(low) == len(high) == np.prod([b + 1 for k, b in enumerate(blocks) if k != axis])
     shift = mesh.points[high].mean(axis=0) - mesh.points[low].mean(axis=0)
-    np.testing.assert_allclose(
-        np.abs(shift), np.abs(image.affine[:n, axis]) * image.shape[axis], rtol=1e-9
-    )
+    assert_allclose(np.abs(shift), np.abs(image.affine[:n, axis]) * image.shape[axis], rtol=1e-9)
     assert shift[-1] > 0.0
 
 
@@ -536,7 +531,7 @@ def test_the_bottom_is_pushed_up_in_a_flipped_image():
     """By a tenth of five slices of 2 mm, whichever comes first."""
     for direction in (1.0, -1.0):
         image = Image(np.zeros((3, 4, 5)), np.diag([1.0, 1.0, 2.0 * direction, 1.0]))
-        np.testing.assert_allclose(elasticity.push_of(image, 10.0), [0.0, 0.0, 1.0], atol=1e-15)
+        assert_allclose(elasticity.push_of(image, 10.0), [0.0, 0.0, 1.0], atol=1e-15)
 
 
 def test_top_is_up_even_where_the_upright_axis_leans_more_than_it_rises():
@@ -547,8 +542,8 @@ def test_top_is_up_even_where_the_upright_axis_leans_more_than_it_rises():
     image = Image(np.zeros((3, 3, 3)), affine)
     mesh = lattice_mesh(image, blocks=(1, 1, 1))
     low, high = box_faces(image, mesh)
-    np.testing.assert_allclose(mesh.points[low, 2], -0.2, rtol=1e-12)
-    np.testing.assert_allclose(mesh.points[high, 2], 1.0, rtol=1e-12)
+    assert_allclose(mesh.points[low, 2], -0.2, rtol=1e-12)
+    assert_allclose(mesh.points[high, 2], 1.0, rtol=1e-12)
 
 
 def test_a_node_just_off_the_face_is_not_on_it():
@@ -557,7 +552,7 @@ def test_a_node_just_off_the_face_is_not_on_it():
     low = box_faces(image, mesh)[0]
     points[low[0], 1] += 0.9e-6
     points[low[1], 1] += 1.1e-6
-    np.testing.assert_array_equal(box_faces(image, Mesh(points, mesh.cells))[0], np.delete(low, 1))
+    assert_array_equal(box_faces(image, Mesh(points, mesh.cells))[0], np.delete(low, 1))
 
 
 # Is it held?
@@ -774,10 +769,8 @@ def test_strains_of_a_linear_field(seed, n):
     mesh = random_mesh(rng, n)
     slope = rng.normal(size=(n, n))
     strain = strains(mesh, mesh.points @ slope.T)
-    np.testing.assert_allclose(
-        strain, np.broadcast_to(0.5 * (slope + slope.T), strain.shape), atol=1e-9
-    )
-    np.testing.assert_array_equal(strain, strain.transpose(0, 2, 1))
+    assert_allclose(strain, np.broadcast_to(0.5 * (slope + slope.T), strain.shape), atol=1e-9)
+    assert_array_equal(strain, strain.transpose(0, 2, 1))
 
 
 @pytest.mark.parametrize("nu", [0.0, 0.3, 0.45])

@@ -3,6 +3,7 @@
 import naive
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from threadpoolctl import threadpool_limits
 
 import tetopt
@@ -53,18 +54,16 @@ def test_product_matrix_and_solution_are_those_of_the_dense_matrix(shape, linear
     )
     u, is_free = nodes_of(modulus)
     free = np.flatnonzero(is_free)
-    np.testing.assert_allclose(
-        stiffness_product(modulus, nu, u).ravel(), dense @ u.ravel(), atol=1e-12
-    )
+    assert_allclose(stiffness_product(modulus, nu, u).ravel(), dense @ u.ravel(), atol=1e-12)
     K = free_stiffness(modulus, nu).toarray()
-    np.testing.assert_allclose(K, dense[np.ix_(free, free)], atol=1e-13)
-    np.testing.assert_array_equal(K, K.T)
+    assert_allclose(K, dense[np.ix_(free, free)], atol=1e-13)
+    assert_array_equal(K, K.T)
     direct = (u * ~is_free).ravel()
     direct[free] = np.linalg.solve(dense[np.ix_(free, free)], -(dense[free] @ direct))
     ours = u.copy()
     solve_between_plates(modulus, nu, ours)
-    np.testing.assert_allclose(ours.ravel(), direct, atol=1e-11 * np.abs(direct).max())
-    np.testing.assert_array_equal(ours[~is_free], u[~is_free])
+    assert_allclose(ours.ravel(), direct, atol=1e-11 * np.abs(direct).max())
+    assert_array_equal(ours[~is_free], u[~is_free])
 
 
 @pytest.mark.parametrize(("shape", "linear"), [((3, 5, 4), STRAIGHT), ((5, 6), STRAIGHT[:2, :2])])
@@ -80,7 +79,7 @@ def test_patch(shape, linear):
     exact = (exact * [*(-0.01 * nu,) * (n - 1), 0.01]).reshape(*(s + 1 for s in shape), n)
     u = np.where(nodes_of(modulus)[1], 0.0, exact)
     solve_between_plates(modulus, nu, u)
-    np.testing.assert_allclose(u, exact, atol=1e-12)
+    assert_allclose(u, exact, atol=1e-12)
 
 
 def multigrid_alone(monkeypatch):
@@ -104,7 +103,7 @@ def test_multigrid_and_factorisation_agree(monkeypatch, shape, linear, nu, contr
     assert solve_between_plates(modulus, nu, direct) == 0
     multigrid_alone(monkeypatch)
     assert 3 < solve_between_plates(modulus, nu, u) < 80
-    np.testing.assert_allclose(u, direct, atol=1e-7 * np.abs(direct).max())
+    assert_allclose(u, direct, atol=1e-7 * np.abs(direct).max())
 
 
 def test_same_bits_on_any_number_of_threads(monkeypatch):
@@ -116,7 +115,7 @@ def test_same_bits_on_any_number_of_threads(monkeypatch):
         solutions.append(nodes_of(modulus)[0])
         with threadpool_limits(threads):
             solve_between_plates(modulus, 0.3, solutions[-1])
-    np.testing.assert_array_equal(*solutions)
+    assert_array_equal(*solutions)
 
 
 def test_says_when_it_is_not_solved(monkeypatch):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import skfem
 from meshes import random_affine
+from numpy.testing import assert_allclose, assert_array_equal
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
 import tetopt
@@ -53,9 +54,7 @@ def test_element_against_scikit_fem(nu):
     ours = element_stiffness(SHEARED, nu)
     dof = basis.nodal_dofs  # (3, 8)
     for a, b in product(range(8), repeat=2):
-        np.testing.assert_allclose(
-            ours[order[a], order[b]], K[np.ix_(dof[:, a], dof[:, b])], atol=1e-12
-        )
+        assert_allclose(ours[order[a], order[b]], K[np.ix_(dof[:, a], dof[:, b])], atol=1e-12)
 
 
 @pytest.mark.parametrize("flip", [1.0, -1.0])
@@ -72,8 +71,8 @@ def test_bar_without_sideways_strain(n, flip):
     expected = np.zeros((n, n))
     expected[-1, -1] = -0.02
     u, strain = at_centres(image, exact.u, np.arange(image.data.size))
-    np.testing.assert_allclose(strain, np.broadcast_to(expected, strain.shape), atol=1e-9)
-    np.testing.assert_allclose(exact.u, exact.u_homogeneous, atol=1e-9)
+    assert_allclose(strain, np.broadcast_to(expected, strain.shape), atol=1e-9)
+    assert_allclose(exact.u, exact.u_homogeneous, atol=1e-9)
     assert exact.own_error.strain_energy < 1e-9
     assert exact.own_error.displacement is None
     assert exact.n_dofs == np.prod(np.array(image.shape) + 1) * n
@@ -82,7 +81,7 @@ def test_bar_without_sideways_strain(n, flip):
     )
     along = image.to_world(index.astype(float))[:, -1]
     top = along.max() + 0.5 * abs(linear[-1, -1])
-    np.testing.assert_allclose(u[:, -1], 0.02 * (top - along), atol=1e-9)
+    assert_allclose(u[:, -1], 0.02 * (top - along), atol=1e-9)
 
 
 @pytest.mark.full
@@ -132,8 +131,8 @@ def test_errors_of_a_known_field():
     labels[:3] = 1
     exact = linear_reference(image, slope, shift)
     u = mesh.points @ slope.T + shift
-    np.testing.assert_allclose(compare(exact, mesh, u, 2.0, labels), 0.0, atol=1e-12)
-    np.testing.assert_allclose(compare(exact, mesh, 1.1 * u, 1.8, labels), 0.1, rtol=1e-9)
+    assert_allclose(compare(exact, mesh, u, 2.0, labels), 0.0, atol=1e-12)
+    assert_allclose(compare(exact, mesh, 1.1 * u, 1.8, labels), 0.1, rtol=1e-9)
     assert compare(exact, mesh, u, 2.0, np.zeros(image.shape)).interface_strain is None
 
 
@@ -200,19 +199,17 @@ def test_averaged_keeps_box_and_mean():
     assert coarse.data.mean() == pytest.approx(image.data.mean(), rel=1e-12)
     for corner in product((0, 1), repeat=3):
         ends = [np.where(corner, np.array(i.shape) - 0.5, -0.5) for i in (image, coarse)]
-        np.testing.assert_allclose(image.to_world(ends[0]), coarse.to_world(ends[1]), atol=1e-12)
+        assert_allclose(image.to_world(ends[0]), coarse.to_world(ends[1]), atol=1e-12)
     by_hand = (image.data[0] + image.data[1] + image.data[2] / 3.0) / (7.0 / 3.0)
-    np.testing.assert_allclose(averaged(image, (3, 10, 9)).data[0], by_hand, rtol=1e-12)
-    np.testing.assert_array_equal(averaged(image, image.shape).data, image.data)
+    assert_allclose(averaged(image, (3, 10, 9)).data[0], by_hand, rtol=1e-12)
+    assert_array_equal(averaged(image, image.shape).data, image.data)
 
 
 @pytest.mark.parametrize("shape", [(7, 10, 9), (5, 1, 6)])
 def test_averaged_against_exact_fractions(shape):
     image = tetopt.Image(np.random.default_rng(6).normal(size=shape))
     for new in (tuple((s + 1) // 2 for s in shape), tuple(max(1, s - 2) for s in shape)):
-        np.testing.assert_allclose(
-            averaged(image, new).data, naive.block_means(image.data, new), atol=1e-13
-        )
+        assert_allclose(averaged(image, new).data, naive.block_means(image.data, new), atol=1e-13)
 
 
 @pytest.mark.parametrize(("old", "new"), [((3, 5, 4), (7, 10, 4)), ((2, 1), (4, 3))])
@@ -223,7 +220,7 @@ def test_interpolated_against_dense_interpolation(old, new):
     dense = np.einsum(
         f"{','.join(map(''.join, zip(*axes, strict=True)))},{axes[1]}d->{axes[0]}d", *P, u
     )
-    np.testing.assert_allclose(interpolated(u, new), dense, atol=1e-14)
+    assert_allclose(interpolated(u, new), dense, atol=1e-14)
 
 
 def test_reference_shape_is_as_fine_as_allowed():
@@ -242,9 +239,7 @@ def test_reference_shape_is_as_fine_as_allowed():
 def test_nearest_takes_the_voxel_around_the_centre():
     image = tetopt.Image(np.arange(6.0).reshape(3, 2))
     fine = tetopt.Image(np.zeros((9, 4)), np.diag([1 / 3, 1 / 2, 1.0]))
-    np.testing.assert_array_equal(
-        nearest(image, fine).data, image.data.repeat(3, axis=0).repeat(2, axis=1)
-    )
+    assert_array_equal(nearest(image, fine).data, image.data.repeat(3, axis=0).repeat(2, axis=1))
 
 
 def test_refined_is_the_same_field():
@@ -261,8 +256,8 @@ def test_refined_is_the_same_field():
         np.meshgrid(*(np.arange(s) for s in fine.shape), indexing="ij"), axis=-1
     ).reshape(-1, 3)
     of = np.rint(image.to_index(fine.to_world(index.astype(float)))).astype(int)
-    np.testing.assert_array_equal(fine.data.ravel(), image.data[tuple(of.T)])
-    np.testing.assert_array_equal(refined(image, image.shape).data, image.data)
+    assert_array_equal(fine.data.ravel(), image.data[tuple(of.T)])
+    assert_array_equal(refined(image, image.shape).data, image.data)
 
 
 @pytest.mark.full
@@ -277,7 +272,7 @@ def test_own_error_is_that_of_half_the_resolution():
     P = [naive.interpolation(*pair) for pair in ((8, 4), (7, 3), (10, 5))]
     difference = np.einsum("ai,bj,ck,ijkd->abcd", *P, coarse.u) - exact.u
     even = reference(tetopt.Image(np.ones(image.shape), image.affine), 0.3).u
-    np.testing.assert_array_equal(exact.u_homogeneous, even)
+    assert_array_equal(exact.u_homogeneous, even)
     assert exact.own_error.strain_energy == pytest.approx(
         abs(coarse.strain_energy / exact.strain_energy - 1.0)
     )
@@ -333,13 +328,13 @@ def test_work_is_done_in_pieces(monkeypatch):
     u = rng.normal(size=mesh.points.shape)
     whole = compare(exact, mesh, u, 2.0, labels)
     monkeypatch.setattr("tetopt.fem.reference.VOXELS_AT_ONCE", 17)
-    np.testing.assert_allclose(compare(exact, mesh, u, 2.0, labels), whole, rtol=1e-12)
+    assert_allclose(compare(exact, mesh, u, 2.0, labels), whole, rtol=1e-12)
 
 
 def test_nearest_to_a_coarser_grid():
     image = tetopt.Image(np.arange(8.0)[:, None] * np.ones((1, 6)))
     coarse = tetopt.Image(np.zeros((2, 3)))
-    np.testing.assert_array_equal(nearest(image, coarse).data[:, 0], [2.0, 6.0])
+    assert_array_equal(nearest(image, coarse).data[:, 0], [2.0, 6.0])
 
 
 def test_refuses_a_modulus_of_0():

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import skfem
 from meshes import random_rotation, split_box
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.sparse import diags_array
 from scipy.spatial import cKDTree
 from skfem.helpers import ddot, dot, sym_grad, trace
@@ -247,16 +248,14 @@ def test_a_bar_under_traction(n, order):
     solution = solve(model_with(mesh, sets, loads, order, young=4.0, nu=0.3))
     places = nodes_of_order(mesh, order)
     expected = np.column_stack([-0.3 * 0.125 * (places[:, : n - 1] - at), 0.125 * places[:, -1]])
-    np.testing.assert_allclose(solution.u, expected, atol=1e-12)
+    assert_allclose(solution.u, expected, atol=1e-12)
     stress = np.zeros((n, n))
     stress[-1, -1] = 0.5
-    np.testing.assert_allclose(
-        solution.stress, np.broadcast_to(stress, solution.stress.shape), atol=1e-12
-    )
-    np.testing.assert_allclose(von_mises(solution.stress), 0.5, rtol=1e-12)
+    assert_allclose(solution.stress, np.broadcast_to(stress, solution.stress.shape), atol=1e-12)
+    assert_allclose(von_mises(solution.stress), 0.5, rtol=1e-12)
     area = 2.0 ** (n - 1)
     assert solution.strain_energy == pytest.approx(0.5 * 0.5 * 0.125 * area * 6.0, rel=1e-12)
-    np.testing.assert_allclose(
+    assert_allclose(
         solution.reactions[words_of(["hold:inferior"], n)[0][5:]][-1], -0.5 * area, rtol=1e-12
     )
 
@@ -278,14 +277,14 @@ def test_a_bar_under_its_own_weight(n, order):
     largest = weight * length**2 / (2.0 * young)
     assert error < (1e-12 if order == 2 else 0.03) * largest
     volume = length * 2.0 ** (n - 1)
-    np.testing.assert_allclose(solution.applied[-1], weight * volume, rtol=1e-12)
+    assert_allclose(solution.applied[-1], weight * volume, rtol=1e-12)
     held_by = words_of(["hold:inferior"], n)[0][5:]
-    np.testing.assert_allclose(solution.reactions[held_by][-1], -weight * volume, rtol=1e-10)
+    assert_allclose(solution.reactions[held_by][-1], -weight * volume, rtol=1e-10)
     if order == 2:
         energy = 0.5 * weight**2 / young * length**3 / 3.0 * 2.0 ** (n - 1)
         assert solution.strain_energy == pytest.approx(energy, rel=1e-12)
         stress = weight * (length - nodes_of_order(mesh, 2)[:, -1])
-        np.testing.assert_allclose(
+        assert_allclose(
             node_means(mesh, solution.stress)[:, -1, -1], stress, atol=1e-12 * stress.max()
         )
 
@@ -298,9 +297,7 @@ def test_a_stiff_block_on_a_bed_of_springs(n, order):
     solution = solve(model_with(mesh, sets, loads, order, young=1e5, nu=0.3))
     force = 2.0 ** (n - 1) * np.array([0.1, 0.0, -0.5])
     bed = words_of(["hold:inferior"], n)[0][5:]
-    np.testing.assert_allclose(
-        solution.reactions[bed], -force[[0, 2] if n == 2 else slice(3)], atol=1e-8
-    )
+    assert_allclose(solution.reactions[bed], -force[[0, 2] if n == 2 else slice(3)], atol=1e-8)
     low = nodes_of_order(mesh, order)[:, -1] < 1e-9
     sunk = np.average(solution.u[low, -1], weights=spring_fractions(mesh, sets, bed, order)[low])
     assert sunk == pytest.approx(-0.25, rel=1e-4)
@@ -327,7 +324,7 @@ def test_patch_with_moduli_and_ratios_of_one_kind(n, order):
     on_boundary[np.unique(element_facets(cells, sets.facets["boundary"]))] = True
     system = constrained(mesh, 3.0, 0.45, on_boundary, points @ slope.T, order=order)
     u = solved(system)
-    np.testing.assert_allclose(u, points @ slope.T, atol=1e-11)
+    assert_allclose(u, points @ slope.T, atol=1e-11)
     assert (~on_boundary[:, 0]).sum() > 5
     force = (system.K @ u.ravel()).reshape(u.shape)
     assert np.abs(force[~on_boundary]).max() < 1e-10 * np.abs(force).max()
@@ -350,11 +347,11 @@ def test_steps_and_superposition(n, order):
     )
     steps = [solve(model, step) for step in (1, 2, 3)]
     whole = solve(model_with(mesh, sets, [*common, *forces], order, **values))
-    np.testing.assert_allclose(sum(s.u for s in steps), whole.u, atol=1e-10 * np.abs(whole.u).max())
-    np.testing.assert_allclose(sum(s.applied for s in steps), whole.applied, atol=1e-10)
+    assert_allclose(sum(s.u for s in steps), whole.u, atol=1e-10 * np.abs(whole.u).max())
+    assert_allclose(sum(s.applied for s in steps), whole.applied, atol=1e-10)
     for name, force in whole.reactions.items():
         scale = np.abs(force).max()
-        np.testing.assert_allclose(sum(s.reactions[name] for s in steps), force, atol=1e-9 * scale)
+        assert_allclose(sum(s.reactions[name] for s in steps), force, atol=1e-9 * scale)
     for solution in (*steps, whole):
         assert solution.strain_energy + solution.spring_energy == pytest.approx(
             solution.work, rel=1e-9
@@ -389,16 +386,16 @@ def test_it_is_the_compression(order):
     push = ours.u[low[0]]
     options = {"fixed_nodes": high, "pushed_nodes": low, "displacement": push, "order": order}
     pressed = compression(mesh, values["young"], values["nu"], **options)
-    np.testing.assert_allclose(ours.u, pressed.u, atol=1e-12)
+    assert_allclose(ours.u, pressed.u, atol=1e-12)
     assert ours.strain_energy == pytest.approx(pressed.strain_energy, rel=1e-11)
-    np.testing.assert_allclose(ours.reactions["inferior"], pressed.reaction, rtol=1e-9)
+    assert_allclose(ours.reactions["inferior"], pressed.reaction, rtol=1e-9)
 
 
 def test_units_do_not_matter():
     mesh, sets, values = uneven(3)
     model = model_with(mesh, sets, LOADS["all"], 1, **values)
     ours, other = solve(model), solve(in_units(model, "MPa"))
-    np.testing.assert_allclose(other.u, ours.u, rtol=1e-9, atol=1e-12)
+    assert_allclose(other.u, ours.u, rtol=1e-9, atol=1e-12)
     assert other.strain_energy == pytest.approx(ours.strain_energy, rel=1e-9)
 
 
@@ -435,7 +432,7 @@ def test_any_number_of_free_pieces_on_springs():
     model = build_model(pair, young=2.0, nu=0.3, loads=loads, known_sets=Sets(both, {}))
     solution = solve(model)
     assert np.abs(solution.u[: len(mesh.points)]).max() == 0.0
-    np.testing.assert_allclose(solution.reactions["second"], [0.0, 0.4], atol=1e-12)
+    assert_allclose(solution.reactions["second"], [0.0, 0.4], atol=1e-12)
     with pytest.raises(InputError) as error:
         solve(model._replace(loads=(model.loads[0], model.loads[2])))
     n_cells = len(mesh.cells)
@@ -465,7 +462,7 @@ def test_multigrid_of_order_2_is_symmetric_and_positive(nu):
     system = solve(model).system
     cycle = multigrid(system)
     dense = np.column_stack([cycle @ unit for unit in np.eye(len(system.free))])
-    np.testing.assert_allclose(dense, dense.T, atol=1e-12 * np.abs(dense).max())
+    assert_allclose(dense, dense.T, atol=1e-12 * np.abs(dense).max())
     assert np.linalg.eigvalsh(dense)[0] > 0.0
     assert np.linalg.eigvals(dense @ system.K_ff.toarray()).real.min() > 0.02
 
@@ -480,7 +477,7 @@ def test_multigrid_and_factorisation_agree_with_order_2(n):
     direct, amg = (solve(model, method=method) for method in ("direct", "amg"))
     assert direct.n_iterations == 0
     assert 5 < amg.n_iterations < 80
-    np.testing.assert_allclose(amg.u, direct.u, atol=1e-8 * np.abs(direct.u).max())
+    assert_allclose(amg.u, direct.u, atol=1e-8 * np.abs(direct.u).max())
     assert amg.strain_energy == pytest.approx(direct.strain_energy, rel=1e-10)
 
 
@@ -520,19 +517,17 @@ def test_fields(n, order):
         "von_mises_nodes": (n_nodes,),
     }
     assert set(fields.cell_data) == {"strain", "stress", "von_mises"}
-    np.testing.assert_array_equal(
-        fields.cell_data["strain"].reshape(-1, n, n), strains(mesh, solution.u)
-    )
+    assert_array_equal(fields.cell_data["strain"].reshape(-1, n, n), strains(mesh, solution.u))
     second = solution_fields(mesh, solution, 2)
     assert set(second.cell_data) == {"strain_step2", "stress_step2", "von_mises_step2"}
-    np.testing.assert_array_equal(second.point_data["displacement_step2"], solution.u)
+    assert_array_equal(second.point_data["displacement_step2"], solution.u)
     # Each cell's stress by the law of its own material, of its own mean strain.
     strain = fields.cell_data["strain"].reshape(-1, n, n)
     young, nu = values["young"][:, None, None], values["nu"][:, None, None]
     narrowing = 1.0 - nu**2 if n == 2 else (1.0 + nu) * (1.0 - 2.0 * nu)
     trace_of = np.einsum("cii->c", strain)[:, None, None]
     stress = young * nu / narrowing * trace_of * np.eye(n) + young / (1.0 + nu) * strain
-    np.testing.assert_allclose(
+    assert_allclose(
         fields.cell_data["stress"].reshape(-1, n, n), stress, atol=1e-10 * np.abs(stress).max()
     )
 
@@ -553,7 +548,7 @@ def test_strain_at_nodes_of_a_quadratic_displacement(n):
     u = np.einsum("ijk,pj,pk->pi", form, points, points)
     slope = 2.0 * np.einsum("ijk,pk->pij", form, points)
     at_nodes = node_means(mesh, gauss_strains(mesh, u))
-    np.testing.assert_allclose(at_nodes, 0.5 * (slope + slope.swapaxes(1, 2)), atol=1e-8)
+    assert_allclose(at_nodes, 0.5 * (slope + slope.swapaxes(1, 2)), atol=1e-8)
 
 
 def test_means_at_nodes_are_by_volume():
@@ -562,7 +557,7 @@ def test_means_at_nodes_are_by_volume():
     v = volumes(mesh.points, mesh.cells)
     means = node_means(mesh, np.array([[10.0], [20.0]]))
     shared = (10.0 * v[0] + 20.0 * v[1]) / v.sum()
-    np.testing.assert_allclose(means, [10.0, shared, shared, 20.0])
+    assert_allclose(means, [10.0, shared, shared, 20.0])
 
 
 def test_von_mises():
@@ -571,13 +566,11 @@ def test_von_mises():
     """
     pulled, sheared = np.diag([2.0, 0.0, 0.0]), np.zeros((3, 3))
     sheared[0, 1] = sheared[1, 0] = 1.5
-    np.testing.assert_allclose(
+    assert_allclose(
         von_mises(np.array([pulled, sheared, -4.0 * np.eye(3)])), [2.0, 1.5 * 3**0.5, 0.0]
     )
-    np.testing.assert_allclose(
-        von_mises(np.array([pulled[:2, :2], sheared[:2, :2]])), [2.0, 1.5 * 3**0.5]
-    )
-    np.testing.assert_allclose(von_mises(-4.0 * np.eye(2)), 4.0)
+    assert_allclose(von_mises(np.array([pulled[:2, :2], sheared[:2, :2]])), [2.0, 1.5 * 3**0.5])
+    assert_allclose(von_mises(-4.0 * np.eye(2)), 4.0)
 
 
 # Refusals
@@ -662,7 +655,7 @@ def test_reactions_of_a_set_add_up():
         solution = solve(build_model(mesh, young=10.0, known_sets=sets, loads=words, order=order))
         assert list(solution.reactions) == ["inferior"]
         # The springs pull by 2 kPa/mm * 0.1 mm on 4 mm2; the support's part is what is left.
-        np.testing.assert_allclose(solution.reactions["inferior"], [-4.0, 0.0, -12.0], atol=1e-7)
+        assert_allclose(solution.reactions["inferior"], [-4.0, 0.0, -12.0], atol=1e-7)
 
 
 CHILD = """
@@ -796,10 +789,10 @@ def test_a_confined_plate_under_pressure(n, order):
     )
     expected = np.zeros_like(solution.u)
     expected[:, -1] = -compliance * pressure * nodes_of_order(mesh, order)[:, -1]
-    np.testing.assert_allclose(solution.u, expected, atol=1e-12)
+    assert_allclose(solution.u, expected, atol=1e-12)
     wall = solution.reactions[words_of(["hold:left"], n)[0][5:]]
     sideways = nu if n == 2 else nu / (1.0 - nu)  # of the pressure
-    np.testing.assert_allclose(wall[0], sideways * pressure * 6.0 * 2.0 ** (n - 2), rtol=1e-10)
+    assert_allclose(wall[0], sideways * pressure * 6.0 * 2.0 ** (n - 2), rtol=1e-10)
 
 
 def test_near_incompressible_cells_of_order_1_lock():

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from meshes import with_bent_edges
 from models import ball_mesh
+from numpy.testing import assert_allclose, assert_array_equal
 
 import tetopt
 from tetopt.geometry.check import scaled_jacobians
@@ -59,8 +60,8 @@ def test_the_determinant_is_how_the_map_to_the_world_grows(n):
     assert (bounds <= ratios.min(axis=1) + 1e-12).all()
     assert (bounds < 0.9).any()
     flat = quadratic(mesh.points, mesh.cells)
-    np.testing.assert_allclose(jacobian_bounds(*flat), 1.0, rtol=1e-12)
-    np.testing.assert_allclose(jacobian_ratios(*flat, places), 1.0, rtol=1e-12)
+    assert_allclose(jacobian_bounds(*flat), 1.0, rtol=1e-12)
+    assert_allclose(jacobian_ratios(*flat, places), 1.0, rtol=1e-12)
 
 
 def test_the_bound_is_the_determinant_at_corners():
@@ -138,7 +139,7 @@ def test_volumes_of_curved_cells_by_another_rule(n):
         total.append(size)
     straight = tetopt.Mesh(mesh.points, mesh.cells).cell_volumes
     expected = straight * (jacobian_ratios(nodes, cells, np.array(places)) @ total) * factorial(n)
-    np.testing.assert_allclose(mesh.cell_volumes, expected, rtol=1e-12)
+    assert_allclose(mesh.cell_volumes, expected, rtol=1e-12)
     assert np.abs(mesh.cell_volumes / straight - 1.0).max() > 0.05
     quality = tetopt.quality(mesh.points, mesh.cells, mesh.midpoints)
     assert quality.volume == pytest.approx(mesh.cell_volumes.sum())
@@ -158,7 +159,7 @@ def test_pieces_of_curved_cells(n):
     assert (n_pieces, len(pieces.cells)) == (2**n, 2**n * len(mesh.cells))
     assert tetopt.check_mesh(pieces) == []
     nodes, cells = quadratic(mesh.points, mesh.cells, mesh.midpoints)
-    np.testing.assert_array_equal(pieces.points, nodes)
+    assert_array_equal(pieces.points, nodes)
     assert all(
         set(own) <= set(whole)
         for own, whole in zip(pieces.cells, np.repeat(cells, n_pieces, axis=0), strict=True)
@@ -170,9 +171,7 @@ def test_pieces_of_curved_cells(n):
     assert not any(each.cell_volumes.flags.writeable for each in (mesh, straight))
     middles = mesh.points[numbered_edges(mesh.cells)[0]].mean(axis=1)
     equal = tetopt.Mesh(mesh.points, mesh.cells, middles).straight_pieces()[0].cell_volumes
-    np.testing.assert_allclose(
-        equal, np.repeat(straight.cell_volumes, n_pieces) / n_pieces, rtol=1e-9
-    )
+    assert_allclose(equal, np.repeat(straight.cell_volumes, n_pieces) / n_pieces, rtol=1e-9)
 
 
 def test_pieces_of_a_folded_cell_are_straight():
@@ -185,5 +184,5 @@ def test_pieces_of_a_folded_cell_are_straight():
     pieces = tetopt.Mesh(mesh.points, mesh.cells, midpoints).straight_pieces()[0]
     assert tetopt.check_mesh(pieces) == []
     shown, straight = pieces.points[len(mesh.points) :], mesh.points[edges].mean(axis=1)
-    np.testing.assert_array_equal(shown[number[cell]], straight[number[cell]])
+    assert_array_equal(shown[number[cell]], straight[number[cell]])
     assert 0.5 < (shown == midpoints).all(axis=1).mean() < 1.0

@@ -25,6 +25,7 @@ from meshes import (
     single,
     sliver,
 )
+from numpy.testing import assert_allclose, assert_array_equal
 
 from tetopt.geometry.simplex import (
     centroids,
@@ -71,14 +72,14 @@ def test_volumes_of_single_cells(mesh, volume):
 def test_volumes_are_those_of_exact_arithmetic(seed, n):
     points, cells = random_cells(seed, n)
     exact = [float(naive.signed_volume([naive.exactly(points)[a] for a in cell])) for cell in cells]
-    np.testing.assert_allclose(volumes(points, cells), exact, rtol=1e-12, atol=1e-15)
+    assert_allclose(volumes(points, cells), exact, rtol=1e-12, atol=1e-15)
 
 
 def test_volumes_do_not_depend_on_how_many_are_taken_at_a_time(monkeypatch):
     points, cells = random_cells(3, 3)
     whole = volumes(points, cells)
     monkeypatch.setattr(sys.modules["tetopt.geometry.simplex"], "CELLS_AT_A_TIME", 2)
-    np.testing.assert_array_equal(volumes(points, cells), whole)
+    assert_array_equal(volumes(points, cells), whole)
 
 
 def test_volume_is_exactly_zero_with_a_node_twice():
@@ -111,10 +112,10 @@ def test_oriented_swaps_the_last_two_nodes_of_negative_cells_only(seed, n):
     turned = oriented(points, cells)
     is_negative = volumes(points, cells) < 0
     assert (volumes(points, turned) > 0).all()
-    np.testing.assert_array_equal(turned[~is_negative], cells[~is_negative])
-    np.testing.assert_array_equal(turned[is_negative, :-2], cells[is_negative, :-2])
-    np.testing.assert_array_equal(turned[is_negative, -2:], cells[is_negative][:, [-1, -2]])
-    np.testing.assert_array_equal(cells, given_cells)
+    assert_array_equal(turned[~is_negative], cells[~is_negative])
+    assert_array_equal(turned[is_negative, :-2], cells[is_negative, :-2])
+    assert_array_equal(turned[is_negative, -2:], cells[is_negative][:, [-1, -2]])
+    assert_array_equal(cells, given_cells)
     assert turned.dtype == np.int64
 
 
@@ -171,12 +172,10 @@ def test_volume_gradients_of_a_cell_sum_to_zero_and_give_n_volumes(seed, n):
     """Translation changes no volume; and Euler: sum_i x_i . dv/dx_i = n v."""
     points, cells = random_cells(seed, n)
     gradients = volume_gradients(points, cells)
-    np.testing.assert_allclose(gradients.sum(axis=1), 0, atol=1e-13)
+    assert_allclose(gradients.sum(axis=1), 0, atol=1e-13)
     euler = (gradients * points[cells]).sum(axis=(1, 2))
-    np.testing.assert_allclose(euler, n * volumes(points, cells), rtol=1e-11, atol=1e-13)
-    np.testing.assert_allclose(
-        np.linalg.norm(gradients, axis=2) * n, facet_areas(points, cells), rtol=1e-13
-    )
+    assert_allclose(euler, n * volumes(points, cells), rtol=1e-11, atol=1e-13)
+    assert_allclose(np.linalg.norm(gradients, axis=2) * n, facet_areas(points, cells), rtol=1e-13)
 
 
 # Circumcentres
@@ -186,9 +185,7 @@ def test_volume_gradients_of_a_cell_sum_to_zero_and_give_n_volumes(seed, n):
 def test_circumcentres_are_as_far_from_every_node(seed, n):
     points, cells = random_cells(seed, n)
     distances = np.linalg.norm(points[cells] - naive.circumcentres(points, cells)[:, None], axis=2)
-    np.testing.assert_allclose(
-        distances, np.broadcast_to(distances[:, :1], distances.shape), rtol=1e-8
-    )
+    assert_allclose(distances, np.broadcast_to(distances[:, :1], distances.shape), rtol=1e-8)
 
 
 # rho
@@ -214,9 +211,9 @@ def test_rho_is_inradius_over_circumradius(seed, n):
     points, cells = random_cells(seed, n)
     inradius = n * volumes(points, cells) / facet_areas(points, cells).sum(axis=1)
     circumradius = np.linalg.norm(points[cells[:, 0]] - naive.circumcentres(points, cells), axis=1)
-    np.testing.assert_allclose(rho(points, cells), inradius / circumradius, rtol=1e-7)
+    assert_allclose(rho(points, cells), inradius / circumradius, rtol=1e-7)
     assert (rho(points, cells) <= 1 / n + 1e-15).all()
-    np.testing.assert_allclose(rho(points, cells[:, ::-1]), rho(points, cells), rtol=1e-12)
+    assert_allclose(rho(points, cells[:, ::-1]), rho(points, cells), rtol=1e-12)
 
 
 @pytest.mark.parametrize("kind", BAD_TETS)
@@ -272,9 +269,7 @@ def test_dihedral_angles_of_slivers_and_needles_are_accurate(t):
     around = np.degrees(2 * np.arcsin(sqrt(2) * t / sqrt(1 + 4 * t * t)))
     across = 180 - np.degrees(2 * np.arctan(2 * t))
     expected = np.array([around, across, around, around, across, around])
-    np.testing.assert_allclose(
-        np.sort(dihedral_angles(*single(sliver(t)))[0]), np.sort(expected), rtol=1e-6
-    )
+    assert_allclose(np.sort(dihedral_angles(*single(sliver(t)))[0]), np.sort(expected), rtol=1e-6)
     at_short = np.degrees(2 * np.arctan(t / 2))
     angles = dihedral_angles(*single(needle(t)))[0]
     assert angles[[0, 5]] == pytest.approx([at_short] * 2, rel=1e-6)
@@ -306,18 +301,14 @@ def test_rotation_scaling_and_translation(seed, n):
         rng.uniform(-10, 10, n),
     )
     moved = scale * points @ rotation.T + shift
-    np.testing.assert_allclose(
-        volumes(moved, cells), scale**n * volumes(points, cells), rtol=1e-8, atol=1e-9
-    )
-    np.testing.assert_allclose(
+    assert_allclose(volumes(moved, cells), scale**n * volumes(points, cells), rtol=1e-8, atol=1e-9)
+    assert_allclose(
         facet_areas(moved, cells), scale ** (n - 1) * facet_areas(points, cells), rtol=1e-8
     )
-    np.testing.assert_allclose(rho(moved, cells), rho(points, cells), rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(
-        dihedral_angles(moved, cells), dihedral_angles(points, cells), atol=1e-6
-    )
+    assert_allclose(rho(moved, cells), rho(points, cells), rtol=1e-6, atol=1e-9)
+    assert_allclose(dihedral_angles(moved, cells), dihedral_angles(points, cells), atol=1e-6)
     rotated = volume_gradients(points, cells) @ rotation.T * scale ** (n - 1)
-    np.testing.assert_allclose(volume_gradients(moved, cells), rotated, rtol=1e-7, atol=1e-9)
+    assert_allclose(volume_gradients(moved, cells), rotated, rtol=1e-7, atol=1e-9)
 
 
 @pytest.mark.parametrize("mesh", ALL_SMALL)
@@ -329,13 +320,11 @@ def test_far_from_the_origin_nothing_is_lost(mesh):
     rng = np.random.default_rng(3)
     shift = 2.0**20 * rng.choice([-1, 1], points.shape[1])
     grid = np.round(points * 2.0**30) / 2.0**30  # exact after the shift
-    np.testing.assert_array_equal(volumes(grid + shift, cells), volumes(grid, cells))
-    np.testing.assert_array_equal(rho(grid + shift, cells), rho(grid, cells))
-    np.testing.assert_array_equal(
-        dihedral_angles(grid + shift, cells), dihedral_angles(grid, cells)
-    )
-    np.testing.assert_array_equal(facet_areas(grid + shift, cells), facet_areas(grid, cells))
-    np.testing.assert_allclose(
+    assert_array_equal(volumes(grid + shift, cells), volumes(grid, cells))
+    assert_array_equal(rho(grid + shift, cells), rho(grid, cells))
+    assert_array_equal(dihedral_angles(grid + shift, cells), dihedral_angles(grid, cells))
+    assert_array_equal(facet_areas(grid + shift, cells), facet_areas(grid, cells))
+    assert_allclose(
         naive.circumcentres(grid + shift, cells) - shift,
         naive.circumcentres(grid, cells),
         atol=1e-9,

@@ -10,6 +10,7 @@ import meshio
 import numpy as np
 import pytest
 from models import loaded_model, sample_model, young_of
+from numpy.testing import assert_allclose, assert_array_equal
 
 from tetopt import InputError, Mesh
 from tetopt.geometry.quadratic import quadratic
@@ -72,8 +73,8 @@ def test_meshio_reads_points_and_cells_back(model):
     file = read_by_meshio(abaqus(model))
     (block,) = file.cells
     n_nodes, n_cells = len(model.mesh.points), len(model.mesh.cells)
-    np.testing.assert_array_equal(file.points[:n_nodes], model.mesh.points)
-    np.testing.assert_array_equal(block.data[:, :4], model.mesh.cells)
+    assert_array_equal(file.points[:n_nodes], model.mesh.points)
+    assert_array_equal(block.data[:, :4], model.mesh.cells)
     if model.order == 1:
         assert block.type == "tetra"
         assert len(file.points) == n_nodes
@@ -81,9 +82,7 @@ def test_meshio_reads_points_and_cells_back(model):
     assert block.type == "tetra10"
     assert block.data.shape == (n_cells, 10)
     ends = file.points[block.data[:, np.array(MIDPOINTS) - 1]]
-    np.testing.assert_allclose(
-        file.points[block.data[:, 4:]], ends.mean(axis=2), rtol=1e-15, atol=1e-17
-    )
+    assert_allclose(file.points[block.data[:, 4:]], ends.mean(axis=2), rtol=1e-15, atol=1e-17)
     assert len(np.unique(block.data)) == len(file.points)
     assert len(np.unique(file.points, axis=0)) == len(file.points)
 
@@ -95,13 +94,13 @@ def test_meshio_reads_node_and_cell_sets_back(model):
         nodes = file.point_sets[name]
         assert len(np.unique(nodes)) == len(nodes)
         is_corner = nodes < len(model.mesh.points)
-        np.testing.assert_array_equal(nodes[is_corner], nodes_of(model.mesh, rows))
+        assert_array_equal(nodes[is_corner], nodes_of(model.mesh, rows))
         corners = np.sort(facet_triples(model.mesh.cells, rows), axis=1)
         edges = np.unique(
             np.concatenate([corners[:, pair] for pair in ([0, 1], [1, 2], [0, 2])]), axis=0
         )
         middles = model.mesh.points[edges].mean(axis=1) if model.order == 2 else np.empty((0, 3))
-        np.testing.assert_allclose(
+        assert_allclose(
             np.unique(file.points[nodes[~is_corner]], axis=0),
             np.unique(middles, axis=0),
             rtol=1e-15,
@@ -110,7 +109,7 @@ def test_meshio_reads_node_and_cell_sets_back(model):
     own = {"all_cells", *named_materials(model)} - set(model.sets.cells)
     assert [name for name in file.cell_sets if name not in own] == list(model.sets.cells)
     for name, cells in {**model.sets.cells, "all_cells": np.arange(len(model.mesh.cells))}.items():
-        np.testing.assert_array_equal(file.cell_sets[name][0], cells)
+        assert_array_equal(file.cell_sets[name][0], cells)
 
 
 def test_surfaces_are_the_facets_by_the_manual_s_faces(model):
@@ -121,10 +120,10 @@ def test_surfaces_are_the_facets_by_the_manual_s_faces(model):
             [model.mesh.cells[int(cell) - 1][k - 1] for k in FACES[face]]
             for cell, face in surfaces[name]
         ]
-        np.testing.assert_array_equal([int(cell) - 1 for cell, _ in surfaces[name]], rows[:, 0])
+        assert_array_equal([int(cell) - 1 for cell, _ in surfaces[name]], rows[:, 0])
         # Faces are listed as seen from outside, clockwise: the same nodes, turned the other way.
         expected = facet_triples(model.mesh.cells, rows)
-        np.testing.assert_array_equal(np.sort(nodes, axis=1), np.sort(expected, axis=1))
+        assert_array_equal(np.sort(nodes, axis=1), np.sort(expected, axis=1))
     assert {face for data in surfaces.values() for _, face in data} == set(FACES)
 
 
@@ -145,8 +144,8 @@ def test_each_cell_has_its_material_and_no_other(model):
         cells = [int(cell) - 1 for line in elements[name] for cell in line]
         assert np.isnan(constants[cells]).all()
         constants[cells] = float(young), float(nu)
-    np.testing.assert_array_equal(constants[:, 0], young_of(model))
-    np.testing.assert_array_equal(constants[:, 1], model.materials.nu[model.materials.of_cell])
+    assert_array_equal(constants[:, 0], young_of(model))
+    assert_array_equal(constants[:, 1], model.materials.nu[model.materials.of_cell])
 
 
 def test_the_step_holds_and_moves_all_three_components():
@@ -263,11 +262,11 @@ def test_numbers_of_more_than_twenty_characters_are_rounded_to_fit(value):
         for text in line
     }
     assert max(map(len, written)) <= 20
-    np.testing.assert_allclose(read_by_meshio(raw).points, mesh.points, rtol=5e-13, atol=0.0)
+    assert_allclose(read_by_meshio(raw).points, mesh.points, rtol=5e-13, atol=0.0)
     ((young, nu),) = next(data for word, _, data in blocks_of(raw) if word == "*ELASTIC")
-    np.testing.assert_allclose([float(young), float(nu)], [-11.0 * value, 1.0 / 30.0], rtol=5e-13)
+    assert_allclose([float(young), float(nu)], [-11.0 * value, 1.0 / 30.0], rtol=5e-13)
     (conditions,) = (data for word, _, data in blocks_of(raw) if word == "*BOUNDARY")
-    np.testing.assert_allclose([float(line[3]) for line in conditions], value, rtol=5e-13)
+    assert_allclose([float(line[3]) for line in conditions], value, rtol=5e-13)
 
 
 def test_what_the_format_cannot_carry_is_refused():
@@ -340,8 +339,8 @@ def test_a_nonlinear_law_is_the_linear_one_at_small_strains():
     found = re.findall(r"\*HYPERELASTIC, NEO HOOKE\n(\S+), (\S+)\n", abaqus(model).decode())
     young, nu = model.materials.young, model.materials.nu
     c10, d1 = np.array(found, dtype=float).T
-    np.testing.assert_allclose(2.0 * c10, young / (2.0 * (1.0 + nu)), rtol=1e-12)
-    np.testing.assert_allclose(2.0 / d1, young / (3.0 * (1.0 - 2.0 * nu)), rtol=1e-12)
+    assert_allclose(2.0 * c10, young / (2.0 * (1.0 + nu)), rtol=1e-12)
+    assert_allclose(2.0 / d1, young / (3.0 * (1.0 - 2.0 * nu)), rtol=1e-12)
 
 
 @pytest.mark.parametrize("order", [1, 2])
@@ -357,11 +356,11 @@ def test_a_modulus_that_varies_is_one_that_depends_on_the_temperature(order):
     )
     for table in tables:
         young = np.interp(degrees, table[:, 2], table[:, 0])
-        np.testing.assert_allclose(young[: len(model.node_young)], model.node_young, rtol=1e-14)
+        assert_allclose(young[: len(model.node_young)], model.node_young, rtol=1e-14)
     ends = model.mesh.cells[:, [0, 1]]
     if order == 2:
         middles = quadratic(model.mesh.points, model.mesh.cells)[1][:, 4]
-        np.testing.assert_allclose(degrees[middles], degrees[ends].mean(axis=1), rtol=1e-14)
+        assert_allclose(degrees[middles], degrees[ends].mean(axis=1), rtol=1e-14)
 
 
 def test_steps_that_a_file_cannot_tell_apart_are_refused():
@@ -386,7 +385,7 @@ def test_sets_are_read_back(model, tmp_path):
     )
     for kind, others in zip(read, model.sets, strict=True):
         for name, members in kind.items():
-            np.testing.assert_array_equal(members, others[name])
+            assert_array_equal(members, others[name])
     turned = Mesh(model.mesh.points, model.mesh.cells[::-1])
     assert input_sets(tmp_path / "a.inp", turned) is None
     (tmp_path / "b.inp").write_text("** by hand\n" + abaqus(model).decode())

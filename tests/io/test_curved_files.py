@@ -10,6 +10,7 @@ import pytest
 import pyvista
 from meshes import with_bent_edges
 from models import quadratic_model
+from numpy.testing import assert_allclose, assert_array_equal
 
 import tetopt
 from tetopt import load_mesh, save_model
@@ -71,7 +72,7 @@ def test_others_read_the_curved_nodes(suffix, n, tmp_path):
         theirs = theirs[:, : ours.shape[1]]
     order = np.lexsort(theirs[:, : n + 1].mean(axis=1).T)
     own = np.lexsort(nodes[ours][:, : n + 1].mean(axis=1).T)
-    np.testing.assert_allclose(theirs[order], nodes[ours][own], rtol=1e-6, atol=1e-6)
+    assert_allclose(theirs[order], nodes[ours][own], rtol=1e-6, atol=1e-6)
 
 
 def test_mfem_and_medit_have_them_too(tmp_path):
@@ -97,21 +98,19 @@ def test_they_come_back_and_go_on(suffix, n, tmp_path):
     model = curved_model(n)
     save_model(tmp_path / f"a{suffix}", model)
     back = load_mesh(tmp_path / f"a{suffix}")
-    np.testing.assert_allclose(back.mesh.midpoints, model.mesh.midpoints, rtol=1e-14, atol=1e-13)
+    assert_allclose(back.mesh.midpoints, model.mesh.midpoints, rtol=1e-14, atol=1e-13)
     assert any("edges are curved by up to" in note for note in back.notes)
     assert tetopt.build_model(back).order == 2
     tetopt.save_mesh(tmp_path / "b.vtu", back.mesh, order=2)
-    np.testing.assert_array_equal(load_mesh(tmp_path / "b.vtu").mesh.midpoints, back.mesh.midpoints)
+    assert_array_equal(load_mesh(tmp_path / "b.vtu").mesh.midpoints, back.mesh.midpoints)
 
 
 def test_turned_to_lps_and_back(tmp_path):
     model = curved_model()
     save_model(tmp_path / "a.vtu", model, space="lps")
     turned = np.asarray(pyvista.read(tmp_path / "a.vtu").points)[len(model.mesh.points) :]
-    np.testing.assert_array_equal(turned, model.mesh.midpoints * (-1.0, -1.0, 1.0))
-    np.testing.assert_array_equal(
-        load_mesh(tmp_path / "a.vtu").mesh.midpoints, model.mesh.midpoints
-    )
+    assert_array_equal(turned, model.mesh.midpoints * (-1.0, -1.0, 1.0))
+    assert_array_equal(load_mesh(tmp_path / "a.vtu").mesh.midpoints, model.mesh.midpoints)
 
 
 def test_cells_turned_by_the_reader_keep_their_midpoints(tmp_path):
@@ -129,7 +128,7 @@ def test_cells_turned_by_the_reader_keep_their_midpoints(tmp_path):
             which, place = np.argwhere(
                 (np.sort(cells[:, :4][:, cell_edges(3)], axis=2) == pair).all(axis=2)
             )[0]
-            np.testing.assert_array_equal(theirs[cell], nodes[cells[which, 4 + place]])
+            assert_array_equal(theirs[cell], nodes[cells[which, 4 + place]])
 
 
 def test_order_1_leaves_them_out():

@@ -9,6 +9,7 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 from models import LOAD_CASES, displaced, loaded_model, sample_model
+from numpy.testing import assert_allclose, assert_array_equal
 
 from tetopt.errors import InputError
 from tetopt.fem.solution import solve
@@ -106,18 +107,18 @@ class Feb:
 def assert_same(feb, model):
     mesh, sets, table = model.mesh, model.sets, model.materials
     assert feb.type == "tet4"
-    np.testing.assert_array_equal(feb.node_ids, np.arange(1, len(mesh.points) + 1))
+    assert_array_equal(feb.node_ids, np.arange(1, len(mesh.points) + 1))
     assert feb.points.tobytes() == mesh.points.tobytes()
-    np.testing.assert_array_equal(feb.cells, mesh.cells)
+    assert_array_equal(feb.cells, mesh.cells)
     assert list(feb.surfaces) == list(feb.node_sets) == list(sets.facets)
     for name, members in sets.facets.items():
-        np.testing.assert_array_equal(feb.surfaces[name], facet_triples(mesh.cells, members))
-        np.testing.assert_array_equal(feb.node_sets[name], nodes_of(mesh, members))
+        assert_array_equal(feb.surfaces[name], facet_triples(mesh.cells, members))
+        assert_array_equal(feb.node_sets[name], nodes_of(mesh, members))
     assert list(feb.cell_sets) == list(sets.cells)
     for name, cells in sets.cells.items():
-        np.testing.assert_array_equal(feb.cell_sets[name], cells)
-    np.testing.assert_array_equal(feb.moduli("E"), table.young[table.of_cell])
-    np.testing.assert_array_equal(feb.moduli("v"), table.nu[table.of_cell])
+        assert_array_equal(feb.cell_sets[name], cells)
+    assert_array_equal(feb.moduli("E"), table.young[table.of_cell])
+    assert_array_equal(feb.moduli("v"), table.nu[table.of_cell])
     assert set(feb.data) <= {"E", "v", "density"}
 
 
@@ -150,11 +151,11 @@ def test_quadratic():
     points, cells = quadratic(model.mesh.points, model.mesh.cells)
     assert feb.type == "tet10"
     assert feb.points.tobytes() == points.tobytes()
-    np.testing.assert_array_equal(feb.cells, cells)
+    assert_array_equal(feb.cells, cells)
     for name, members in model.sets.facets.items():
         nodes = quadratic_facet_nodes(cells, members)
-        np.testing.assert_array_equal(feb.surfaces[name], nodes)
-        np.testing.assert_array_equal(feb.node_sets[name], np.unique(nodes))
+        assert_array_equal(feb.surfaces[name], nodes)
+        assert_array_equal(feb.node_sets[name], np.unique(nodes))
 
 
 def test_one_ratio_is_no_map():
@@ -347,9 +348,9 @@ def test_what_the_file_says_is_what_fem_solves(case, order):
             springs[here] += stiffness[each.get("dmat")] * np.outer(along, along)
     n = len(elements(model)[0])
     # the same in all directions
-    np.testing.assert_allclose(springs, springs[:, :1, :1] * np.eye(3), atol=1e-12)
+    assert_allclose(springs, springs[:, :1, :1] * np.eye(3), atol=1e-12)
     u = displaced(model, is_prescribed[:n], prescribed[:n], forces[:n], springs[:n, 0, 0])
-    np.testing.assert_allclose(u, solve(model).u, atol=1e-9 * np.abs(u).max())
+    assert_allclose(u, solve(model).u, atol=1e-9 * np.abs(u).max())
 
 
 def test_several_steps_are_several_files():

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import pyvista_frd
 from models import young_of
+from numpy.testing import assert_allclose, assert_array_equal
 from results import CASES, FOLDER, NU, our_displacement, solved_model
 
 from tetopt import InputError, Mesh
@@ -25,7 +26,7 @@ def path_of(order):
 
 def assert_printed(values, expected, digits=PRINTED):
     """Equal as far as printed: relative to the largest."""
-    np.testing.assert_allclose(values, expected, rtol=0.0, atol=digits * np.abs(expected).max())
+    assert_allclose(values, expected, rtol=0.0, atol=digits * np.abs(expected).max())
 
 
 def slopes_at(places, u, degree):
@@ -88,7 +89,7 @@ def test_a_binary_file_is_read_as_well(tmp_path):
     )
     assert list(binary.point_data) == list(text.point_data)
     for name, values in text.point_data.items():
-        np.testing.assert_allclose(binary.point_data[name], values, rtol=1e-12, atol=1e-15)
+        assert_allclose(binary.point_data[name], values, rtol=1e-12, atol=1e-15)
 
 
 def test_of_increments_the_last_is_taken(tmp_path):
@@ -107,10 +108,8 @@ def test_what_the_head_does_not_say_is_assumed(tmp_path):
         read_frd(path, solved_model(2).mesh) for path in (tmp_path / "a.frd", path_of(2))
     )
     assert results.notes == ("a.frd does not state its units: assuming mm and kPa",)
-    np.testing.assert_array_equal(
-        results.point_data["displacement"], known.point_data["displacement"]
-    )
-    np.testing.assert_allclose(
+    assert_array_equal(results.point_data["displacement"], known.point_data["displacement"])
+    assert_allclose(
         1e3 * results.point_data["stress_nodes"], known.point_data["stress_nodes"], rtol=1e-12
     )
 

@@ -22,6 +22,7 @@ from models import (
     unlabelled,
     young_of,
 )
+from numpy.testing import assert_allclose, assert_array_equal
 
 import tetopt.io.gmsh
 from tetopt.errors import InputError
@@ -226,7 +227,7 @@ def test_labels_too_large_for_numbers_are_numbered_from_1_with_a_table(suffix, t
     assert "label_2147483647" in text
     if suffix.startswith(".msh"):
         read = load_mesh(tmp_path / f"a{suffix}").cell_data["label"]
-        np.testing.assert_array_equal(np.sort(read), np.sort(labels))
+        assert_array_equal(np.sort(read), np.sort(labels))
 
 
 @pytest.mark.parametrize("version", WRITERS)
@@ -410,7 +411,7 @@ def test_moduli_by_label_are_read_back(tmp_path):
     )
     save_model(tmp_path / "a.msh", model)
     back = load_mesh(tmp_path / "a.msh").cell_data
-    np.testing.assert_array_equal(back["young"], np.where(back["label"] == 1, 10.0, 2.0))
+    assert_array_equal(back["young"], np.where(back["label"] == 1, 10.0, 2.0))
     assert "young" in meshio.read(tmp_path / "a.msh").cell_data
 
 
@@ -472,12 +473,10 @@ def test_our_reader_finds_the_model(version, n, space, bins, order, tmp_path, mo
         }
     assert set(back.cell_data) == set(expected)
     for name, values in expected.items():
-        np.testing.assert_array_equal(back.cell_data[name], values[of_cell])
+        assert_array_equal(back.cell_data[name], values[of_cell])
     assert set(back.sets.cells) == set(model.sets.cells)
     for name, members in model.sets.cells.items():
-        np.testing.assert_array_equal(
-            back.sets.cells[name], np.flatnonzero(np.isin(of_cell, members))
-        )
+        assert_array_equal(back.sets.cells[name], np.flatnonzero(np.isin(of_cell, members)))
     assert set(back.sets.facets) == set(model.sets.facets)
     for name, rows in model.sets.facets.items():
         triples = facet_triples(back.mesh.cells, back.sets.facets[name])
@@ -546,9 +545,9 @@ def test_results_come_back_in_our_axes_and_units(tmp_path):
     of_cell = np.array([place[tuple(cell)] for cell in back.mesh.cells.tolist()])
     assert set(back.cell_data) == {*cell_data, "young", "nu"}
     for name, values in cell_data.items():
-        np.testing.assert_allclose(back.cell_data[name], values[of_cell], rtol=1e-14)
+        assert_allclose(back.cell_data[name], values[of_cell], rtol=1e-14)
     for name in ("stress_nodes", "displacement"):
-        np.testing.assert_allclose(back.point_data[name], point_data[name], rtol=1e-14)
+        assert_allclose(back.point_data[name], point_data[name], rtol=1e-14)
 
 
 def test_comments_that_gmsh_has_put_at_the_end(tmp_path):
@@ -565,8 +564,8 @@ def test_comments_that_gmsh_has_put_at_the_end(tmp_path):
     back = load_mesh(tmp_path / "a.msh")
     assert back.space == "lps"
     assert set(back.sets.cells) == set(model.sets.cells)
-    np.testing.assert_array_equal(back.sets.cells["dark"], model.sets.cells["dark"])
-    np.testing.assert_array_equal(back.cell_data["young"], young_of(model))
+    assert_array_equal(back.sets.cells["dark"], model.sets.cells["dark"])
+    assert_array_equal(back.cell_data["young"], young_of(model))
     # Without the constants of a material there are no moduli: what is left are the groups' names.
     without = "".join(
         f"{line}\n" for line in more.splitlines() if not line.startswith("material_1:")
@@ -575,7 +574,7 @@ def test_comments_that_gmsh_has_put_at_the_end(tmp_path):
     back = load_mesh(tmp_path / "a.msh")
     assert "young" not in back.cell_data
     for k in (0, 1):
-        np.testing.assert_array_equal(
+        assert_array_equal(
             back.sets.cells[f"material_{k + 1}"], np.flatnonzero(model.materials.of_cell == k)
         )
 
@@ -686,7 +685,7 @@ def test_gmsh_reads_it(version, n, bins, order, tmp_path):
     assert np.array_equal(points[:, :n], own_points)
     sizes = np.sort(np.reshape(determinants, (len(own), -1)) / [0, 0, 2, 6][n], axis=0)
     expected = np.sort(volumes(model.mesh.points, model.mesh.cells))
-    np.testing.assert_allclose(sizes, np.broadcast_to(expected[:, None], sizes.shape), rtol=1e-10)
+    assert_allclose(sizes, np.broadcast_to(expected[:, None], sizes.shape), rtol=1e-10)
     smaller = set()
     for name, rows in sorted(model.sets.facets.items(), key=lambda item: len(item[1])):
         triples = [each for _, each in groups.pop(f"{n - 1} {name}", [])]

@@ -10,6 +10,7 @@ import meshio
 import numpy as np
 import pytest
 import pyvista
+from numpy.testing import assert_allclose, assert_array_equal
 
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import cell_edges, quadratic
@@ -80,7 +81,7 @@ def test_every_bit_comes_back(tmp_path, n):
     save_mesh(tmp_path / "a.vtu", mesh, fields, ABOUT)
     back = load_mesh(tmp_path / "a.vtu")
     assert back.mesh.points.tobytes() == mesh.points.tobytes()
-    np.testing.assert_array_equal(back.mesh.cells, mesh.cells)
+    assert_array_equal(back.mesh.cells, mesh.cells)
     assert back.n_turned == 0
     assert list(back.cell_data) == FIELDS
     for name, expected in fields.items():
@@ -95,15 +96,15 @@ def test_meshio_reads_the_same(tmp_path, n):
     fields = cell_fields(mesh, image_of(n))
     save_mesh(tmp_path / "a.vtu", mesh, fields, ABOUT)
     other = meshio.read(tmp_path / "a.vtu")
-    np.testing.assert_array_equal(other.points[:, :n], mesh.points)
-    np.testing.assert_array_equal(other.points[:, n:], 0.0)
+    assert_array_equal(other.points[:, :n], mesh.points)
+    assert_array_equal(other.points[:, n:], 0.0)
     assert [(block.type, len(block.data)) for block in other.cells] == [
         ("triangle" if n == 2 else "tetra", len(mesh.cells))
     ]
-    np.testing.assert_array_equal(other.cells[0].data, mesh.cells)
+    assert_array_equal(other.cells[0].data, mesh.cells)
     assert set(other.cell_data) == set(FIELDS)
     for name, expected in fields.items():
-        np.testing.assert_array_equal(other.cell_data[name][0], expected)
+        assert_array_equal(other.cell_data[name][0], expected)
     assert other.field_data["image"].tobytes().decode() == ABOUT["image"]
 
 
@@ -119,8 +120,8 @@ def test_files_of_meshio(tmp_path, file_format):
     )
     back = load_mesh(path)
     assert back.mesh.points.tobytes() == mesh.points.tobytes()
-    np.testing.assert_array_equal(back.mesh.cells, mesh.cells)
-    np.testing.assert_array_equal(back.cell_data["k"], np.arange(len(mesh.cells)))
+    assert_array_equal(back.mesh.cells, mesh.cells)
+    assert_array_equal(back.cell_data["k"], np.arange(len(mesh.cells)))
 
 
 def test_field_data_that_is_no_text_stays(tmp_path):
@@ -141,11 +142,11 @@ def test_fields_of_a_mesh_without_an_image():
     mesh = Mesh([[0, 0, 0], [2, 0, 0], [0, 2, 0], [0, 0, 2]], [[0, 1, 2, 3]])
     fields = cell_fields(mesh)
     assert list(fields) == ["volume", "rho", "min_dihedral"]
-    np.testing.assert_allclose(fields["volume"], [8 / 6])
+    assert_allclose(fields["volume"], [8 / 6])
     # 54.7 degrees
-    np.testing.assert_allclose(fields["min_dihedral"], [np.degrees(np.arccos(1 / np.sqrt(3)))])
+    assert_allclose(fields["min_dihedral"], [np.degrees(np.arccos(1 / np.sqrt(3)))])
     # Inradius 2 / (3 + sqrt 3), circumradius sqrt 3.
-    np.testing.assert_allclose(fields["rho"], [2 / (3 + np.sqrt(3)) / np.sqrt(3)])
+    assert_allclose(fields["rho"], [2 / (3 + np.sqrt(3)) / np.sqrt(3)])
 
 
 # --------------------------------------------------------------------------------------------------
@@ -161,8 +162,8 @@ def test_inverted_cells_are_turned_and_counted(tmp_path):
         write_grid(tmp_path / "a.vtu", {TETRA: swapped}, POINTS)
         back = load_mesh(tmp_path / "a.vtu")
         assert back.n_turned == len(turned)
-        np.testing.assert_allclose(volumes(back.mesh.points, back.mesh.cells), expected)
-        np.testing.assert_array_equal(np.sort(back.mesh.cells, axis=1), np.sort(cells, axis=1))
+        assert_allclose(volumes(back.mesh.points, back.mesh.cells), expected)
+        assert_array_equal(np.sort(back.mesh.cells, axis=1), np.sort(cells, axis=1))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -205,7 +206,7 @@ def test_quadratic_cells_become_their_corners(tmp_path, n):
     assert back.cell_data["k"].tolist() == list(range(grid.n_cells))
     # the corners in the order of the file, as ours are read
     nodes = np.argsort(place[: len(mesh.points)])
-    np.testing.assert_array_equal(back.mesh.points, mesh.points[nodes])
+    assert_array_equal(back.mesh.points, mesh.points[nodes])
     places = quadratic(back.mesh.points, back.mesh.cells)[0]
     own = {
         tuple(point): row
@@ -237,7 +238,7 @@ def test_cells_of_vtk_s_lagrange_kinds(tmp_path, n, order):
     back = load_mesh(tmp_path / "a.vtu")
     assert (back.order, back.n_left, back.notes) == (order, 2, ())
     assert back.mesh.points.tobytes() == mesh.points.tobytes()
-    np.testing.assert_array_equal(back.mesh.cells, mesh.cells)
+    assert_array_equal(back.mesh.cells, mesh.cells)
     assert back.cell_data["k"].tolist() == list(range(2, len(cells) + 2))
 
 
@@ -262,9 +263,9 @@ def test_quadratic_files_of_meshio(tmp_path, n, file_format):
     )
     back = load_mesh(path)
     assert back.mesh.points.tobytes() == mesh.points.tobytes()
-    np.testing.assert_array_equal(back.mesh.cells, mesh.cells)
+    assert_array_equal(back.mesh.cells, mesh.cells)
     assert (back.order, back.notes) == (2, ())
-    np.testing.assert_array_equal(back.point_data["u"], points + 1.0)
+    assert_array_equal(back.point_data["u"], points + 1.0)
 
 
 @pytest.mark.parametrize("n", [2, 3])
@@ -278,7 +279,7 @@ def test_save_mesh_of_order_2(tmp_path, n):
     assert (back.order, back.notes, back.text("image")) == (2, (), ABOUT["image"])
     assert back.cell_data["k"].tolist() == list(range(len(mesh.cells)))
     assert back.point_data["displacement"].tobytes() == (points * 0.5).tobytes()
-    np.testing.assert_allclose(back.point_data["corners"], points, rtol=1e-15, atol=1e-15)
+    assert_allclose(back.point_data["corners"], points, rtol=1e-15, atol=1e-15)
 
 
 @pytest.mark.parametrize("n", [2, 3])
@@ -297,7 +298,7 @@ def test_curved_edges_are_kept_and_told(tmp_path, n):
     assert note == f"2 of {len(edges)} edges are curved by up to {off} mm"
     in_file = np.asarray(grid.points)[place[first:], :n]
     assert sorted(back.mesh.midpoints.tolist()) == sorted(in_file.tolist())
-    np.testing.assert_allclose(
+    assert_allclose(
         volumes(back.mesh.points, back.mesh.cells).sum(), volumes(mesh.points, mesh.cells).sum()
     )
 
@@ -399,7 +400,7 @@ def write_msh41(path, is_binary):
 def test_every_physical_group_becomes_a_set_of_a_valid_name(tmp_path, is_binary):
     write_msh41(tmp_path / "a.msh", is_binary)
     back = load_mesh(tmp_path / "a.msh")
-    np.testing.assert_array_equal(back.mesh.cells, TETRAHEDRA)
+    assert_array_equal(back.mesh.cells, TETRAHEDRA)
     first, second = [0, 3], [1, 2]  # rows of the triangles
     assert {name: rows.tolist() for name, rows in back.sets.facets.items()} == {
         "Skin": [first, second],

@@ -9,6 +9,7 @@ import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from meshes import CUBE_CORNER, TWO_TETS
+from numpy.testing import assert_allclose, assert_array_equal
 from shapes import n_pieces, volume_and_area
 from vtkmodules.vtkIOGeometry import vtkSTLReader
 from vtkmodules.vtkIOPLY import vtkPLYReader
@@ -88,7 +89,7 @@ def test_every_bit_and_the_order_come_back_from_ply(tmp_path):
     save_surface(tmp_path / "a.ply", surface)
     back = trimesh.load_mesh(tmp_path / "a.ply", process=False)
     assert np.asarray(back.vertices, dtype=np.float64).tobytes() == surface.points.tobytes()
-    np.testing.assert_array_equal(back.faces, surface.triangles)
+    assert_array_equal(back.faces, surface.triangles)
     assert [p.name for p in tmp_path.iterdir()] == ["a.ply"]
 
 
@@ -96,7 +97,7 @@ def test_stl_holds_the_nearest_float32_and_unit_normals(tmp_path):
     surface, _ = some_surface(3)
     save_surface(tmp_path / "a.stl", surface)
     back = trimesh.load_mesh(tmp_path / "a.stl", process=False)
-    np.testing.assert_array_equal(
+    assert_array_equal(
         np.asarray(back.vertices, dtype=np.float32),
         surface.points[surface.triangles].reshape(-1, 3).astype(np.float32),
     )
@@ -108,10 +109,8 @@ def test_stl_holds_the_nearest_float32_and_unit_normals(tmp_path):
         .copy()
         .view("<f4")
     )
-    np.testing.assert_allclose(np.linalg.norm(stored, axis=1), 1.0, rtol=1e-6)
-    np.testing.assert_allclose(
-        (stored * normals).sum(axis=1), np.linalg.norm(normals, axis=1), rtol=1e-6
-    )
+    assert_allclose(np.linalg.norm(stored, axis=1), 1.0, rtol=1e-6)
+    assert_allclose((stored * normals).sum(axis=1), np.linalg.norm(normals, axis=1), rtol=1e-6)
 
 
 def test_the_header_says_ras_where_slicer_looks(tmp_path):
@@ -154,9 +153,9 @@ def test_vtk_files_say_their_space_and_hold_every_bit(tmp_path, space):
         back = pyvista.read(tmp_path / f"a{suffix}")
         sign = np.array([1.0, 1.0, 1.0]) if space == "ras" else np.array([-1.0, -1.0, 1.0])
         assert np.asarray(back.points).tobytes() == (surface.points * sign).tobytes()
-        np.testing.assert_array_equal(back.regular_faces, surface.triangles)
+        assert_array_equal(back.regular_faces, surface.triangles)
         for name, values in labels.items():
-            np.testing.assert_array_equal(back.cell_data[name], values)
+            assert_array_equal(back.cell_data[name], values)
     assert (
         (tmp_path / "a.vtk")
         .read_bytes()

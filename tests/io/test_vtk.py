@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import pyvista
 from models import ABOUT, all_nodes, quadratic_model, sample_model, young_of
+from numpy.testing import assert_allclose, assert_array_equal
 
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import quadratic, quadratic_facet_nodes
@@ -28,7 +29,7 @@ def test_every_bit_comes_back(tmp_path, suffix, space, n, order):
     save_model(path, model, space=space)
     back = load_mesh(path)
     assert back.mesh.points.tobytes() == model.mesh.points.tobytes()
-    np.testing.assert_array_equal(back.mesh.cells, model.mesh.cells)
+    assert_array_equal(back.mesh.cells, model.mesh.cells)
     assert (back.n_turned, back.n_left, back.space, back.notes, back.order) == (
         0,
         0,
@@ -43,7 +44,7 @@ def test_every_bit_comes_back(tmp_path, suffix, space, n, order):
     for kind in (0, 1):
         assert set(back.sets[kind]) == set(model.sets[kind])
         for name, members in model.sets[kind].items():
-            np.testing.assert_array_equal(back.sets[kind][name], members)
+            assert_array_equal(back.sets[kind][name], members)
     table = model.materials
     expected = dict(model.cell_data) | {
         "young": table.young[table.of_cell],
@@ -52,7 +53,7 @@ def test_every_bit_comes_back(tmp_path, suffix, space, n, order):
     }
     assert set(back.cell_data) == set(expected)
     for name, values in expected.items():
-        np.testing.assert_array_equal(back.cell_data[name], values)
+        assert_array_equal(back.cell_data[name], values)
     texts = {name: str(back.field_data[name][0]) for name in (*ABOUT, "units", "space", "loads")}
     words = [
         load_words(
@@ -72,11 +73,11 @@ def test_other_readers_see_the_file_s_own_space_and_units(tmp_path, suffix):
         (pyvista.read(path).points, pyvista.read(path).cell_data["young"]),
         (meshio.read(path).points, meshio.read(path).cell_data["young"][0]),
     ):
-        np.testing.assert_array_equal(points, model.mesh.points * [-1, -1, 1])
-        np.testing.assert_allclose(young, young_of(model) / 1000.0, rtol=1e-15)
+        assert_array_equal(points, model.mesh.points * [-1, -1, 1])
+        assert_allclose(young, young_of(model) / 1000.0, rtol=1e-15)
     grid = pyvista.read(path)
     for name, rows in model.sets.facets.items():
-        np.testing.assert_array_equal(
+        assert_array_equal(
             np.flatnonzero(grid.point_data[f"on_{name}"]), nodes_of(model.mesh, rows)
         )
 
@@ -93,22 +94,22 @@ def test_other_readers_see_quadratic_cells(tmp_path, n, suffix):
     field = ((nodes - middle) ** 2).sum(axis=1)
     save_model(path, model._replace(point_data={"square": field}))
     other = meshio.read(path)
-    np.testing.assert_array_equal(other.points[:, :n], nodes)
+    assert_array_equal(other.points[:, :n], nodes)
     assert [(block.type, block.data.tolist()) for block in other.cells] == [
         ({2: "triangle6", 3: "tetra10"}[n], cells.tolist())
     ]
     grid = pyvista.read(path)
-    np.testing.assert_array_equal(grid.points[:, :n], nodes)
+    assert_array_equal(grid.points[:, :n], nodes)
     for name, rows in model.sets.facets.items():
         on_set = np.unique(quadratic_facet_nodes(cells, rows))
-        np.testing.assert_array_equal(np.flatnonzero(grid.point_data[f"on_{name}"]), on_set)
-        np.testing.assert_array_equal(np.flatnonzero(other.point_data[f"on_{name}"]), on_set)
+        assert_array_equal(np.flatnonzero(grid.point_data[f"on_{name}"]), on_set)
+        assert_array_equal(np.flatnonzero(other.point_data[f"on_{name}"]), on_set)
     centres = model.mesh.points[model.mesh.cells].mean(axis=1)
     expected = ((centres - middle) ** 2).sum(axis=1)
     places = pyvista.PolyData(np.column_stack([centres, np.zeros((len(centres), 3 - n))]))
     # VTK looks for a place in a cell by iteration. Were two edges exchanged, values would be off by
     # 1.
-    np.testing.assert_allclose(places.sample(grid)["square"], expected, rtol=0, atol=0.01)
+    assert_allclose(places.sample(grid)["square"], expected, rtol=0, atol=0.01)
 
 
 def test_point_data_of_another_length_is_refused():
@@ -140,17 +141,17 @@ def test_results_are_turned_and_scaled_with_the_file(tmp_path):
     save_model(tmp_path / "a.vtu", model, space="lps", units="MPa")
     grid, turn = pyvista.read(tmp_path / "a.vtu"), np.diag([-1.0, -1.0, 1.0])
     there = turn @ tensor @ turn.T
-    np.testing.assert_allclose(grid.cell_data["stress"], there.reshape(-1, 9) / 1000.0, rtol=1e-14)
-    np.testing.assert_allclose(grid.cell_data["strain_step2"], there.reshape(-1, 9), rtol=1e-14)
-    np.testing.assert_allclose(grid.cell_data["von_mises"], tensor[:, 0, 0] / 1000.0, rtol=1e-14)
-    np.testing.assert_allclose(
+    assert_allclose(grid.cell_data["stress"], there.reshape(-1, 9) / 1000.0, rtol=1e-14)
+    assert_allclose(grid.cell_data["strain_step2"], there.reshape(-1, 9), rtol=1e-14)
+    assert_allclose(grid.cell_data["von_mises"], tensor[:, 0, 0] / 1000.0, rtol=1e-14)
+    assert_allclose(
         grid.point_data["displacement_step2"], (model.mesh.points + 1.0) @ turn, rtol=1e-14
     )
     back = load_mesh(tmp_path / "a.vtu")
     for fields, expected in ((back.cell_data, cell_data), (back.point_data, point_data)):
         assert set(fields) == set(expected)
         for name, values in expected.items():
-            np.testing.assert_allclose(fields[name], values, rtol=1e-14, err_msg=name)
+            assert_allclose(fields[name], values, rtol=1e-14, err_msg=name)
 
 
 def test_stresses_of_an_unknown_unit_are_left_out(tmp_path):
@@ -196,7 +197,7 @@ def test_a_file_of_3d_slicer_s_in_lps_is_turned(tmp_path, suffix):
         path.write_text("\n".join([lines[0], "3D Slicer output. SPACE=LPS", *lines[2:]]))
     back = load_mesh(path)
     assert back.space == "lps"
-    np.testing.assert_allclose(back.mesh.points, model.mesh.points, rtol=1e-9)
+    assert_allclose(back.mesh.points, model.mesh.points, rtol=1e-9)
 
 
 def turned(grid):
@@ -319,7 +320,7 @@ def test_the_box_of_ours_comes_back(tmp_path):
     save_model(tmp_path / "a.vtu", sample_model(3)._replace(about={"box": BOX}))
     box = load_mesh(tmp_path / "a.vtu").box
     assert box.shape == (9, 8, 7)
-    np.testing.assert_array_equal(box.affine, BOX["affine"])
+    assert_array_equal(box.affine, BOX["affine"])
 
 
 def test_meshio_reads_a_legacy_file_of_data_that_came_from_a_vtu_file(tmp_path):
@@ -341,7 +342,7 @@ def test_meshio_reads_a_legacy_file_of_data_that_came_from_a_vtu_file(tmp_path):
     other = meshio.read(tmp_path / "b.vtk")
     assert set(other.cell_data) == set(fields)
     for name, values in fields.items():
-        np.testing.assert_array_equal(other.cell_data[name][0].ravel(), values)
+        assert_array_equal(other.cell_data[name][0].ravel(), values)
         kind = np.int32 if name in ("n_voxels", "label", "material") else np.float64
         assert other.cell_data[name][0].dtype.newbyteorder("=") == kind
 

@@ -4,6 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from tetopt import Image, InputError, cell_moments, cell_of_voxel, lattice_mesh
 from tetopt.fem.solution import gauss_moduli, solve
@@ -35,14 +36,14 @@ def test_the_cell_s_modulus_is_the_mean_of_the_mapping_over_its_voxels(shape):
     moments = cell_moments(image, mesh)
     assert moments.variance.min() > 0.0
     linear = cell_young(image, mesh, lambda h: 1.0 + h / 50.0)
-    np.testing.assert_allclose(linear, 1.0 + moments.mean / 50.0, rtol=1e-12)
+    assert_allclose(linear, 1.0 + moments.mean / 50.0, rtol=1e-12)
     owner = cell_of_voxel(image, mesh).ravel()
     squares = (image.data.astype(np.float64) ** 2).ravel()
     expected = np.bincount(owner, squares) / np.bincount(owner)
     moduli = cell_young(image, mesh, lambda h: h**2)
-    np.testing.assert_allclose(moduli, expected, rtol=1e-12)
-    np.testing.assert_allclose(moduli - moments.mean**2, moments.variance, rtol=1e-9)
-    np.testing.assert_allclose(cell_young(image, mesh), moments.mean, rtol=1e-14)
+    assert_allclose(moduli, expected, rtol=1e-12)
+    assert_allclose(moduli - moments.mean**2, moments.variance, rtol=1e-9)
+    assert_allclose(cell_young(image, mesh), moments.mean, rtol=1e-14)
 
 
 AVERAGES = {
@@ -107,9 +108,7 @@ def test_averages_are_in_the_order_of_their_powers():
         assert (less < more).all()
     hill = cell_young(image, mesh, lambda h: 1.0 + h, "hill")
     assert ((moduli[1] < hill) & (hill < moduli[5])).all()
-    np.testing.assert_allclose(
-        cell_young(image, mesh, lambda h: 1.0 + h, "power:-1"), moduli[1], rtol=1e-14
-    )
+    assert_allclose(cell_young(image, mesh, lambda h: 1.0 + h, "power:-1"), moduli[1], rtol=1e-14)
     for each in [*words, "hill", "nodes", "gauss"]:
         assert (cell_young(image, mesh, lambda h: 0.7 + 0.0 * h, each) == 0.7).all()
         for order in (1, 2):
@@ -151,12 +150,8 @@ def test_a_mapping_need_not_be_one_for_voxels_beside_the_mesh(average):
         )
     )
     moduli = element_young(air, part, lambda h: 1.0 + h, average, 2)
-    np.testing.assert_array_equal(
-        moduli, element_young(image, part, lambda h: 1.0 + np.abs(h), average, 2)
-    )
-    np.testing.assert_array_equal(
-        cell_values(air, part, np.sqrt), cell_values(image, part, np.sqrt)
-    )
+    assert_array_equal(moduli, element_young(image, part, lambda h: 1.0 + np.abs(h), average, 2))
+    assert_array_equal(cell_values(air, part, np.sqrt), cell_values(image, part, np.sqrt))
     with pytest.raises(InputError, match="expected 0 kPa or more"):
         element_young(air, mesh, lambda h: 1.0 + h, average, 2)
 
@@ -202,8 +197,8 @@ def test_moduli_of_nodes(shape):
         hats = np.linalg.solve(frame, [*image.to_world(place[None].astype(float))[0], 1.0])
         weight[corners] += hats
         total[corners] += hats * np.log(1.0 + image.data[tuple(place)])
-    np.testing.assert_allclose(young, np.exp(total / weight), rtol=1e-9)
-    np.testing.assert_allclose(
+    assert_allclose(young, np.exp(total / weight), rtol=1e-9)
+    assert_allclose(
         cell_young(image, mesh, lambda h: 1.0 + h, "nodes"),
         young[mesh.cells].mean(axis=1),
         rtol=1e-15,
@@ -218,7 +213,7 @@ def test_a_node_without_voxels_has_the_nearest_one_s_modulus():
     is_empty = np.bincount(mesh.cells.ravel(), np.repeat(counts, 4)) == 0
     assert is_empty.sum() > 100
     index = np.clip(np.rint(image.to_index(mesh.points)).astype(int), 0, 2)
-    np.testing.assert_array_equal(young[is_empty], 1.0 + image.data[tuple(index[is_empty].T)])
+    assert_array_equal(young[is_empty], 1.0 + image.data[tuple(index[is_empty].T)])
 
 
 @pytest.mark.parametrize("n", [2, 3])
@@ -234,8 +229,8 @@ def test_moduli_at_gauss_points_are_linear_in_the_cell(n, order):
     young = 20.0 + mesh.points @ slope
     moduli = gauss_young(young, mesh, order)
     at = np.einsum("qa,cai->cqi", places, mesh.points[mesh.cells])
-    np.testing.assert_allclose(moduli, 20.0 + at @ slope, rtol=1e-13)
-    np.testing.assert_allclose(moduli @ weights, young[mesh.cells].mean(axis=1), rtol=1e-13)
+    assert_allclose(moduli, 20.0 + at @ slope, rtol=1e-13)
+    assert_allclose(moduli @ weights, young[mesh.cells].mean(axis=1), rtol=1e-13)
     assert (gauss_young(np.full(len(mesh.points), 0.7), mesh, order) == 0.7).all()
 
 
@@ -244,11 +239,11 @@ def test_a_model_has_moduli_of_nodes():
     mesh = lattice_mesh(image, blocks=(2, 2, 2))
     mapping = [(0.0, 1.0), (200.0, 10.0)]
     model = build_model(mesh, image, young=mapping, average="nodes")
-    np.testing.assert_array_equal(model.node_young, node_young(image, mesh, mapping))
-    np.testing.assert_array_equal(
+    assert_array_equal(model.node_young, node_young(image, mesh, mapping))
+    assert_array_equal(
         model.materials.young[model.materials.of_cell], gauss_young(model.node_young, mesh, 1)[:, 0]
     )
-    np.testing.assert_array_equal(
+    assert_array_equal(
         build_model(mesh, image, young="1 + 0.045*h", average="nodes").node_young,
         node_young(image, mesh, lambda h: 1.0 + 0.045 * h),
     )
@@ -297,7 +292,7 @@ def test_moduli_around_gauss_points(shape):
             n_full, n_empty = n_full + bool(values), n_empty + (not values)
     assert n_full > 20
     assert n_empty > 0
-    np.testing.assert_array_equal(
+    assert_array_equal(
         element_young(image, mesh, lambda h: 1.0 + h, "gauss"),
         cell_young(image, mesh, lambda h: 1.0 + h, "geometric"),
     )
@@ -311,12 +306,10 @@ def test_a_model_has_moduli_at_gauss_points():
     mesh = lattice_mesh(image, blocks=(2, 2, 2))
     mapping = [(0.0, 1.0), (200.0, 10.0)]
     model = build_model(mesh, image, young=mapping, average="gauss", order=2, loads=["compress:1%"])
-    np.testing.assert_array_equal(
-        gauss_moduli(model), element_young(image, mesh, mapping, "gauss", 2)
-    )
-    np.testing.assert_array_equal(gauss_moduli(in_units(model, "MPa")), gauss_moduli(model) * 1e-3)
+    assert_array_equal(gauss_moduli(model), element_young(image, mesh, mapping, "gauss", 2))
+    assert_array_equal(gauss_moduli(in_units(model, "MPa")), gauss_moduli(model) * 1e-3)
     of_cells = model.materials.young[model.materials.of_cell]
-    np.testing.assert_array_equal(of_cells, cell_young(image, mesh, mapping, "geometric"))
+    assert_array_equal(of_cells, cell_young(image, mesh, mapping, "geometric"))
     assert build_model(mesh, image, young=mapping, average="gauss").gauss_young is None
     one = solve(model)
     other = solve(model._replace(gauss_young=None))
@@ -333,4 +326,4 @@ def test_voxels_are_taken_in_parts(monkeypatch):
     monkeypatch.setattr("tetopt.model.averages.VOXELS_PER_CHUNK", 7)
     parts = element_young(image, mesh, average="gauss", order=2), node_young(image, mesh)
     for one, other in zip(whole, parts, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-13)
+        assert_allclose(one, other, rtol=1e-13)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from models import sample_image, sample_model, young_of
+from numpy.testing import assert_allclose, assert_array_equal
 
 from tetopt.errors import InputError
 from tetopt.model.averages import cell_values
@@ -68,14 +69,14 @@ def test_bins_by_number_and_by_logarithm():
 def test_enough_bins_change_nothing():
     exact = materials(YOUNG, 0.3, 5)
     table = binned(exact, np.ones(5), 4)
-    np.testing.assert_array_equal(table.young, exact.young)
+    assert_array_equal(table.young, exact.young)
     assert table.binning == (0.0, 0.0)
 
 
 def test_ratios_by_label_are_not_blended():
     table = binned(materials(np.arange(1.0, 11.0), np.repeat([0.3, 0.45], 5), 10), np.ones(10), 3)
     assert set(table.nu) == {0.3, 0.45}
-    np.testing.assert_array_equal(table.nu[table.of_cell], np.repeat([0.3, 0.45], 5))
+    assert_array_equal(table.nu[table.of_cell], np.repeat([0.3, 0.45], 5))
     many = binned(materials(1.0, np.linspace(0.0, 0.4, 9), 9), np.ones(9), 2)
     assert len(many.nu) == 2
 
@@ -137,15 +138,13 @@ def test_a_model_s_table_names_mappings_and_sets():
         about=about,
     )
     is_bright = model.cell_data["label"] == 1
-    np.testing.assert_array_equal(
+    assert_array_equal(
         named.materials.young[named.materials.of_cell], np.where(is_bright, 5.0, 2.0)
     )
-    np.testing.assert_array_equal(
-        named.materials.nu[named.materials.of_cell], np.where(is_bright, 0.4, 0.3)
-    )
+    assert_array_equal(named.materials.nu[named.materials.of_cell], np.where(is_bright, 0.4, 0.3))
     assert set(named.sets.cells) == {"rest", "bright_ball"}
     assert "interface_rest_bright_ball" in named.sets.facets
-    np.testing.assert_array_equal(
+    assert_array_equal(
         named.sets.facets["interface_rest_bright_ball"], model.sets.facets["interface_0_1"]
     )
 
@@ -156,10 +155,10 @@ def test_the_mean_of_the_mapping_and_the_mapping_of_the_mean():
     by_image = build_model(mesh, image, young="1 + h**2", average="mean")
     by_mean = build_model(mesh, young="1 + h**2", cell_data=fields)
     young = young_of(by_image)
-    np.testing.assert_allclose(young, cell_values(image, mesh, lambda h: 1.0 + h**2), rtol=1e-14)
-    np.testing.assert_allclose(young, 1.0 + fields["mean"] ** 2 + fields["variance"], rtol=1e-9)
+    assert_allclose(young, cell_values(image, mesh, lambda h: 1.0 + h**2), rtol=1e-14)
+    assert_allclose(young, 1.0 + fields["mean"] ** 2 + fields["variance"], rtol=1e-9)
     flat = young_of(by_mean)
-    np.testing.assert_allclose(flat, 1.0 + fields["mean"] ** 2, rtol=1e-14)
+    assert_allclose(flat, 1.0 + fields["mean"] ** 2, rtol=1e-14)
     assert (young > flat + 1.0).any()
 
 
@@ -200,12 +199,12 @@ def test_one_mapping_for_each_label_and_one_number_a_cell():
     table = build_model(
         model.mesh, young="0=1.5,1=4", nu="0=0.45,1=0.3", cell_data=model.cell_data
     ).materials
-    np.testing.assert_array_equal(table.young[table.of_cell], np.where(labels == 1, 4.0, 1.5))
-    np.testing.assert_array_equal(table.nu[table.of_cell], np.where(labels == 1, 0.3, 0.45))
+    assert_array_equal(table.young[table.of_cell], np.where(labels == 1, 4.0, 1.5))
+    assert_array_equal(table.nu[table.of_cell], np.where(labels == 1, 0.3, 0.45))
     moduli = np.linspace(1.0, 2.0, len(labels))
     for values in (moduli, moduli.tolist()):
         table = build_model(model.mesh, young=values, nu=np.float32(0.25)).materials
-        np.testing.assert_array_equal(table.young[table.of_cell], moduli)
+        assert_array_equal(table.young[table.of_cell], moduli)
         assert set(table.nu) == {0.25}
 
 
@@ -248,7 +247,7 @@ def test_density_by_mapping_by_label_and_from_the_moduli_s_file(tmp_path):
         (2.0, 1060, np.full(len(mean), 1060.0)),
     ):
         table = build_model(mesh, young=young, density=density, cell_data=fields).materials
-        np.testing.assert_allclose(table.density[table.of_cell], values, rtol=1e-14)
+        assert_allclose(table.density[table.of_cell], values, rtol=1e-14)
     assert build_model(mesh, young=2.0, cell_data=fields).materials.density is None
     with pytest.raises(InputError, match="a material also needs a modulus; give `young`"):
         build_model(mesh, density=1000.0)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 
 import tetopt
 from tetopt.model.formula import parse_formula
@@ -32,7 +33,7 @@ def test_values(text, expected):
     values = parse_formula(text)(H)
     assert values.shape == H.shape
     assert values.dtype == np.float64
-    np.testing.assert_allclose(values, expected, rtol=1e-15)
+    assert_allclose(values, expected, rtol=1e-15)
 
 
 @pytest.mark.parametrize(
@@ -107,15 +108,15 @@ def test_no_value_is_refused_with_the_intensity():
 
 def test_one_over_strain_is_the_papers_mapping():
     strain = np.array([0.02, -0.01, 0.0, 0.3])
-    np.testing.assert_array_equal(
+    assert_array_equal(
         young_from(parse_mapping("1/max(abs(h), 0.001)"), strain),
         1.0 / np.maximum(np.abs(strain), 0.001),
     )
 
 
 def test_mapping_is_a_table_or_a_formula():
-    np.testing.assert_array_equal(young_from(parse_mapping("0:1,100:5"), [50.0]), [3.0])
-    np.testing.assert_array_equal(young_from(parse_mapping("max(h, 60)"), [50.0]), [60.0])
+    assert_array_equal(young_from(parse_mapping("0:1,100:5"), [50.0]), [3.0])
+    assert_array_equal(young_from(parse_mapping("max(h, 60)"), [50.0]), [60.0])
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import warnings
 import numpy as np
 import pytest
 from models import ball_mesh, sample_image, sample_model
+from numpy.testing import assert_allclose, assert_array_equal
 
 import tetopt
 from tetopt.errors import InputError
@@ -39,10 +40,10 @@ def test_a_compression_is_that_of_fem(n):
     image, model = sample_image(n), sample_model(n)
     low, high = box_faces(image, model.mesh)
     top, bottom = parse_loads(["compress:5%"], model.mesh, model.sets)
-    np.testing.assert_array_equal(nodes_of(model.mesh, model.sets.facets[top.set_name]), high)
-    np.testing.assert_array_equal(nodes_of(model.mesh, model.sets.facets[bottom.set_name]), low)
+    assert_array_equal(nodes_of(model.mesh, model.sets.facets[top.set_name]), high)
+    assert_array_equal(nodes_of(model.mesh, model.sets.facets[bottom.set_name]), low)
     assert not top.numbers.any()
-    np.testing.assert_allclose(bottom.numbers, push_of(image, 5.0), atol=1e-12)
+    assert_allclose(bottom.numbers, push_of(image, 5.0), atol=1e-12)
 
 
 def test_a_sheared_box_is_pressed_along_its_faces_normal():
@@ -50,7 +51,7 @@ def test_a_sheared_box_is_pressed_along_its_faces_normal():
     image = tetopt.Image(np.zeros((4, 4, 4)), affine)
     mesh = tetopt.lattice_mesh(image, blocks=(1, 1, 1))
     (_, moved) = parse_loads(["compress:2.5%"], mesh, standard_sets(mesh, box_of(image)))
-    np.testing.assert_allclose(moved.numbers, push_of(image, 2.5), atol=1e-12)
+    assert_allclose(moved.numbers, push_of(image, 2.5), atol=1e-12)
 
 
 WORDS = {  # and what they mean in 3-D
@@ -171,9 +172,7 @@ def test_an_organ_is_pressed_along_the_world_axis(n):
     top, bottom = parse_loads(["compress:5%"], mesh, standard_sets(mesh))
     assert [top.set_name, bottom.set_name] == list(FACE_NAMES[n][-1])[::-1]
     assert not top.numbers.any()
-    np.testing.assert_allclose(
-        bottom.numbers, 0.05 * np.ptp(mesh.points, axis=0) * np.eye(n)[-1], rtol=1e-12
-    )
+    assert_allclose(bottom.numbers, 0.05 * np.ptp(mesh.points, axis=0) * np.eye(n)[-1], rtol=1e-12)
 
 
 @pytest.mark.parametrize("n", [2, 3])
@@ -242,11 +241,11 @@ def test_weights_integrate_what_cells_of_the_order_can_be(n, order):
     volume = volumes(mesh.points, mesh.cells).sum()
     # of each coordinate's unit vector
     flux = np.einsum("kw,ki,kwj->ij", weights, normals, points[nodes])
-    np.testing.assert_allclose(flux, volume * np.eye(n), atol=1e-10 * volume)
+    assert_allclose(flux, volume * np.eye(n), atol=1e-10 * volume)
     if order == 2:
         centre = volumes(mesh.points, mesh.cells) @ mesh.points[mesh.cells].mean(axis=1) / volume
         squares = np.einsum("kw,ki,kwi->i", weights, normals, points[nodes] ** 2)
-        np.testing.assert_allclose(squares, 2.0 * volume * centre, rtol=1e-12)
+        assert_allclose(squares, 2.0 * volume * centre, rtol=1e-12)
 
 
 def test_each_order_s_parts_of_a_facet():
@@ -256,12 +255,12 @@ def test_each_order_s_parts_of_a_facet():
     nodes, weights = facet_weights(solid, bottom, 1)
     assert (sorted(nodes[0].tolist()), weights.tolist()) == ([0, 1, 2], [[1 / 6] * 3])
     nodes, weights = facet_weights(solid, bottom, 2)
-    np.testing.assert_allclose(weights, [[0, 0, 0, 1 / 6, 1 / 6, 1 / 6]])
+    assert_allclose(weights, [[0, 0, 0, 1 / 6, 1 / 6, 1 / 6]])
     middles = quadratic(solid.points, solid.cells)[0][nodes[0, 3:]]
     assert sorted(middles.tolist()) == [[0, 0.5, 0], [0.5, 0, 0], [0.5, 0.5, 0]]
     plate = tetopt.Mesh([[0, 0], [2, 0], [0, 1]], [[0, 1, 2]])
     nodes, weights = facet_weights(plate, np.array([[0, 2]]), 2)
-    np.testing.assert_allclose(weights, [[1 / 3, 1 / 3, 4 / 3]])
+    assert_allclose(weights, [[1 / 3, 1 / 3, 4 / 3]])
     assert quadratic(plate.points, plate.cells)[0][nodes[0, 2]].tolist() == [1.0, 0.0]
 
 
@@ -274,23 +273,23 @@ def test_forces_add_up_to_stress_times_area(n, order):
     areas = area_vectors(mesh, sets.facets[name])
     area = np.linalg.norm(areas, axis=1).sum()
     nodes, forces = facet_forces(mesh, sets, Load("pressure", name, np.array([2.0])), order)
-    np.testing.assert_allclose(forces.sum(axis=0), -2.0 * areas.sum(axis=0), atol=1e-9)
+    assert_allclose(forces.sum(axis=0), -2.0 * areas.sum(axis=0), atol=1e-9)
     pull = np.array([1.0, -2.0, 0.5])[:n]
     also, forces = facet_forces(mesh, sets, Load("traction", name, pull), order)
-    np.testing.assert_allclose(forces.sum(axis=0), area * pull)
-    np.testing.assert_array_equal(nodes, also)
+    assert_allclose(forces.sum(axis=0), area * pull)
+    assert_array_equal(nodes, also)
     which, stiffness = spring_constants(mesh, sets, Load("spring", name, np.array([0.3])), order)
-    np.testing.assert_array_equal(nodes, which)
+    assert_array_equal(nodes, which)
     assert stiffness.sum() == pytest.approx(0.3 * area)
     assert (stiffness > 0.0).all()
     corners = nodes_of(mesh, sets.facets[name])
     if order == 1:
-        np.testing.assert_array_equal(nodes, corners)
+        assert_array_equal(nodes, corners)
     elif n == 3:
         assert (nodes >= len(mesh.points)).all()  # corners get nothing
     # A pressure on all of the boundary pushes a body nowhere, and does not turn it.
     nodes, forces = facet_forces(mesh, sets, Load("pressure", "boundary", np.array([1.0])), order)
-    np.testing.assert_allclose(forces.sum(axis=0), 0.0, atol=1e-9)
+    assert_allclose(forces.sum(axis=0), 0.0, atol=1e-9)
     places = nodes_and_cells(mesh, order)[0][nodes] - mesh.points.mean(axis=0)
     moments = np.einsum("ki,kj->ij", places, forces)
-    np.testing.assert_allclose(moments, moments.T, atol=1e-7)
+    assert_allclose(moments, moments.T, atol=1e-7)

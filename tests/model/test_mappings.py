@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from models import sample_model
+from numpy.testing import assert_allclose, assert_array_equal
 
 from tetopt import InputError
 from tetopt.model.build import build_model
@@ -20,15 +21,15 @@ TABLE = [(-50.0, 2.0), (0.0, 1.0), (100.0, 5.0)]
 
 def test_a_table_is_linear_between_its_pairs_and_constant_beyond_them():
     moduli = young_from(TABLE, [[-1e9, -50.0, -25.0], [50.0, 100.0, 1e9]])
-    np.testing.assert_array_equal(moduli, [[2.0, 2.0, 1.5], [3.0, 5.0, 5.0]])
-    np.testing.assert_array_equal(young_from(np.array(TABLE), [0.0]), [1.0])
-    np.testing.assert_array_equal(young_from([(7.0, 3.0)], [-1.0, 7.0, 8.0]), [3.0, 3.0, 3.0])
+    assert_array_equal(moduli, [[2.0, 2.0, 1.5], [3.0, 5.0, 5.0]])
+    assert_array_equal(young_from(np.array(TABLE), [0.0]), [1.0])
+    assert_array_equal(young_from([(7.0, 3.0)], [-1.0, 7.0, 8.0]), [3.0, 3.0, 3.0])
 
 
 def test_no_mapping_takes_the_intensity_itself_and_a_copy_of_it():
     intensities = np.array([0.0, 1.5, 7.0])
     moduli = young_from(None, intensities)
-    np.testing.assert_array_equal(moduli, intensities)
+    assert_array_equal(moduli, intensities)
     moduli[0] = 9.0
     assert intensities[0] == 0.0
 
@@ -43,12 +44,12 @@ def test_a_function_sees_float64_and_may_return_whole_numbers():
     moduli = young_from(mapping, np.array([1, 2], dtype=np.uint8))
     assert seen == [np.float64]
     assert moduli.dtype == np.float64
-    np.testing.assert_array_equal(moduli, [3.0, 3.0])
+    assert_array_equal(moduli, [3.0, 3.0])
 
 
 def test_a_function_equal_to_a_table_gives_the_same():
     h = np.linspace(-50.0, 100.0, 31)
-    np.testing.assert_allclose(
+    assert_allclose(
         young_from(TABLE, h),
         young_from(lambda x: np.where(x < 0, 1.0 - x / 50.0, 1.0 + x / 25.0), h),
         rtol=1e-14,

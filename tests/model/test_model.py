@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from models import sample_model
+from numpy.testing import assert_allclose, assert_array_equal
 
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import QUADRATIC_EDGES, quadratic, quadratic_facet_nodes
@@ -23,12 +24,12 @@ def test_lps_turns_points_and_loads_about_z():
         ),
         "lps",
     )
-    np.testing.assert_array_equal(turned.mesh.points, model.mesh.points * [-1, -1, 1])
-    np.testing.assert_array_equal(turned.mesh.cells, model.mesh.cells)
+    assert_array_equal(turned.mesh.points, model.mesh.points * [-1, -1, 1])
+    assert_array_equal(turned.mesh.cells, model.mesh.cells)
     assert turned.loads[1].numbers.tolist() == [-1.0, -2.0, 3.0]
     assert turned.space == "lps"
     assert in_space(model, "ras") is model
-    np.testing.assert_array_equal(in_space(turned, "ras").mesh.points, model.mesh.points)
+    assert_array_equal(in_space(turned, "ras").mesh.points, model.mesh.points)
     for wrong, match in (("las", "expected ras or lps"), ("lps", "omit `space`")):
         with pytest.raises(InputError, match=match):
             in_space(sample_model(2), wrong)
@@ -37,13 +38,11 @@ def test_lps_turns_points_and_loads_about_z():
 def test_units():
     model = sample_model(3)
     other = in_units(model, "MPa")
-    np.testing.assert_allclose(other.materials.young, model.materials.young / 1000.0, rtol=1e-15)
-    np.testing.assert_array_equal(other.materials.nu, model.materials.nu)
+    assert_allclose(other.materials.young, model.materials.young / 1000.0, rtol=1e-15)
+    assert_array_equal(other.materials.nu, model.materials.nu)
     assert described(model)[2] == "units: mm, kPa, mN, uJ, kg, s"
     assert described(other)[2] == "units: mm, MPa, N, mJ, t, s"
-    np.testing.assert_allclose(
-        in_units(other, "kPa").materials.young, model.materials.young, rtol=1e-15
-    )
+    assert_allclose(in_units(other, "kPa").materials.young, model.materials.young, rtol=1e-15)
     with pytest.raises(InputError, match="expected one of kPa, MPa, Pa, got psi"):
         in_units(model, "psi")
 
@@ -69,13 +68,13 @@ def test_with_pascals_lengths_are_in_metres():
     )
     other = in_units(model, "Pa")
     assert described(other)[1:3] == ["coordinates: RAS+, m", "units: m, Pa, N, J, kg, s"]
-    np.testing.assert_allclose(other.mesh.points, model.mesh.points / 1000.0, rtol=1e-15)
+    assert_allclose(other.mesh.points, model.mesh.points / 1000.0, rtol=1e-15)
     assert other.materials.young.tolist() == [4000.0]
     assert mass_densities(other).tolist() == [1000.0]
     numbers = [load.numbers.tolist() for load in other.loads]
     expected = [[0.0, 0.0, 0.0], [np.nan, 0.0, -0.002], [3000.0], [5e6], [0.0, 0.0, -9.81]]
     for found, right in zip(numbers, expected, strict=True):
-        np.testing.assert_allclose(found, right, rtol=1e-15)
+        assert_allclose(found, right, rtol=1e-15)
     found = {
         name: float(values.ravel()[0])
         for name, values in (other.cell_data | other.point_data).items()
@@ -85,11 +84,11 @@ def test_with_pascals_lengths_are_in_metres():
     )
     corner = Mesh([[0, 0], [2, 0], [0, 2]], [[0, 1, 2]], [[1.0, 0.0], [0.0, 1.0], [1.1, 1.1]])
     curved = in_units(Model(corner, {}, Sets({}, {}), order=2), "Pa").mesh
-    np.testing.assert_allclose(curved.midpoints, corner.midpoints / 1000.0, rtol=1e-15)
+    assert_allclose(curved.midpoints, corner.midpoints / 1000.0, rtol=1e-15)
     back = in_units(other, "kPa")
-    np.testing.assert_allclose(back.mesh.points, model.mesh.points, rtol=1e-15)
+    assert_allclose(back.mesh.points, model.mesh.points, rtol=1e-15)
     for one, two in zip(back.loads, model.loads, strict=True):
-        np.testing.assert_allclose(one.numbers, two.numbers, rtol=1e-15)
+        assert_allclose(one.numbers, two.numbers, rtol=1e-15)
 
 
 def test_the_head_is_of_single_lines():
@@ -114,9 +113,9 @@ def test_the_head_is_of_single_lines():
 def test_quadratic_cells_have_their_nodes_in_the_middle_of_edges():
     mesh = sample_model(3).mesh
     points, cells = quadratic(mesh.points, mesh.cells)
-    np.testing.assert_array_equal(points[: len(mesh.points)], mesh.points)
-    np.testing.assert_array_equal(cells[:, :4], mesh.cells)
-    np.testing.assert_allclose(
+    assert_array_equal(points[: len(mesh.points)], mesh.points)
+    assert_array_equal(cells[:, :4], mesh.cells)
+    assert_allclose(
         points[cells[:, 4:]], mesh.points[mesh.cells[:, QUADRATIC_EDGES]].mean(axis=2), rtol=1e-15
     )
     edges = {
@@ -127,10 +126,10 @@ def test_quadratic_cells_have_their_nodes_in_the_middle_of_edges():
     assert len(points) == len(mesh.points) + len(edges)  # each once
     rows = sample_model(3).sets.facets["boundary"]
     facets = quadratic_facet_nodes(cells, rows)
-    np.testing.assert_array_equal(facets[:, :3], facet_triples(mesh.cells, rows))
+    assert_array_equal(facets[:, :3], facet_triples(mesh.cells, rows))
     for k in range(3):
         ends = points[facets[:, k]] + points[facets[:, (k + 1) % 3]]
-        np.testing.assert_allclose(points[facets[:, 3 + k]], ends / 2.0, rtol=1e-15)
+        assert_allclose(points[facets[:, 3 + k]], ends / 2.0, rtol=1e-15)
 
 
 @pytest.mark.parametrize("order", [0, 3])

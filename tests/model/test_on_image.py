@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from models import sample_image
+from numpy.testing import assert_allclose, assert_array_equal
 
 import tetopt
 from tetopt.geometry.quadratic import quadratic
@@ -36,12 +37,12 @@ def test_a_voxel_has_the_value_of_its_cell_to_the_last_bit(n):
     values = tetopt.field_on_image(mesh, mean, image)
     inside = owner >= 0
     assert 0.4 < inside.mean() < 1.0
-    np.testing.assert_array_equal(values[inside], mean[owner[inside]])
+    assert_array_equal(values[inside], mean[owner[inside]])
     assert np.isnan(values[~inside]).all()
     tensors = np.arange(9.0 * len(mean)).reshape(-1, 3, 3)
     stacked = tetopt.field_on_image(mesh, tensors, image, at="cells", outside=-1.0)
     assert stacked.shape == (*image.shape, 3, 3)
-    np.testing.assert_array_equal(stacked[inside], tensors[owner[inside]])
+    assert_array_equal(stacked[inside], tensors[owner[inside]])
     assert (stacked[~inside] == -1.0).all()
 
 
@@ -56,13 +57,11 @@ def test_fields_of_nodes_are_exact_up_to_their_order(n):
         places = centres(grid).reshape(*grid.shape, n)
         linear = tetopt.field_on_image(mesh, mesh.points, grid)
         inside = np.isfinite(linear[..., 0])
-        np.testing.assert_allclose(
-            linear[inside], places[inside], rtol=0.0, atol=1e-12 * np.abs(places).max()
-        )
+        assert_allclose(linear[inside], places[inside], rtol=0.0, atol=1e-12 * np.abs(places).max())
         nodes = quadratic(mesh.points, mesh.cells)[0]
         curved = tetopt.field_on_image(mesh, (nodes**2).sum(axis=1), grid)
         expected = (places**2).sum(axis=-1)
-        np.testing.assert_allclose(curved[inside], expected[inside], rtol=1e-12)
+        assert_allclose(curved[inside], expected[inside], rtol=1e-12)
 
 
 @pytest.mark.parametrize("n", [2, 3])
@@ -79,7 +78,7 @@ def test_curved_cells_are_isoparametric(n):
     found = tetopt.field_on_image(mesh, bent, image)
     inside = np.isfinite(found[..., 0])
     places = centres(image).reshape(*image.shape, n)
-    np.testing.assert_allclose(found[inside], places[inside], rtol=0.0, atol=1e-9)
+    assert_allclose(found[inside], places[inside], rtol=0.0, atol=1e-9)
     unbent = tetopt.field_on_image(straight, bent, image)
     assert np.nanmax(np.abs(unbent - places)) > 0.05
 
@@ -91,12 +90,12 @@ def test_an_image_moves_with_its_displacement():
     image = sample_image(3)
     mesh = tetopt.lattice_mesh(image, nodes=100)
     still = tetopt.warped_image(mesh, np.zeros_like(mesh.points), image)
-    np.testing.assert_allclose(still.data, image.data, atol=1e-9)
+    assert_allclose(still.data, image.data, atol=1e-9)
     along = image.affine[:3, 0]
     moved = tetopt.warped_image(
         mesh, np.tile(2.0 * along, (len(mesh.points), 1)), image, outside=-5.0
     )
-    np.testing.assert_allclose(moved.data[2:], image.data[:-2], atol=1e-9)
+    assert_allclose(moved.data[2:], image.data[:-2], atol=1e-9)
     assert (moved.data[:2] == -5.0).all()
     middle = mesh.points.mean(axis=0)
     grown = tetopt.warped_image(mesh, 0.25 * (mesh.points - middle), image)
@@ -110,12 +109,10 @@ def test_an_image_moves_with_its_displacement():
     assert (of_labels.data.ravel() == nearest).mean() > 0.97  # but for ties
     from scipy.ndimage import map_coordinates
 
-    np.testing.assert_allclose(
-        grown.data.ravel(), map_coordinates(image.data, index.T, order=1), atol=1e-6
-    )
+    assert_allclose(grown.data.ravel(), map_coordinates(image.data, index.T, order=1), atol=1e-6)
     nodes = quadratic(mesh.points, mesh.cells)[0]
     bent = tetopt.warped_image(mesh, 0.25 * (nodes - middle), image)  # the same, of order 2
-    np.testing.assert_allclose(bent.data, grown.data, atol=1e-6)
+    assert_allclose(bent.data, grown.data, atol=1e-6)
 
 
 def test_other_rows_and_displacements_are_rejected():

@@ -5,6 +5,7 @@ from itertools import permutations
 import numpy as np
 import pytest
 from models import ball_mesh, sample_image, sample_model
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 import tetopt
@@ -80,7 +81,7 @@ def test_faces_are_named_by_the_world(order, signs):
         for name, sign in ((low, -1.0), (high, 1.0)):
             area = np.zeros(3)
             area[axis] = sign * np.prod(size) / size[axis]
-            np.testing.assert_allclose(outward_areas(mesh, sets[name]).sum(axis=0), area, atol=1e-9)
+            assert_allclose(outward_areas(mesh, sets[name]).sum(axis=0), area, atol=1e-9)
     assert len(sets["boundary"]) == sum(len(sets[name]) for pair in NAMES for name in pair)
     assert "mask_surface" not in sets
     assert [name for name in standard_sets(mesh).facets] == [
@@ -96,7 +97,7 @@ def test_an_oblique_box_is_known_by_its_affine_alone():
     # turned about z, so that only those two faces lie in planes of the world
     without = standard_sets(mesh).facets
     for name in ("inferior", "superior"):
-        np.testing.assert_array_equal(without[name], with_box[name])
+        assert_array_equal(without[name], with_box[name])
     # what is outermost along the world's axes
     for name in ("left", "right", "posterior", "anterior"):
         assert 0 < len(without[name]) < len(with_box[name])
@@ -108,9 +109,7 @@ def test_the_surface_of_a_mask_is_the_boundary_off_the_box():
     lower = part_of(mesh, mesh.points[mesh.cells].mean(axis=1)[:, 2] < 1.5)
     sets = standard_sets(lower, box_of(image)).facets
     assert (lower.points[nodes_of(lower, sets["mask_surface"])][:, 2] > -0.5).all()
-    np.testing.assert_allclose(
-        outward_areas(lower, sets["inferior"]).sum(axis=0), [0.0, 0.0, -16.0]
-    )
+    assert_allclose(outward_areas(lower, sets["inferior"]).sum(axis=0), [0.0, 0.0, -16.0])
     assert len(sets["boundary"]) == sum(
         len(rows) for name, rows in sets.items() if name != "boundary"
     )
@@ -124,7 +123,7 @@ def test_a_ball_within_the_box_has_sides_by_its_own_extent(n):
     mesh = ball_mesh(n)
     box = Box((60,) * n, np.eye(n + 1))
     sets = standard_sets(mesh, box).facets
-    np.testing.assert_array_equal(sets.pop("mask_surface"), sets["boundary"])
+    assert_array_equal(sets.pop("mask_surface"), sets["boundary"])
     assert {name: rows.tolist() for name, rows in sets.items()} == {
         name: rows.tolist() for name, rows in standard_sets(mesh).facets.items()
     }
@@ -150,7 +149,7 @@ def test_sides_by_extent_make_way_for_sets_of_the_mesh():
     own = Sets({"superior": boundary_rows(mesh)[:5]}, {})
     sets, renamed = sets_beside(mesh, None, {}, own, {})
     assert renamed == {}
-    np.testing.assert_array_equal(sets.facets["superior"], own.facets["superior"])
+    assert_array_equal(sets.facets["superior"], own.facets["superior"])
 
 
 def test_interfaces_are_held_by_the_smaller_label():
@@ -171,9 +170,7 @@ def test_interfaces_are_held_by_the_smaller_label():
         assert {tuple(row) for row in nodes} == zero & one
         assert len(nodes) == len(zero & one)
         for label in (0, 1):
-            np.testing.assert_array_equal(
-                model.sets.cells[f"label_{label}"], np.flatnonzero(labels == label)
-            )
+            assert_array_equal(model.sets.cells[f"label_{label}"], np.flatnonzero(labels == label))
 
 
 def test_three_labels_have_an_interface_for_each_pair_that_touches():
@@ -208,14 +205,14 @@ def test_below_is_the_largest_connected_part_and_its_surface():
     mesh, sets = requested("dark=below:12")
     mean = sample_model(3).cell_data["mean"]
     chosen = tetopt.geometry.topology.largest_component(mesh.cells, mean < 12)
-    np.testing.assert_array_equal(sets.cells["dark"], chosen)
+    assert_array_equal(sets.cells["dark"], chosen)
     rows = sets.facets["dark_surface"]
     assert set(rows[:, 0]) <= set(chosen.tolist())
-    np.testing.assert_allclose(outward_areas(mesh, rows).sum(axis=0), 0.0, atol=1e-9)  # closed
+    assert_allclose(outward_areas(mesh, rows).sum(axis=0), 0.0, atol=1e-9)  # closed
     centres = mesh.points[facet_triples(mesh.cells, rows)].mean(axis=1)
     enclosed = (centres * outward_areas(mesh, rows)).sum() / 3.0
-    np.testing.assert_allclose(enclosed, volumes(mesh.points, mesh.cells[chosen]).sum())
-    np.testing.assert_array_equal(rows, enclosing_facets(mesh, chosen))
+    assert_allclose(enclosed, volumes(mesh.points, mesh.cells[chosen]).sum())
+    assert_array_equal(rows, enclosing_facets(mesh, chosen))
 
 
 def test_near_a_point_and_a_plane():
@@ -232,7 +229,7 @@ def test_near_a_point_and_a_plane():
         reach = float(words.rpartition(":")[2])
         expected = every[(distance[facet_triples(mesh.cells, every)] <= reach).all(axis=1)]
         assert 0 < len(expected) < len(every)
-        np.testing.assert_array_equal(sets.facets["p"], expected)
+        assert_array_equal(sets.facets["p"], expected)
         assert "p" not in sets.cells
 
 
@@ -282,7 +279,7 @@ def test_rows_of_nodes_in_any_order():
     mesh = sample_model(3).mesh
     rows = boundary_rows(mesh)
     nodes = facet_triples(mesh.cells, rows)[:, [2, 0, 1]]
-    np.testing.assert_array_equal(rows_of(mesh, nodes[::-1]), rows)
+    assert_array_equal(rows_of(mesh, nodes[::-1]), rows)
     assert len(rows_of(mesh, np.array([[0, 0, 1], [-1, 2, 3]]))) == 0
 
 
@@ -318,9 +315,9 @@ def test_sets_of_a_mesh_join_the_standard_ones():
     merged, renamed = merged_sets(standard, own)
     assert renamed == {"left": "left_2", "Boundary": "Boundary_2"}
     assert set(merged.facets) == {*standard.facets, "left_2", "skin"}
-    np.testing.assert_array_equal(merged.facets["left"], standard.facets["left"])
-    np.testing.assert_array_equal(merged.facets["left_2"], some)
-    np.testing.assert_array_equal(merged.cells["Boundary_2"], np.arange(4))
+    assert_array_equal(merged.facets["left"], standard.facets["left"])
+    assert_array_equal(merged.facets["left_2"], some)
+    assert_array_equal(merged.cells["Boundary_2"], np.arange(4))
     assert "left_2" not in standard.facets  # which are left as they were
 
 
@@ -336,5 +333,5 @@ def test_top_and_bottom_are_those_of_fem(tilt):
     mesh = tetopt.lattice_mesh(image, blocks=(2, 2, 2))
     low, high = box_faces(image, mesh)
     sets = standard_sets(mesh, box_of(image)).facets
-    np.testing.assert_array_equal(nodes_of(mesh, sets["inferior"]), low)
-    np.testing.assert_array_equal(nodes_of(mesh, sets["superior"]), high)
+    assert_array_equal(nodes_of(mesh, sets["inferior"]), low)
+    assert_array_equal(nodes_of(mesh, sets["superior"]), high)

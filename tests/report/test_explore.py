@@ -13,6 +13,7 @@ import PIL.Image
 import pytest
 from browser import BLIND, FRAMES, copied, document
 from meshes import with_bent_edges
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy import ndimage
 from scipy.spatial import Delaunay
 
@@ -52,14 +53,14 @@ def test_volumes_of_curved_cells_are_theirs(mesh):
     """The page computes volumes of straight cells itself."""
     curved = with_bent_edges(mesh, 0.05)
     kept = array(packed(explorer_html(exhibit(curved, {})))["volumes"], "<f4")
-    np.testing.assert_allclose(kept, curved.cell_volumes, rtol=1e-6)
+    assert_allclose(kept, curved.cell_volumes, rtol=1e-6)
     assert packed(explorer_html(exhibit(mesh, {})))["volumes"] is None
 
 
 def test_fields_are_labels_or_quantities(mesh, cell_data):
     mean, label = exhibit(mesh, cell_data).fields
     assert (mean.name, mean.unit, mean.categories) == ("mean", "intensity", [])
-    np.testing.assert_allclose(
+    assert_allclose(
         mean.limits, np.nanpercentile(cell_data["mean"].astype(np.float32), [1, 99]), rtol=1e-6
     )
     assert [value for value, _ in label.categories] == [0, 1, 2, 3]
@@ -81,7 +82,7 @@ def test_a_field_is_the_first_within_limits(mesh, cell_data):
     assert labels == shown.fields[1]
     mean, label = opened_on(shown, "mean", (-5.0, 120.0)).fields
     assert (mean.limits, label.limits) == ((-5.0, 120.0), shown.fields[1].limits)
-    np.testing.assert_array_equal(mean.values, shown.fields[0].values)
+    assert_array_equal(mean.values, shown.fields[0].values)
     for words, match in (
         (("rho",), 'field: the mesh has no field "rho"; it has mean, label'),
         (("mean", (3.0, 3.0)), "range: expected LOW,HIGH with LOW below HIGH, got 3,3"),
@@ -118,14 +119,12 @@ def test_the_data_are_the_meshs(mesh, cell_data, image):
     top = boundary_facets(mesh.cells)[:5]
     data = packed(explorer_html(exhibit(mesh, cell_data, image, facet_sets={"top": top})))
     points = array(data["points"], "<f4").reshape(-1, 3) + data["centre"]
-    np.testing.assert_allclose(points, mesh.points, atol=1e-5)
-    np.testing.assert_array_equal(array(data["cells"], "<u4").reshape(-1, 4), mesh.cells)
+    assert_allclose(points, mesh.points, atol=1e-5)
+    assert_array_equal(array(data["cells"], "<u4").reshape(-1, 4), mesh.cells)
     assert [field["name"] for field in data["fields"]] == ["mean", "label"]
-    np.testing.assert_allclose(
-        array(data["fields"][0]["values"], "<f4"), cell_data["mean"], rtol=1e-6
-    )
+    assert_allclose(array(data["fields"][0]["values"], "<f4"), cell_data["mean"], rtol=1e-6)
     assert data["skipped"] == ["strain"]
-    np.testing.assert_array_equal(array(data["sets"][0]["triangles"], "<u4").reshape(-1, 3), top)
+    assert_array_equal(array(data["sets"][0]["triangles"], "<u4").reshape(-1, 3), top)
 
 
 def test_the_image_is_where_its_affine_puts_it(mesh, image):
@@ -133,14 +132,12 @@ def test_the_image_is_where_its_affine_puts_it(mesh, image):
     packed_image = data["image"]
     index = np.random.default_rng(0).uniform(0, 13, (9, 3))
     relative = np.append(image.to_world(index) - data["centre"], np.ones((9, 1)), axis=1)
-    np.testing.assert_allclose(
+    assert_allclose(
         (relative @ np.reshape(packed_image["toIndex"], (4, 4)))[:, :3], index, atol=1e-9
     )
     low, high = np.percentile(image.data, [0.5, 99.5])
     greys = array(packed_image["voxels"], "u1").reshape(image.shape, order="F")
-    np.testing.assert_allclose(
-        greys, np.clip((image.data - low) / (high - low), 0, 1) * 255, atol=0.51
-    )
+    assert_allclose(greys, np.clip((image.data - low) / (high - low), 0, 1) * 255, atol=0.51)
 
 
 def test_a_large_image_is_averaged_over_the_same_box(mesh, image, monkeypatch):
@@ -149,7 +146,7 @@ def test_a_large_image_is_averaged_over_the_same_box(mesh, image, monkeypatch):
     assert np.prod(whole["shape"]) <= 600
     assert whole["original"] == list(image.shape)
     monkeypatch.undo()
-    np.testing.assert_allclose(
+    assert_allclose(
         whole["box"], packed(explorer_html(exhibit(mesh, {}, image)))["image"]["box"], atol=1e-9
     )
 
@@ -513,7 +510,7 @@ def test_the_section_shows_the_cells_it_cuts(shown, mesh, cell_data):
     expected = np.where(
         np.isnan(step)[:, None], 0xAA, colour_table()[np.nan_to_num(step).astype(int)].astype(int)
     )
-    np.testing.assert_allclose(np.array(page["cells"])[clear, 2:], expected[clear], atol=2)
+    assert_allclose(np.array(page["cells"])[clear, 2:], expected[clear], atol=2)
 
 
 @pytest.mark.deep
@@ -533,7 +530,7 @@ def test_the_slice_shows_the_voxel_at_every_place(shown, mesh, image):
         np.clip((image.data[tuple(index[inside].astype(int).T)] - low) / (high - low), 0, 1) * 255
     )
     colours = np.array(page["slice"])[inside, 2:]
-    np.testing.assert_allclose(colours, np.repeat(expected[:, None], 3, axis=1), atol=1.01)
+    assert_allclose(colours, np.repeat(expected[:, None], 3, axis=1), atol=1.01)
 
 
 @pytest.mark.deep
@@ -572,9 +569,9 @@ def test_results_at_the_nodes_are_fields_and_deformations(mesh, cell_data):
     ]
     assert shown.skipped == ["strain", "on_top", "strain_nodes"]
     lengths = np.linalg.norm(pressed(mesh)["displacement_step2"][: len(mesh.points)], axis=1)
-    np.testing.assert_allclose(shown.fields[1].nodes, lengths, rtol=1e-6)
-    np.testing.assert_allclose(shown.fields[1].values, lengths[mesh.cells].mean(axis=1), rtol=1e-6)
-    np.testing.assert_allclose(shown.fields[1].limits, np.percentile(lengths, [1, 99]), rtol=1e-6)
+    assert_allclose(shown.fields[1].nodes, lengths, rtol=1e-6)
+    assert_allclose(shown.fields[1].values, lengths[mesh.cells].mean(axis=1), rtol=1e-6)
+    assert_allclose(shown.fields[1].limits, np.percentile(lengths, [1, 99]), rtol=1e-6)
     assert list(shown.displacements) == [1, 2]
     alone = exhibit(mesh, cell_data, point_data={"displacement": pressed(mesh)["displacement"]})
     assert list(alone.displacements) == [0]
@@ -649,9 +646,7 @@ def test_the_second_step_is_drawn_interpolated_and_picked(shown, mesh, image):
     values = at_corners[:, 0] + (fractions * (at_corners[:, 1:] - at_corners[:, :1])).sum(axis=1)
     low, high = field.limits
     step = np.rint(255 * np.clip((values - low) / (high - low), 0, 1)).astype(int)
-    np.testing.assert_allclose(
-        np.array(page["cells"])[clear, 2:], colour_table()[step].astype(int), atol=3
-    )
+    assert_allclose(np.array(page["cells"])[clear, 2:], colour_table()[step].astype(int), atol=3)
     rest = mesh.points[mesh.cells[cells[clear]]]
     index = (
         image.to_index(
@@ -668,10 +663,10 @@ def test_the_second_step_is_drawn_interpolated_and_picked(shown, mesh, image):
     )
     colours = np.array(page["carried"])[clear[is_inside], 2:]
     assert len(grey) > 200
-    np.testing.assert_allclose(colours, np.repeat(grey[:, None], 3, axis=1), atol=1.01)
+    assert_allclose(colours, np.repeat(grey[:, None], 3, axis=1), atol=1.01)
     assert page["second"][1:3] == ["Deformation × 1.5", "displacement (mm)"]
     numbers = [float(text) for text in re.findall(r"[\d.]+", page["second"][3])]
-    np.testing.assert_allclose(numbers, [field.nodes.min(), field.nodes.max()], rtol=1e-4)
+    assert_allclose(numbers, [field.nodes.min(), field.nodes.max()], rtol=1e-4)
     clicked = np.array(
         [[*places_of({**page, "cells": CLICKS[:1]}, mesh, radius)[0][0], middle[2] + AT[1]]]
     )
@@ -683,7 +678,7 @@ def test_the_second_step_is_drawn_interpolated_and_picked(shown, mesh, image):
         float, re.search(r"centroid \(RAS, mm\)\t(\S+), (\S+), (\S+)", page["picked"]).groups()
     )
     # at rest
-    np.testing.assert_allclose([x, y, z], mesh.points[mesh.cells[cell]].mean(axis=0), atol=0.051)
+    assert_allclose([x, y, z], mesh.points[mesh.cells[cell]].mean(axis=0), atol=0.051)
     assert page["grey"]  # nodes without a value
     second, first, none = page["reactions"]
     assert second == "reaction 1,235 mN: R 0, A 0.5, S 1,235"

@@ -11,6 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgb, to_rgba, to_rgba_array
 from matplotlib.figure import Figure
+from numpy.testing import assert_allclose, assert_array_equal
 
 from tetopt.contents.content import content
 from tetopt.contents.labels import BACKGROUND_COLOUR, LABEL_PALETTE
@@ -119,8 +120,8 @@ def test_pixels_lie_where_the_letters_say(worlds, signs, normal):
     place = image.to_world(index)
     order = np.lexsort((place[:, vertical], place[:, horizontal]))
     assert np.ptp(place[:, normal]) == 0.0
-    np.testing.assert_array_equal(view.pixels.ravel(), image.data[tuple(index[order].T)])
-    np.testing.assert_allclose(
+    assert_array_equal(view.pixels.ravel(), image.data[tuple(index[order].T)])
+    assert_allclose(
         view.size, np.ptp(place[:, (horizontal, vertical)], axis=0) + image_steps(image, view)
     )
 
@@ -137,8 +138,8 @@ def test_an_oblique_image_is_laid_out_by_its_nearest_axes():
     view = SliceView(image, None, None)
     assert (view.across, view.axes, view.letters) == (2, [0, 1], ["LR", "PA"])
     # the first axis runs to the left
-    np.testing.assert_array_equal(view.pixels, image.data[::-1, :, 4])
-    np.testing.assert_allclose(view.size, image.spacing[:2] * SHAPE[:2])
+    assert_array_equal(view.pixels, image.data[::-1, :, 4])
+    assert_allclose(view.size, image.spacing[:2] * SHAPE[:2])
 
 
 @pytest.mark.parametrize("signs", list(product((1, -1), repeat=2)))
@@ -153,7 +154,7 @@ def test_a_2d_image_has_x_to_the_right_and_y_up(worlds, signs):
     index = np.array(list(np.ndindex(5, 7)))
     place = image.to_world(index)
     order = np.lexsort((place[:, 1], place[:, 0]))
-    np.testing.assert_array_equal(view.pixels.ravel(), image.data[tuple(index[order].T)])
+    assert_array_equal(view.pixels.ravel(), image.data[tuple(index[order].T)])
     assert view.letters == ["", ""]
 
 
@@ -218,7 +219,7 @@ def test_a_2d_mesh_is_shown_whole():
     image = noise((6, 7), SHEARED)
     mesh = bent(image, (2, 3))
     polygons, cells = SliceView(image, None, None).section(mesh)
-    np.testing.assert_array_equal(cells, np.arange(len(mesh.cells)))
+    assert_array_equal(cells, np.arange(len(mesh.cells)))
     assert areas(polygons).sum() == pytest.approx((image.spacing * image.shape).prod(), rel=1e-12)
 
 
@@ -246,14 +247,12 @@ def test_slice_figure_holds_each_mesh_under_its_title(n):
         over, flat = grid[:, column]
         polygons, cells = view.section(mesh)
         assert over.get_title() == title
-        np.testing.assert_array_equal(over.images[0].get_array(), view.pixels.T)
+        assert_array_equal(over.images[0].get_array(), view.pixels.T)
         assert over.images[0].get_extent() == [0.0, view.size[0], 0.0, view.size[1]]
         assert over.images[0].origin == "lower"
-        np.testing.assert_allclose(corners(collections(over)[0]), polygons.mean(axis=1))
-        np.testing.assert_allclose(corners(collections(flat)[0]), polygons.mean(axis=1))
-        np.testing.assert_array_equal(
-            collections(flat)[0].get_array(), cell_moments(image, mesh).mean[cells]
-        )
+        assert_allclose(corners(collections(over)[0]), polygons.mean(axis=1))
+        assert_allclose(corners(collections(flat)[0]), polygons.mean(axis=1))
+        assert_array_equal(collections(flat)[0].get_array(), cell_moments(image, mesh).mean[cells])
         assert collections(flat)[0].get_clim() == over.images[0].get_clim()
 
 
@@ -282,7 +281,7 @@ def test_nothing_is_drawn_where_a_mesh_leaves_the_image_uncovered(n):
     for axes in figure.axes:
         (drawn,) = collections(axes)
         polygons = np.concatenate([path.vertices for path in drawn.get_paths()])
-        np.testing.assert_allclose(
+        assert_allclose(
             [polygons.min(axis=0), polygons.max(axis=0)], [[0.0, 0.0], [4.0, 7.0]], atol=1e-9
         )
         assert axes.get_xlim() == (0.0, 10.0)  # the whole image stays in view
@@ -340,10 +339,8 @@ def test_a_label_has_one_colour_whatever_else_is_there():
     """
     few, many = (label_colours(np.arange(n)) for n in (8, 10))
     assert (few.shape, many.shape) == ((8, 3), (10, 3))
-    np.testing.assert_array_equal(few, many[:8])
-    np.testing.assert_array_equal(
-        many, to_rgba_array([BACKGROUND_COLOUR, *LABEL_PALETTE[:9]])[:, :3]
-    )
+    assert_array_equal(few, many[:8])
+    assert_array_equal(many, to_rgba_array([BACKGROUND_COLOUR, *LABEL_PALETTE[:9]])[:, :3])
     words = table_words(coloured(LabelTable({}, {2: (1.0, 0.0, 0.0)}), np.array([0, 7, 2, 7])))
     assert words == {
         "0": {"colour": BACKGROUND_COLOUR},
@@ -357,20 +354,16 @@ def test_a_label_has_one_colour_whatever_else_is_there():
 def test_labels_keep_colours_of_their_own_but_the_background():
     labels = np.array([0, 1, 2, 5, 7])
     colours = label_colours(labels, {0: (0, 0, 0), 2: (0.1, 0.2, 0.3), 9: (1, 1, 1)})
-    np.testing.assert_array_equal(colours[2], [0.1, 0.2, 0.3])
-    np.testing.assert_array_equal(
-        np.delete(colours, 2, axis=0), np.delete(label_colours(labels), 2, axis=0)
-    )
+    assert_array_equal(colours[2], [0.1, 0.2, 0.3])
+    assert_array_equal(np.delete(colours, 2, axis=0), np.delete(label_colours(labels), 2, axis=0))
 
 
 def test_colours_begin_again_in_other_tints():
     n = len(LABEL_PALETTE)
     colours = label_colours(np.arange(3 * n + 2))
     assert len(np.unique(colours[: 3 * n + 1], axis=0)) == 3 * n + 1
-    np.testing.assert_array_equal(colours[3 * n + 1], to_rgb(LABEL_PALETTE[0]))
-    np.testing.assert_array_equal(
-        label_colours(np.array([2**31 - 1]))[0], colours[1 + (2**31 - 2) % (3 * n)]
-    )
+    assert_array_equal(colours[3 * n + 1], to_rgb(LABEL_PALETTE[0]))
+    assert_array_equal(label_colours(np.array([2**31 - 1]))[0], colours[1 + (2**31 - 2) % (3 * n)])
 
 
 def test_a_legend_lists_the_largest_and_counts_the_others():
@@ -408,14 +401,12 @@ def test_voxels_and_cells_have_the_same_colours(worlds, signs):
     colours, of_cell = label_colours(np.arange(4)), cell_labels(labels, mesh)
     for (left, right), normal in zip(grid, (2, 1, 0), strict=True):
         view = SliceView(labels, worlds.index(normal), None)
-        np.testing.assert_array_equal(
-            left.images[0].get_array(), colours[view.pixels.T.astype(int)]
-        )
+        assert_array_equal(left.images[0].get_array(), colours[view.pixels.T.astype(int)])
         assert left.images[0].get_extent() == [0.0, view.size[0], 0.0, view.size[1]]
         polygons, cells = view.section(mesh)
         (drawn,) = collections(right)
-        np.testing.assert_allclose(corners(drawn), polygons.mean(axis=1))
-        np.testing.assert_array_equal(drawn.get_facecolors()[:, :3], colours[of_cell[cells]])
+        assert_allclose(corners(drawn), polygons.mean(axis=1))
+        assert_array_equal(drawn.get_facecolors()[:, :3], colours[of_cell[cells]])
         # sides alone
         assert [text.get_text() for text in left.texts] == [text.get_text() for text in right.texts]
         assert len(left.texts) == 4
@@ -440,18 +431,18 @@ def test_interfaces_are_drawn_over_the_image(worlds, signs):
     n_cells = np.bincount(of_cell)
     for axes, normal in zip(grid[:, 2], (2, 1, 0), strict=True):
         view = SliceView(image, worlds.index(normal), None)
-        np.testing.assert_array_equal(axes.images[0].get_array(), view.pixels.T)
+        assert_array_equal(axes.images[0].get_array(), view.pixels.T)
         under, over = [each for each in axes.collections if isinstance(each, LineCollection)]
         lines = np.array(over.get_segments())
-        np.testing.assert_array_equal(np.array(under.get_segments()), lines)
+        assert_array_equal(np.array(under.get_segments()), lines)
         _, sides = view.interfaces(mesh, of_cell)
         rarer = np.where(n_cells[sides[:, 0]] <= n_cells[sides[:, 1]], sides[:, 0], sides[:, 1])
-        np.testing.assert_array_equal(
+        assert_array_equal(
             over.get_colors()[:, :3], label_colours(np.arange(4), table.colours)[rarer]
         )
         if worlds.index(normal) != 0:
             along = view.axes.index(0)
-            np.testing.assert_allclose(lines[:, 0, along], lines[:, 1, along], atol=1e-9)
+            assert_allclose(lines[:, 0, along], lines[:, 1, along], atol=1e-9)
             lengths = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).sum()
             assert lengths == pytest.approx(3 * view.size[1 - along])
     assert "2 left lung" in [text.get_text() for text in figure.legends[0].get_texts()]
@@ -461,7 +452,7 @@ def test_interfaces_of_a_plane():
     labels = Image(np.repeat([0, 3], 4)[:, None] + np.zeros((1, 6)), np.diag([2.0, 1.0, 1.0]))
     mesh = lattice_mesh(labels, blocks=(2, 2))
     lines, sides = SliceView(labels, None, None).interfaces(mesh, cell_labels(labels, mesh))
-    np.testing.assert_allclose(lines[..., 0], 8.0)
+    assert_allclose(lines[..., 0], 8.0)
     assert np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).sum() == pytest.approx(6.0)
     assert {tuple(sorted(pair)) for pair in sides.tolist()} == {(0, 3)}
 
@@ -521,12 +512,10 @@ def test_boundary_and_outline_lie_between_the_same_pixels(worlds, signs):
     pixels = SliceView(mask, normal, 2).pixels
     place = SPACING[axis] * (np.flatnonzero(np.diff(pixels[:, 0]))[0] + 1)
     for axes in figure.axes:
-        np.testing.assert_array_equal(
-            axes.images[0].get_array(), SliceView(image, normal, 2).pixels.T
-        )
+        assert_array_equal(axes.images[0].get_array(), SliceView(image, normal, 2).pixels.T)
         for drawn in lines(axes):
-            np.testing.assert_allclose(drawn[..., 0], place, atol=1e-4)
-            np.testing.assert_allclose(
+            assert_allclose(drawn[..., 0], place, atol=1e-4)
+            assert_allclose(
                 [drawn[..., 1].min(), drawn[..., 1].max()], [0.0, figure.axes[0].get_ylim()[1]]
             )
             assert np.abs(np.diff(drawn[..., 1], axis=1)).sum() == pytest.approx(
@@ -550,7 +539,7 @@ def test_a_closed_boundary_is_closed_in_every_slice(index):
     polygons, _ = view.section(inner)
     assert (len(segments) > 0) == (len(polygons) > 0) == (1 < index < 5)
     if len(polygons):
-        np.testing.assert_allclose(
+        assert_allclose(
             [ends.min(axis=0), ends.max(axis=0)], [polygons.min((0, 1)), polygons.max((0, 1))]
         )
 
@@ -565,11 +554,11 @@ def test_the_detail_is_where_the_outline_bends_most():
     mask[28:40, 60:64] = 0.0
     whole, detail = boundary_figure(image, Image(mask, image.affine), lower_part(image, 0, 40)).axes
     low, high = np.transpose([detail.get_xlim(), detail.get_ylim()])
-    np.testing.assert_allclose(high - low, 2.0 * DETAIL_VOXELS)
+    assert_allclose(high - low, 2.0 * DETAIL_VOXELS)
     assert (low <= [56.0, 120.0]).all()
     assert (high >= [80.0, 128.0]).all()
     (frame,) = whole.patches
-    np.testing.assert_allclose([*frame.get_xy(), frame.get_width()], [*low, 2.0 * DETAIL_VOXELS])
+    assert_allclose([*frame.get_xy(), frame.get_width()], [*low, 2.0 * DETAIL_VOXELS])
     assert whole.get_xlim() == (0.0, 160.0)
 
 
@@ -578,7 +567,7 @@ def test_the_slice_is_in_the_middle_of_the_mask():
     mask = np.zeros(image.shape)
     mask[1:4, 2:6, 12:17] = 1.0
     figure = boundary_figure(image, Image(mask), lattice_mesh(image, blocks=(2, 2, 2)))
-    np.testing.assert_array_equal(figure.axes[0].images[0].get_array(), image.data[:, :, 14].T)
+    assert_array_equal(figure.axes[0].images[0].get_array(), image.data[:, :, 14].T)
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0])
@@ -606,8 +595,8 @@ def test_curved_cells_are_drawn_as_straight_pieces(tmp_path):
     mesh, view = result.mesh, SliceView(labels, None, None)
     polygons, cells = view.section(mesh)
     pieces, n_pieces = mesh.straight_pieces()
-    np.testing.assert_array_equal(cells, np.repeat(np.arange(len(mesh.cells)), n_pieces))
-    np.testing.assert_allclose(areas(polygons), pieces.cell_volumes)
+    assert_array_equal(cells, np.repeat(np.arange(len(mesh.cells)), n_pieces))
+    assert_allclose(areas(polygons), pieces.cell_volumes)
     assert len(view.interfaces(mesh, result.labels)[0]) == 2 * len(
         view.interfaces(Mesh(mesh.points, mesh.cells), result.labels)[0]
     )
@@ -645,7 +634,7 @@ def test_histograms_are_fractions(n):
     for patch, (_, mesh) in zip(outlines, meshes, strict=True):
         values, edges, _ = patch.get_data()
         expected = rho_histogram(mesh.points, mesh.cells)
-        np.testing.assert_array_equal(values, expected[0])
+        assert_array_equal(values, expected[0])
         assert values.sum() == pytest.approx(1.0, abs=1e-12)
         assert (edges[0], edges[-1]) == (0.0, 1.0 / n)
 
@@ -671,14 +660,14 @@ def test_energy_lines_hold_the_history():
     top, bottom = energy_figure(history(8.0, 4.0, 2.0, 1.0)).axes
     curves = {line.get_label().split(",")[0]: line for line in top.lines}
     assert list(curves) == ["E", "E_G", "E_D"]
-    np.testing.assert_allclose(curves["E"].get_ydata(), [1.0, 0.9, 0.8, 0.7])
-    np.testing.assert_allclose(curves["E_G"].get_ydata(), [1.0, 1.05, 1.1, 1.15])
-    np.testing.assert_allclose(curves["E_D"].get_ydata(), [1.0, 0.5, 0.25, 0.125])
+    assert_allclose(curves["E"].get_ydata(), [1.0, 0.9, 0.8, 0.7])
+    assert_allclose(curves["E_G"].get_ydata(), [1.0, 1.05, 1.1, 1.15])
+    assert_allclose(curves["E_D"].get_ydata(), [1.0, 0.5, 0.25, 0.125])
     for line in top.lines:
-        np.testing.assert_array_equal(line.get_xdata(), [0, 1, 2, 3])
+        assert_array_equal(line.get_xdata(), [0, 1, 2, 3])
         assert line.get_label().endswith(f": {line.get_ydata()[-1]:.3f}")
-    np.testing.assert_array_equal(bottom.lines[0].get_xdata(), [1, 2, 3])
-    np.testing.assert_allclose(bottom.lines[0].get_ydata(), [0.1, 0.01, 0.001])
+    assert_array_equal(bottom.lines[0].get_xdata(), [1, 2, 3])
+    assert_allclose(bottom.lines[0].get_ydata(), [0.1, 0.01, 0.001])
     # connected anew in 2
     assert [(p.get_x(), p.get_x() + p.get_width()) for p in top.patches] == [(1.5, 2.5)]
 
