@@ -49,10 +49,10 @@ from tetopt import (
 )
 from tetopt.cli.app import COMMANDS, help_line, loaded_command
 from tetopt.cli.console import show_error, show_event
-from tetopt.engine.requirements import ERROR_RATE
 from tetopt.geometry.simplex import volumes
 from tetopt.job.advice import agreed, sentences, tell, unmet
 from tetopt.job.events import listened
+from tetopt.measure.judge import ERROR_RATE
 from tetopt.measure.segmentation import dice, segment
 from tetopt.report.summary import mesh_hash
 from tetopt.start.octree import nodes_of_sizes

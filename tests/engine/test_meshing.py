@@ -10,8 +10,8 @@ import pytest
 import tetopt
 from tetopt.contents.content import plain
 from tetopt.engine.meshing import Aim, MeshSearch, _next_nodes, sizes_of_order
-from tetopt.engine.requirements import ERROR_RATE
 from tetopt.geometry.quadratic import node_count, quadratic
+from tetopt.measure.judge import ERROR_RATE
 from tetopt.start.clip import lattice_within
 
 IMAGE = tetopt.load_phantom("sphere").image(voxel_mm=4.0)

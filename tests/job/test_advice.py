@@ -10,7 +10,6 @@ import tetopt
 from tetopt.contents.labels import LostComponent
 from tetopt.engine.interfaces import crowded_nodes
 from tetopt.engine.loop import IterationRecord, MeshingResult
-from tetopt.engine.requirements import LABEL_REMEDY, PIECES_REMEDY
 from tetopt.job.advice import (
     agreed,
     beyond_requirements,
@@ -25,6 +24,7 @@ from tetopt.job.advice import (
 from tetopt.job.events import listened
 from tetopt.measure.fidelity import LabelFidelity, MaskFidelity
 from tetopt.measure.interfaces import LabelInterface
+from tetopt.measure.judge import LABEL_REMEDY, PIECES_REMEDY
 from tetopt.start.label_sizes import sizes_by_label
 from tetopt.start.sizes import EdgeRatios, Sizes
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import tetopt
-from tetopt.engine.requirements import checked, checked_curved
 from tetopt.geometry.quadratic import numbered_edges
+from tetopt.measure.judge import Requirements, judge, measure
 from tetopt.measure.measures import fidelity
 
 RADIUS = 20.0
@@ -110,30 +110,29 @@ def test_requirements_are_on_curved_cells(ball, monkeypatch):
     stays.
     """
     labels, result = ball
-    content = tetopt.content(labels, labels)
-    monkeypatch.setattr("tetopt.engine.requirements.LEAST_VOLUME", 0.97)
-    straight = result._replace(mesh=tetopt.Mesh(result.mesh.points, result.mesh.cells))
-    before = checked(straight, content, 90.0, straight.mesh)
-    assert sorted(before.violated) == ["labels", "min_dihedral"]
-    assert "0.941 for label 1;" in before.violated["labels"]
-    assert checked_curved(before, content) is before
-    curved = result._replace(violated=before.violated)
-    assert sorted(checked_curved(curved, content).violated) == ["min_dihedral"]
-    monkeypatch.setattr("tetopt.engine.requirements.LEAST_VOLUME", 1.01)
-    assert (
-        "times that of voxels: 0.999 for label 1, 1 for label 0;"
-        in checked_curved(curved, content).violated["labels"]
+    target = tetopt.content(labels, labels)
+    monkeypatch.setattr("tetopt.measure.judge.LEAST_VOLUME", 0.97)
+    straight = tetopt.Mesh(result.mesh.points, result.mesh.cells)
+    before, after = (
+        judge(measure(mesh, target, result.labels), Requirements(90.0))
+        for mesh in (straight, result.mesh)
     )
+    assert sorted(before) == ["labels", "min_dihedral"]
+    assert "0.941 for label 1;" in before["labels"]
+    assert sorted(after) == ["min_dihedral"]
+    monkeypatch.setattr("tetopt.measure.judge.LEAST_VOLUME", 1.01)
+    words = judge(measure(result.mesh, target, result.labels), Requirements())["labels"]
+    assert "times that of voxels: 0.999 for label 1, 1 for label 0;" in words
 
 
 def test_a_run_is_judged_by_its_curved_cells(monkeypatch):
     """The same number as in the table of its labels, below which straight cells are by a tenth."""
     labels = tetopt.load_phantom("sphere").label_image(voxel_mm=4)
-    content = tetopt.content(labels, labels)
-    monkeypatch.setattr("tetopt.engine.requirements.LEAST_VOLUME", 0.95)
-    result = tetopt.mesh_image(content, 600, order=2, iterations=4)
+    target = tetopt.content(labels, labels)
+    monkeypatch.setattr("tetopt.measure.judge.LEAST_VOLUME", 0.95)
+    result = tetopt.mesh_image(target, 600, order=2, iterations=4)
     straight = tetopt.Mesh(result.mesh.points, result.mesh.cells)
-    assert "labels" in checked(result._replace(mesh=straight), content, 0.0, straight).violated
+    assert "labels" in judge(measure(straight, target, result.labels), Requirements())
     assert result.violated == {}
     assert (
         tetopt.label_fidelity(labels, result.mesh, result.labels)[1].mesh_volume

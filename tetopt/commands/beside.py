@@ -30,7 +30,7 @@ from tetopt.job.inputs import (
 )
 from tetopt.job.options import WHOLE_BOX, BoxPart, MaskedPart, stated_part
 from tetopt.measure.fidelity import cell_labels
-from tetopt.measure.requirements import warn_of_other_mask
+from tetopt.measure.judge import warn_of_other_mask
 from tetopt.model.file import (
     MASK_TEXT,
     MeshFile,

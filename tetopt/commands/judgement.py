@@ -6,27 +6,29 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple, cast
 
 import numpy as np
 
 from tetopt.commands.beside import check_part
 from tetopt.contents.labels import LARGEST_LABEL
+from tetopt.energy.discretization import content_E_D
 from tetopt.energy.sampling import cell_moments
-from tetopt.engine.loop import MeshingResult
-from tetopt.engine.requirements import ANGLE_ROUNDING
 from tetopt.errors import InputError
 from tetopt.geometry.check import check_mesh, manifold_problems, scaled_jacobians
-from tetopt.job.advice import Problem, agreed, sentences, tell, unmet
+from tetopt.geometry.simplex import dihedral_angles
+from tetopt.job.advice import Problem, agreed, required_of, sentences, tell, unmet
 from tetopt.job.events import warning
 from tetopt.job.inputs import label_table, read_companion, read_mesh, warn_of_other_image
 from tetopt.job.options import WHOLE_IMAGE, ImagePart, MaskedPart, SourceOptions
 from tetopt.job.request import checksum
 from tetopt.job.source import Source, read_source
 from tetopt.measure.fidelity import ImageFit, LabelFidelity, image_fit
+from tetopt.measure.judge import Requirements, measure
+from tetopt.measure.judge import judge as judge_rows
 from tetopt.measure.measures import fidelity
 from tetopt.measure.quality import Quality, quality
-from tetopt.measure.requirements import judged
 from tetopt.model.file import MASK_TEXT, MeshFile, words_of_other_box
 from tetopt.report.summary import size_summary
 
@@ -41,8 +43,7 @@ class Judgement(NamedTuple):
     is_checked: bool
     source: Source | None = None  # the image, mask and labels it was measured on
     fit: ImageFit | None = None
-    # the mesh as the result of a run, with violated requirements
-    result: MeshingResult | None = None
+    violated: Mapping[str, str] = MappingProxyType({})  # requirements of the run
     measured: dict[str, Any] = {}  # noqa: RUF012 - fit to mask, labels and contrasts; never modified
     is_compared: bool = True  # with the mask; the mesh's file does not contain the fractions of one
 
@@ -90,18 +91,15 @@ class Judgement(NamedTuple):
         return left_out + ["other images"] * (isinstance(images, list) and len(images) > 1)
 
     @property
-    def requirements(self) -> dict[str, Any]:
-        """Requirements of the run that built the mesh, from its file; another program's mesh
-        need only fill the box.
-        """
-        options = self.loaded.table("options")  # only tetopt's have a method
+    def required(self) -> Requirements:
+        """Requirements of the run that built the mesh, from its file."""
+        options = self.loaded.table("options")
         is_fast = options.get("method") == "fast"
-        return {
-            "min_dihedral": _number(options.get("min_dihedral")) or 0.0 if is_fast else 0.0,
-            "target_error": None if self.left_out else _number(options.get("target_error")),
-            "is_filled": "method" in options and self.is_filled,
-            "is_initial": options.get("iterations") == 0,
-        }
+        return required_of(self.mask_word, self.measured.get("label_names", {}))._replace(
+            min_dihedral=_number(options.get("min_dihedral")) or 0.0 if is_fast else 0.0,
+            target_error=None if self.left_out else _number(options.get("target_error")),
+            is_initial=options.get("iterations") == 0,
+        )
 
     def tell(self) -> list[str]:
         """Report the mesh's problems; return a line on each that makes it fail."""
@@ -112,33 +110,23 @@ class Judgement(NamedTuple):
     def problems(self) -> list[Problem]:
         """Return the mesh's problems, worst first; those with a name make it fail."""
         wrong: list[str] = self.numbers.get("problems", [])
-        overlap = None if self.fit is None else self.fit.overlap
+        if wrong and not {"box", "cover", "manifold"}.isdisjoint(self.violated):
+            # these sentences name the rest
+            mesh, is_whole = self.loaded.mesh, not self.is_masked
+            wrong = check_mesh(mesh, is_whole=is_whole, is_manifold=False)
+        is_named = self.fit is None or (self.is_checked and "overlap" in self.violated)
+        overlap = None if is_named else cast(ImageFit, self.fit).overlap
         named = [("mesh", each) for each in wrong] + (
             [] if overlap is None else [("overlap", overlap)]
         )
         problems = [
             Problem(f"{self.path}: {each}", name=name, is_failure=True) for name, each in named
         ]
-        if self.source is not None and self.result is not None:
-            # named above, with numbers of cells or nodes
-            known = ("overlap", "manifold") if wrong else ("overlap",)
-            requirements = {
-                name: words for name, words in self.result.violated.items() if name not in known
-            }
-            measured = self.measured
-            if not self.is_checked:  # only what makes the numbers meaningless
-                requirements, measured = (
-                    {name: words for name, words in requirements.items() if name == "mask"},
-                    {},
-                )
-            problems += unmet(requirements, measured, self.mask_word)
-        least, smallest = self.requirements["min_dihedral"], self.shape.min_dihedral
-        if self.is_checked and self.source is None and least and smallest < least - ANGLE_ROUNDING:
-            text = (
-                f"{self.path}: the smallest dihedral angle is {smallest:.2f} degrees, below "
-                f"{least:g}"
-            )
-            problems.append(Problem(text, name="min_dihedral"))
+        requirements, measured = self.violated, self.measured
+        if not self.is_checked:  # only what makes the numbers meaningless
+            requirements = {name: each for name, each in requirements.items() if name == "mask"}
+            measured = {}
+        problems += unmet(requirements, measured, self.mask_word)
         if self.is_checked and self.source is None:
             problems += self._recorded(("min_dihedral", *(name for name, _ in named)))
         return agreed(
@@ -209,12 +197,11 @@ def judge(
             )
         has_mask = part.mask is not None or loaded.table("inputs").get("background") is not None
         judgement = judgement._replace(source=source, is_compared=has_mask)
-        fit, result, measured = _measured(judgement)
-        measured |= _names(
-            measured.get("labels", []), label_table(label_names, loaded, labels).names
-        )
-        numbers |= {**measured, "image": image.name, "fit": fit}
-        judgement = judgement._replace(fit=fit, result=result, measured=measured)
+        judgement = _measured(judgement, label_table(label_names, loaded, labels).names)
+        numbers |= {**judgement.measured, "image": image.name, "fit": judgement.fit}
+    elif check and loaded.mesh.ndim == 3:
+        rows = {"min_dihedral": dihedral_angles(loaded.mesh.points, loaded.mesh.cells).min(axis=1)}
+        judgement = judgement._replace(violated=judge_rows(rows, judgement.required))
     if check:
         problems, remarks = _checked(judgement)
         numbers |= {"problems": problems, "remarks": remarks}
@@ -292,30 +279,34 @@ def _merged(inputs: Mapping[str, Any], labels: Path, part: ImagePart) -> dict[in
     )
 
 
-def _measured(judgement: Judgement) -> tuple[ImageFit, MeshingResult, dict[str, Any]]:
-    """Return the fit of the cells to the image, the mesh as the result of a run, and its fit to
-    mask and labels.
-    """
+def _measured(judgement: Judgement, names: Mapping[int, str]) -> Judgement:
+    """Measure the fit of the cells to the image, mask and labels, and judge it."""
     source, loaded = cast(Source, judgement.source), judgement.loaded
     mesh, of_cell = loaded.mesh, loaded.cell_data.get("label")
     fit = image_fit(source.contrasts[0], mesh)
     measured = fidelity(source.labels, source.mask, mesh, of_cell, what=source.content)
-    dice = None if source.mask is None else measured["mask"].dice
-    result = judged(mesh, source.content, of_cell, **judgement.requirements, dice=dice)
-    if result.history[-1].n_voxels == 0:
+    measured |= _names(measured.get("labels", []), names)
+    counted = content_E_D(source.content, mesh)
+    if counted[1] == 0:
         raise InputError(
             f"{judgement.path}: the mesh lies outside the mask and its surroundings; was it "
             "built within another mask?"
         )
     is_uniform = source.content.variance == 0.0
+    known = {"labels": measured["labels"]} if "labels" in measured else {}
+    known |= {"mask": measured["mask"].dice} if "mask" in measured else {}
+    # another program's mesh has no method
+    is_filled = judgement.is_filled and "method" in loaded.table("options")
+    rows = measure(mesh, source.content, of_cell, is_filled=is_filled, counted=counted, known=known)
     fit = fit._replace(
-        E_D=result.history[-1].E_D, E_D_fraction_of_variance=None if is_uniform else result.fraction
+        E_D=counted[0], E_D_fraction_of_variance=None if is_uniform else rows["error"]
     )
     if not judgement.is_compared:
         measured.pop("mask", None)
     if not source.content.is_plain:
         measured["contrasts"] = source.by_contrast(cell_moments(source.image, mesh)._asdict())
-    return fit, result, measured
+    judgement = judgement._replace(fit=fit, measured=measured)
+    return judgement._replace(violated=judge_rows(rows, judgement.required))
 
 
 def _number(value: Any) -> float | None:

@@ -78,6 +78,7 @@ LABEL_PALETTE = (
 LABEL_TINTS = (0.0, -0.4, 0.4)
 ABSENT_LISTED = 5  # labels without a voxel in an image or mask
 BACKGROUND_LABEL = 0  # the label outside all tissues
+COMPONENT_VOXELS = 50  # a face-connected component of a label or mask of as many must have a cell
 BACKGROUND_COLOUR = "#e6e6e6"  # of that label
 
 

@@ -51,7 +51,6 @@ from tetopt.engine.loop import (
 )
 from tetopt.engine.paper import optimize_paper
 from tetopt.engine.repair import cell_cosines, n_cells_below, repair
-from tetopt.engine.requirements import checked
 from tetopt.engine.smooth import _attract, _gradients, attract, blocks, sweep
 from tetopt.engine.state import angle_limit_of, content_energies, state_of, with_min_dihedral
 from tetopt.engine.surface import _fill_offsets, fill_offsets
@@ -158,18 +157,17 @@ def optimize(
         Called between colours of nodes; True ends the run.
     keep : callable, optional
         Called with the mesh and the labels of its cells, if they have any, as soon as the run is
-        cut short: lifting cells and checking the mesh take more time.
+        cut short: lifting cells takes more time.
 
     Returns
     -------
     MeshingResult
-        Mesh, history, reason for the end, and in `violated` the requirements that the mesh does not
-        meet (`tetopt.engine.requirements`): dihedral angles below the minimum, voxels in two cells,
-        a mask or labels for which cells are too large. The mesh covers the same domain, and every
-        cell is positively oriented. E never rises between records, unless cells had to be lifted
-        above the minimum dihedral angle (which may insert or remove nodes), or nodes were exchanged
-        or moved onto interfaces; once cells have labels, E is defined differently. Results are the
-        same to the last bit on any number of threads.
+        Mesh, history and reason for the end, without a verdict: `violated` is that of `mesh_image`.
+        The mesh covers the same domain, and every cell is positively oriented. E never rises
+        between records, unless cells had to be lifted above the minimum dihedral angle (which may
+        insert or remove nodes), or nodes were exchanged or moved onto interfaces; once cells have
+        labels, E is defined differently. Results are the same to the last bit on any number of
+        threads.
 
     Raises
     ------
@@ -222,8 +220,7 @@ def optimize(
     result = MeshingResult(
         run.mesh(), history, ended, mesh, labels=run.labels(), n_dropped=run.n_dropped
     )
-    result = result._replace(dropped=dict(run.dropped))
-    return checked(result, content, min_dihedral, mesh)
+    return result._replace(dropped=dict(run.dropped))
 
 
 class Course(NamedTuple):

@@ -30,6 +30,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from tetopt.contents.labels import COMPONENT_VOXELS
 from tetopt.engine.complex import has_node
 from tetopt.geometry.simplex import facet_areas, regular_edge, volumes
 from tetopt.geometry.topology import linked, stars
@@ -81,7 +82,6 @@ MOST_BIAS = 0.4  # of a cell's volume, at most, which bounds the overlap that vo
 # the loss but for a tenth is more: a label that would lose half of its volume or more gets it back
 SPARED_LOSS = 0.1
 LEAST_SHARE = 0.05  # of a cell's volume: a label with less of it does not get the cell
-COMPONENT_VOXELS = 50  # a face-connected component of a label or mask of as many must have a cell
 TRIED_CELLS = 5  # cells for a piece, the best first, tried for one that leaves interfaces manifold
 # of the cell that it gets; with .2, fluid has a Dice of .634, not .639 (MNI152, 5,000 nodes)
 PIECE_SHARE = 0.3

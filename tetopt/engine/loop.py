@@ -97,6 +97,11 @@ class IterationRecord(NamedTuple):
     n_voxels: int
     seconds: float
 
+    @property
+    def counted(self) -> tuple[float, int]:
+        """E_D and the number of voxels."""
+        return self.E_D, self.n_voxels
+
 
 class MeshingResult(NamedTuple):
     """Result of `optimize` and, with all fields, of `mesh_image`.
@@ -121,7 +126,7 @@ class MeshingResult(NamedTuple):
         Label of each cell, for a content with memberships.
     violated : mapping of str to str
         Requirements that the mesh violates, by name, one sentence each
-        (`tetopt.engine.requirements`); empty if none.
+        (`tetopt.measure.judge`), judged by `mesh_image`; empty if none.
     fraction : float, optional
         Unexplained fraction of the content's variance: E_D over variance times volume. Only from
         `mesh_image`.

@@ -30,6 +30,7 @@ from tetopt.engine.loop import (
     DEFAULT_NODES,
     GRADED_ITERATIONS,
     GRADED_K_D,
+    MIN_DIHEDRAL,
     QUADRATIC_GRADATION,
     QUADRATIC_RATIO,
     START_K_D,
@@ -40,18 +41,19 @@ from tetopt.engine.loop import (
     MeshingResult,
 )
 from tetopt.engine.paper import optimize_paper
-from tetopt.engine.requirements import (
-    ERROR_AIM,
-    ERROR_RATE,
-    ERROR_REACHED,
-    checked_curved,
-    nodes_ratio,
-    requested,
-    unexplained_by,
-)
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import node_count
 from tetopt.image import Image
+from tetopt.measure.judge import (
+    ERROR_AIM,
+    ERROR_RATE,
+    ERROR_REACHED,
+    Requirements,
+    judge,
+    measure,
+    nodes_ratio,
+    unexplained_by,
+)
 from tetopt.mesh import Mesh
 from tetopt.start.carve import carved, part_of
 from tetopt.start.clip import lattice_within
@@ -181,7 +183,7 @@ def mesh_image(
         As for `optimize`; its first record is that of the initial mesh, which it contains, too. A
         run that does not meet all requirements still returns its mesh, and `violated` has a
         sentence for each violated one, by name (`min_dihedral`, `box`, `cover`, `overlap`, `mask`,
-        `labels`, `error`; see `tetopt.engine.requirements`).
+        `labels`, `error`; see `tetopt.measure.judge`).
 
     Raises
     ------
@@ -268,13 +270,21 @@ class MeshSearch:
     """The runs that lead to a mesh: iterate over the attempts, and `tell` the result of each; then
     take the `result`.
 
-    Parameters are those of `mesh_image`, which raises the same errors.
+    Parameters are those of `mesh_image`, which raises the same errors; `required` has words for the
+    verdict.
     """
 
     result: MeshingResult
     _told: MeshingResult  # of the last attempt
 
-    def __init__(self, image: Image | Content, aim: Aim, **options: Any) -> None:
+    def __init__(
+        self,
+        image: Image | Content,
+        aim: Aim,
+        required: Requirements = Requirements(),  # noqa: B008 - a tuple
+        **options: Any,
+    ) -> None:
+        self._required = required
         self._begin, self._seconds = time.perf_counter(), 0.0  # in attempts
         content = plain(image)
         mode = ("graded" if aim.start is None else "start") if aim.mode is None else aim.mode
@@ -347,13 +357,35 @@ class MeshSearch:
     def _finished(self, result: MeshingResult) -> MeshingResult:
         """Judge the result by the aim, and curve its surfaces for order 2."""
         content, aim = self._content, self._aim
-        is_filled = aim.mode != "start" and content.region is None
-        result = requested(result, content, aim.target_error, is_filled)
         if aim.order == 2:
             mesh, curving = curved(result.mesh, content, result.labels)
-            result = checked_curved(result._replace(mesh=mesh, curving=curving), content)
+            result = result._replace(mesh=mesh, curving=curving)
+        result = self._with_verdict(result)
         seconds = time.perf_counter() - self._begin
         return result._replace(seconds_start=seconds - self._seconds, seconds_run=self._seconds)
+
+    def _with_verdict(self, result: MeshingResult) -> MeshingResult:
+        """Measure the mesh, and add the requirements that it violates."""
+        content, aim, options = self._content, self._aim, self._options
+        first, last = result.history[0], result.history[-1]
+        rows = measure(
+            result.mesh,
+            content,
+            result.labels,
+            is_filled=aim.mode != "start" and content.region is None,
+            initial=result.initial,
+            n_initial=first.n_voxels,
+            counted=last.counted,
+        )
+        has_angles = aim.mode != "paper"
+        required = self._required._replace(
+            min_dihedral=options.get("min_dihedral", MIN_DIHEDRAL) if has_angles else 0.0,
+            target_error=aim.target_error,
+            cut_short=result.ended if result.ended in CUT_SHORT else "",
+            is_initial=last.iteration == 0,
+        )
+        fraction = None if isinstance(rows["error"], Exception) else rows["error"]
+        return result._replace(violated=judge(rows, required), fraction=fraction)
 
 
 def _searched(content: Content, aim: Aim, attempted: Attempted) -> Search:
@@ -626,7 +658,7 @@ def meshed_to_error(content: Content, aim: Aim, attempted: Attempted) -> Search:
         result = yield from attempted(initial, nodes, predicted)
         count, fraction = (
             len(result.mesh.points),
-            unexplained_by(content, result.mesh, result.history[-1]),
+            unexplained_by(content, result.mesh, *result.history[-1].counted),
         )
         runs.append((initial.points, nodes, count))
         if result.ended in CUT_SHORT:

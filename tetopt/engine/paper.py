@@ -32,7 +32,6 @@ from tetopt.engine.loop import (
     side_ticks,
 )
 from tetopt.engine.paper_moves import Moves, descend, relocate
-from tetopt.engine.requirements import checked
 from tetopt.engine.state import unweighted, weighted
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides, facets_on_sides
@@ -181,9 +180,7 @@ def optimize_paper(
             ended = "converged"
             break
     points = image.to_world(from_ticks(state.complex.ticks, grid, image.ndim))
-    return checked(
-        MeshingResult(Mesh(points, _cells(state)), history, ended, mesh), plain(image), 0.0, mesh
-    )
+    return MeshingResult(Mesh(points, _cells(state)), history, ended, mesh)
 
 
 def _cells(state: State) -> NDArray[np.int64]:

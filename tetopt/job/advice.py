@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from tetopt.contents.labels import BACKGROUND_LABEL
 from tetopt.engine.loop import MeshingResult
 from tetopt.engine.meshing import Mode
-from tetopt.engine.requirements import LABEL_VOXELS, LabelFit, label_faults, label_remedy
 from tetopt.engine.surface import MOST_MEETING
 from tetopt.job.events import note, violated, warning
 from tetopt.job.inputs import listed
 from tetopt.job.options import Method
 from tetopt.measure.fidelity import LabelFidelity, MaskFidelity
 from tetopt.measure.interfaces import LabelInterface
+from tetopt.measure.judge import LABEL_VOXELS, Requirements, faulty_labels
 from tetopt.model.labels import count_of_labels, label_words
 from tetopt.start.label_sizes import SizesByLabel
 from tetopt.start.octree import is_for_walls
@@ -115,17 +115,12 @@ def failures(failed: Mapping[str, str], known: Iterable[Problem]) -> Iterator[Pr
 def unmet(
     requirements: Mapping[str, str], measured: dict[str, Any], word: str = "mask"
 ) -> Iterator[Problem]:
-    """Yield violated `requirements` (`tetopt.engine.requirements`), that on labels with their
-    names, and lesser deviations from mask and labels. `word` is the name of the meshed region in
-    messages.
+    """Yield violated `requirements` (`tetopt.measure.judge`), and lesser deviations from mask and
+    labels. `word` is the name of the meshed region in messages.
     """
-    of_labels = list(_lost(measured, word))
     for name, words in requirements.items():
-        if name not in {each.name for each in of_labels}:
-            yield Problem(
-                words.replace("the mask", f"the {word}"), name=name, wants=SMALLER_CELLS.get(name)
-            )
-    yield from of_labels
+        yield Problem(words, name=name, wants=SMALLER_CELLS.get(name))
+    yield from _lost(measured, word)
     yield from _of_mask(measured.get("mask"), word)
     if n_dropped := measured.get("dropped_components"):
         text = (
@@ -148,34 +143,20 @@ def _dropped_words(measured: dict[str, Any]) -> str:
 
 
 def _lost(measured: dict[str, Any], word: str) -> Iterator[Problem]:
-    """Yield labels that violate the requirement, small ones without a cell, and those of poor
-    volume or overlap.
-
-    More nodes are no remedy for label 0 within a foreground: it has the voxels that are no
-    background.
+    """Yield small labels without a cell, and labels of poor volume or overlap, beyond those that
+    violate the requirement.
     """
-    labels, pockets = (
-        measured.get("labels", []),
-        {BACKGROUND_LABEL: POCKETS} if word == "foreground" else {},
-    )
-    words = {
-        row.label: label_words(row.label, measured.get("label_names", {}) | pockets)
-        for row in labels
-    }
+    labels = measured.get("labels", [])
+    required = required_of(word, measured.get("label_names", {}))
+    words = {row.label: required.label_words(row.label) for row in labels}
     ratios = {row: row.volume_ratio for row in labels}
-    fits = {
-        row: LabelFit(row.label, row.covered_voxels, ratio, row.dice > 0.0, row.lost_components)
-        for row, ratio in ratios.items()
-    }
 
     def smaller(rows: Iterable[LabelFidelity], remedy: str) -> dict[str, Any]:
-        is_helped = any(row.label not in pockets for row in rows)
+        is_helped = any(row.label not in required.unhelped for row in rows)
         return {"remedy": remedy, "wants": "smaller"} if is_helped else {}
 
-    if faulty := [row for row, fit in fits.items() if fit.is_faulty]:
-        text = label_faults(fits.values(), words)
-        yield Problem(text, name="labels", **smaller(faulty, label_remedy(fits.values())))
-    others = [row for row in labels if row not in faulty]
+    faulty = set(faulty_labels(labels))
+    others = [row for row in labels if row.label not in faulty]
     if small := [words[row.label] for row in others if row.is_lost]:
         yield Problem(
             f"no cell has label {', '.join(small)}, of fewer than {LABEL_VOXELS} voxels in the mesh"
@@ -195,6 +176,21 @@ def _lost(measured: dict[str, Any], word: str) -> Iterator[Problem]:
         names = listed([words[row.label] for row in poor], 5)
         remedy = "allow more nodes, or check that these are labels, not intensities"
         yield Problem(f"Dice below {LABEL_DICE} for label {names}", **smaller(poor, remedy))
+
+
+def required_of(word: str, names: Mapping[int, str]) -> Requirements:
+    """Return the words for a verdict: of the meshed region, and of labels by their names.
+
+    More nodes are no remedy for label 0 within a foreground: it has the voxels that are no
+    background.
+    """
+    pockets = {BACKGROUND_LABEL: POCKETS} if word == "foreground" else {}
+    known = {**names, **pockets}
+    return Requirements(
+        region=word,
+        label_words=lambda label: label_words(label, known),
+        unhelped=frozenset(pockets),
+    )
 
 
 def beyond_requirements(measured: Mapping[str, Any], word: str = "mask") -> dict[str, str]:

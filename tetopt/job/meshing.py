@@ -26,7 +26,6 @@ from tetopt.engine.meshing import (
     Run,
     check_memory_of,
 )
-from tetopt.engine.requirements import ERROR_REACHED, unexplained_by
 from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import squared_edges
 from tetopt.job.events import KERNEL_WORDS, ended_words, note, progress, started, time_words
@@ -36,6 +35,7 @@ from tetopt.job.plan import kind_of
 from tetopt.job.task import Meshed, Task
 from tetopt.job.write import model_with
 from tetopt.measure.fidelity import cell_labels
+from tetopt.measure.judge import ERROR_REACHED, unexplained_by
 from tetopt.mesh import Mesh
 from tetopt.model.model import Model
 from tetopt.report.tables import curving_in_words
@@ -81,7 +81,7 @@ def meshed(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
         early.extend([] if place is None else [place])
 
     started("start", START_WORDS)
-    search, first = MeshSearch(content, _aim(task), **options), 0.0
+    search, first = MeshSearch(content, _aim(task), task.source.required, **options), 0.0
     for number, (initial, run, predicted) in enumerate(search, 1):
         if number == 1:
             _check_initial(task, initial)
@@ -248,7 +248,7 @@ def _say_search(task: Task, number: int, result: MeshingResult) -> None:
     job, content = task.plan.job, task.source.content
     n_nodes = node_count(result.mesh.points, result.mesh.cells, task.plan.order)
     if (target := job.target_error) is not None:
-        fraction = unexplained_by(content, result.mesh, result.history[-1])
+        fraction = unexplained_by(content, result.mesh, *result.history[-1].counted)
         note(
             f"run {number} of up to {ERROR_RUNS}: {n_nodes} nodes leave {fraction:.4g} of the "
             "variance unexplained; "

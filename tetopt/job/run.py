@@ -29,6 +29,7 @@ from tetopt.job.meshing import meshed
 from tetopt.job.read import read
 from tetopt.job.task import Meshed, Shapes, Task
 from tetopt.job.write import draw, measured_of, numbers_of, saved
+from tetopt.measure.judge import judge
 from tetopt.measure.measures import measured_each
 from tetopt.measure.quality import quality
 from tetopt.mesh import Mesh
@@ -186,7 +187,11 @@ def _shapes(outcome: Meshed, failed: dict[str, str]) -> Shapes:
 def _problems(result: Result, failed: dict[str, str]) -> list[Problem]:
     """Return violated requirements, failed measurements and oddities, worst first."""
     task, outcome, measured = result.task, result.meshed, result.measured
-    problems = list(unmet(outcome.result.violated, measured, task.source.mask_word))
+    required = dict(outcome.result.violated)
+    if outcome.result.labels is None:  # but its file gives each cell that of most voxels
+        of_labels = {name: rows for name, rows in measured.items() if name == "labels"}
+        required |= judge(of_labels, task.source.required)
+    problems = list(unmet(required, measured, task.source.mask_word))
     problems += failures(failed, problems)
     job, mode = task.plan.job, task.plan.mode
     expected = job.nodes if mode == "graded" and job.target_error is None else None

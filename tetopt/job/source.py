@@ -27,6 +27,7 @@ from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io.label_tables import NO_TABLE, LabelTable
 from tetopt.io.text import counted
+from tetopt.job.advice import required_of
 from tetopt.job.events import note, warning
 from tetopt.job.inputs import (
     Align,
@@ -48,6 +49,7 @@ from tetopt.job.inputs import (
 from tetopt.job.options import SourceOptions
 from tetopt.job.request import checksum
 from tetopt.measure.fidelity import cell_labels, unexplained_of
+from tetopt.measure.judge import Requirements
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
 from tetopt.model.file import MASK_TEXT, MeshFile
@@ -86,6 +88,11 @@ class Source(NamedTuple):
     def mask_word(self) -> str:
         """The name of the meshed region in messages."""
         return "mask" if self.about["inputs"]["background"] is None else "foreground"
+
+    @property
+    def required(self) -> Requirements:
+        """Words for the verdict on its mesh."""
+        return required_of(self.mask_word, self.table.names)
 
     @property
     def surface_words(self) -> str:

@@ -171,6 +171,11 @@ class LabelFidelity(NamedTuple):
         """Ratio of the volume of its cells to that of its voxels that they should represent."""
         return self.mesh_volume / self.volume * self.voxels / max(self.covered_voxels, 1)
 
+    @property
+    def is_met(self) -> bool:
+        """True if one of its voxels, or more, lies in one of its cells."""
+        return self.dice > 0.0
+
 
 class MaskFidelity(NamedTuple):
     """Fidelity of a mesh to the mask that it should fill. Volumes are areas in 2-D.

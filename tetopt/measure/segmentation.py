@@ -17,7 +17,7 @@ from tetopt.contents.otsu import class_thresholds
 from tetopt.energy.sampling import cell_moments, cell_of_voxel
 from tetopt.errors import InputError
 from tetopt.image import Image
-from tetopt.measure.requirements import warn_of_other_mask
+from tetopt.measure.judge import warn_of_other_mask
 from tetopt.mesh import Mesh
 
 

@@ -14,7 +14,7 @@ from tetopt.engine.loop import MeshingResult
 from tetopt.errors import InputError, Note, warn
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image
-from tetopt.measure.requirements import warn_of_other_mask
+from tetopt.measure.judge import warn_of_other_mask
 from tetopt.mesh import Mesh
 from tetopt.model.averages import (
     DEFAULT_AVERAGE,

@@ -13,7 +13,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.quadratic import cell_edges, quadratic
 from tetopt.geometry.simplex import dihedral_angles, rho
 from tetopt.image import Image
-from tetopt.measure.requirements import warn_of_other_mask
+from tetopt.measure.judge import warn_of_other_mask
 from tetopt.mesh import Mesh
 
 # Fields that depend on the world's axes or on the unit of stress, by name; a suffix such as _step2

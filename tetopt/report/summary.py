@@ -13,9 +13,9 @@ import numpy as np
 
 from tetopt.contents.content import Content, plain
 from tetopt.engine.loop import MeshingResult
-from tetopt.engine.requirements import unexplained_by
 from tetopt.geometry.quadratic import node_count
 from tetopt.image import Image
+from tetopt.measure.judge import unexplained_by
 from tetopt.measure.quality import Quality, quality
 from tetopt.mesh import Mesh
 from tetopt.model.loads import load_words
@@ -89,8 +89,8 @@ def run_summary(
     is_varied = own.variance > 0.0
     known = result.fraction
     fractions = (
-        unexplained_by(own, result.mesh, last) if known is None else known,
-        unexplained_by(own, initial, first),
+        unexplained_by(own, result.mesh, *last.counted) if known is None else known,
+        unexplained_by(own, initial, *first.counted),
     )
     left, left_first = (fraction if is_varied else None for fraction in fractions)
     return {

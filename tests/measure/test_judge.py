@@ -1,30 +1,190 @@
-"""A result says which requirements its mesh violates; each is violated by hand, one at a time."""
+"""A mesh is judged in one place; each requirement is violated by hand, one at a time, and all who
+ask get the same answer.
+"""
 
+import functools
 import re
 
 import numpy as np
 import pytest
 import scipy
+from commands import exit_code, numbers_in
 from shapes import shaped
 
 import tetopt
+import tetopt.engine.meshing
+import tetopt.measure.judge
+from tetopt.cohort.layout import mesh_name, numbers_path, subject_folder
+from tetopt.cohort.numbers import row_of
 from tetopt.contents.content import content, plain
-from tetopt.engine.requirements import _label_fits, checked, requested
+from tetopt.energy.discretization import content_E_D
+from tetopt.engine.loop import IterationRecord, MeshingResult
 from tetopt.geometry.check import manifold_problems
 from tetopt.geometry.simplex import centroids, volumes
 from tetopt.geometry.topology import components
-from tetopt.measure.requirements import judged
+from tetopt.measure.judge import Requirements, judge, measure
 from tetopt.start.carve import part_of
 
 
-def violated(target, result, min_dihedral=0.0, start=None):
-    return checked(
-        result, plain(target), min_dihedral, result.mesh if start is None else start
-    ).violated
+def judged(mesh, target, labels=None, required=Requirements(), **options):  # noqa: B008 - a tuple
+    return judge(measure(mesh, plain(target), labels, **options), required)
 
 
-def violated_request(image, result, target_error, is_filled):
-    return requested(result, plain(image), target_error, is_filled).violated
+def violated(target, result, min_dihedral=0.0, start=None, **required):
+    first, last = result.history[0], result.history[-1]
+    return judged(
+        result.mesh,
+        target,
+        result.labels,
+        Requirements(min_dihedral, **required),
+        initial=result.mesh if start is None else start,
+        n_initial=first.n_voxels,
+        counted=last.counted,
+    )
+
+
+SIDE = 12  # voxels of the images that follow, of 1 mm, whose sides are at -0.5 and 11.5
+
+
+def lattice(low=(0, 0, 0), high=(SIDE, SIDE, SIDE), step=2):
+    """Mesh a box of whole voxels."""
+    low, high = np.array(low), np.array(high)
+    box = tetopt.Image(np.zeros(high - low), np.eye(4))
+    mesh = tetopt.lattice_mesh(box, blocks=tuple((high - low) // step))
+    return mesh.points + low, mesh.cells
+
+
+def joined(*parts):
+    """Make one mesh of several, which share no node."""
+    starts = np.cumsum([0, *(len(points) for points, _ in parts)])
+    cells = [cells + start for (_, cells), start in zip(parts, starts, strict=False)]
+    return tetopt.Mesh(np.concatenate([points for points, _ in parts]), np.concatenate(cells))
+
+
+def moved(points, is_moved, by):
+    return points + np.asarray(is_moved, dtype=float)[:, None] * by
+
+
+def block(*boxes):
+    """Return a mask, 1 in boxes of whole voxels."""
+    data = np.zeros((SIDE, SIDE, SIDE))
+    for low, high in boxes:
+        data[tuple(map(slice, low, high))] = 1.0
+    return data
+
+
+def flat_cells():
+    points, cells = lattice()
+    inner = np.argmin(((points - 5.5) ** 2).sum(axis=1))
+    return joined((moved(points, np.arange(len(points)) == inner, (1.75, 0.0, 0.0)), cells)), {}
+
+
+def beyond_the_box():
+    points, cells = lattice()
+    corner = np.argmin(points.sum(axis=1))
+    ones = block(((0, 0, 0), (SIDE,) * 3))
+    return joined((moved(points, np.arange(len(points)) == corner, (-0.1,) * 3), cells)), {
+        "mask": ones
+    }
+
+
+def without_a_cell():
+    points, cells = lattice()
+    return part_of(tetopt.Mesh(points, cells), np.arange(len(cells)) > 0), {}
+
+
+def twice_the_voxels():
+    """A block whose left side is stretched through a gap into another block."""
+    one = lattice((0, 0, 0), (6, 12, 12))
+    points, cells = lattice((8, 0, 0), (12, 12, 12))
+    points = moved(points, points[:, 0] < 8.0, (-2.9, 0.0, 0.0))
+    mask = block(((0, 0, 0), (6, 12, 12)), ((7, 0, 0), (12, 12, 12)))
+    return joined(one, (points, cells)), {"mask": mask}
+
+
+def beyond_the_mask():
+    return joined(lattice((0, 0, 0), (10, 10, 10))), {"mask": block(((0, 0, 0), (8, 8, 8)))}
+
+
+def parts_of_a_block():
+    points, cells = lattice((0, 0, 0), (6, 12, 12))
+    other, more = lattice((6, 0, 0), (12, 12, 12))
+    parts = (points, cells), (moved(other, other[:, 0] < 6.0, (0.01, 0.0, 0.0)), more)
+    return joined(*parts), {"mask": block(((0, 0, 0), (SIDE,) * 3))}
+
+
+def blocks_that_share_an_edge():
+    points, cells = lattice()
+    at = points[cells].mean(axis=1) - 5.5
+    mesh = part_of(tetopt.Mesh(points, cells), at[:, 0] * at[:, 1] > 0.0)
+    return mesh, {"mask": block(((0, 0, 0), (6, 6, 12)), ((6, 6, 0), (12, 12, 12)))}
+
+
+def a_label_without_a_cell():
+    return joined(lattice()), {"labels": block(((0, 0, 0), (6, 12, 12)))}
+
+
+def large_cells():
+    return joined(lattice(step=6)), {"target_error": 0.01}
+
+
+CASES = {
+    "min_dihedral": flat_cells,
+    "box": beyond_the_box,
+    "cover": without_a_cell,
+    "overlap": twice_the_voxels,
+    "mask": beyond_the_mask,
+    "components": parts_of_a_block,
+    "manifold": blocks_that_share_an_edge,
+    "labels": a_label_without_a_cell,
+    "error": large_cells,
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_all_who_ask_about_a_mesh_get_the_same_answer(name, tmp_path, monkeypatch):
+    """From Python, in run.json, by `quality --check` and in a cohort's table: of a small mesh that
+    violates this requirement alone, as if the engine had made it.
+    """
+    mesh, given = CASES[name]()
+    engine = tetopt.engine.meshing.optimize
+
+    @functools.wraps(engine)
+    def optimize(target, initial, **_):
+        rows = [
+            IterationRecord(at, 1.0, 1.0, E_D, 0.0, False, len(each.cells), n_voxels, 0.0)
+            for at, each in enumerate((initial, mesh))
+            for E_D, n_voxels in (content_E_D(target, each),)
+        ]
+        labels = None if target.memberships is None else np.zeros(len(mesh.cells), dtype=np.int64)
+        return MeshingResult(mesh, rows, "iterations", initial, labels=labels)
+
+    monkeypatch.setattr(tetopt.engine.meshing, "optimize", optimize)
+    target_error = given.pop("target_error", None)
+    images = {kind: tetopt.Image(data) for kind, data in given.items()}
+    images["images"] = tetopt.Image(np.indices((SIDE,) * 3).sum(axis=0) ** 2.0)
+    for kind, image in images.items():
+        tetopt.save_image(tmp_path / f"{kind}.nii.gz", image)
+    files = {kind: str(tmp_path / f"{kind}.nii.gz") for kind in images}
+    options = {"spacing": 3.0} if target_error is None else {"target_error": target_error}
+    target = tetopt.content(images["images"], images.get("labels"), images.get("mask"))
+    mode = {} if target_error is not None else {"mode": "uniform"}
+    expected = dict(tetopt.mesh_image(target, iterations=1, **options, **mode).violated)
+    assert list(expected) == [name]
+
+    subject_folder(tmp_path, "sub-1").mkdir(parents=True)
+    out = subject_folder(tmp_path, "sub-1") / mesh_name("sub-1", ".vtu")
+    numbers = numbers_path(tmp_path, "sub-1")
+    job = tetopt.Job(**files, output=out, json_path=numbers, iterations=1, **options)
+    with pytest.warns(UserWarning, match="."):
+        assert tetopt.run(job).violated == expected
+    assert numbers_in(numbers)["violated"] == expected
+    words = [word for kind in given for word in (f"--{kind}", files[kind])]
+    check = ["quality", out, "--image", files["images"], *words, "--check"]
+    assert exit_code(*check, "--json", tmp_path / "q.json") == 1
+    assert numbers_in(tmp_path / "q.json")["violated"] == expected
+    row = row_of(tmp_path, "sub-1")
+    assert (row.violated, row.reason) == ((name,), expected[name])
 
 
 @pytest.fixture(scope="module")
@@ -48,9 +208,9 @@ def test_the_minimum_dihedral_angle(whole):
     assert words["min_dihedral"].startswith(
         f"{(angles < 60.0).sum()} of {len(angles)} cells have a dihedral angle below 60 degrees"
     )
-    unmoved = result._replace(history=result.history[:1])
     # The floor holds for meshes without iterations, too.
-    assert list(violated(image, unmoved, 60.0)) == ["min_dihedral"]
+    words = violated(image, result, 60.0, is_initial=True)["min_dihedral"]
+    assert "allow more `iterations`, as none was made" in words
     # No mesh of tetrahedra has all angles so large: the run itself says so. Of few nodes, since it
     # tries them all.
     assert list(tetopt.mesh_image(image, 60, iterations=2, min_dihedral=65.0).violated) == [
@@ -63,20 +223,25 @@ def test_the_box_and_the_cover(whole):
     larger = result._replace(mesh=tetopt.Mesh(result.mesh.points * 1.01, result.mesh.cells))
     assert list(violated(image, larger, start=result.mesh)) == ["box", "cover"]
     assert list(violated(image, larger, start=larger.mesh)) == []  # as the user's own was
-    assert "0 voxels are outside" in violated_request(image, larger, None, True)["cover"]
+    E_D, n_voxels = result.history[-1].counted
+    filled = judged(larger.mesh, image, is_filled=True, counted=(E_D, n_voxels))
+    assert ": +0 voxels, and its volume" in filled["cover"]
     last = result.history[-1]
     fewer = result._replace(history=[*result.history, last._replace(n_voxels=last.n_voxels - 1)])
-    assert "-1 voxels" in violated(image, fewer)["cover"]
-    assert "1 voxels are outside" in violated_request(image, fewer, None, True)["cover"]
-    assert violated_request(image, fewer, None, False) == {}
+    assert "initial domain: -1 voxels" in violated(image, fewer)["cover"]
+    filled = judged(result.mesh, image, is_filled=True, counted=(E_D, n_voxels - 1))
+    assert "the image: -1 voxels" in filled["cover"]
+    assert judged(result.mesh, image, counted=(E_D, n_voxels - 1)) == {}
 
 
 @pytest.mark.full
 def test_the_error(whole):
     image, result = whole
     fraction = result.history[-1].E_D / (plain(image).variance * image.volume)
-    assert violated_request(image, result, 1.01 * fraction, True) == {}
-    assert list(violated_request(image, result, 0.99 * fraction, True)) == ["error"]
+    assert violated(image, result, target_error=1.01 * fraction) == {}
+    assert list(violated(image, result, target_error=0.99 * fraction)) == ["error"]
+    words = violated(image, result, target_error=0.5 * fraction, cut_short="stopped")["error"]
+    assert "as the run was cut short (stopped); allow more time or memory, or raise" in words
     short = tetopt.mesh_image(image, target_error=0.3, iterations=3, k_D=0.0)
     assert ("error" in short.violated) == (
         short.history[-1].E_D > 0.3 * plain(image).variance * image.volume
@@ -128,11 +293,11 @@ def test_a_requirement_that_cannot_be_checked_is_violated_and_the_mesh_is_there(
     image, mask = shaped("ball")
     target = content(image, mask=mask)
     result = tetopt.mesh_image(target, 400, iterations=1)
-    monkeypatch.setattr(tetopt.engine.requirements, name, fail)
+    monkeypatch.setattr(tetopt.measure.judge, name, fail)
     names = {
         "dihedral_angles": "min_dihedral",
         "beyond_box": "box",
-        "cell_of_voxel": "mask components",
+        "cell_of_voxel": "overlap mask components",
         "manifold_problems": "manifold",
     }
     assert violated(target, result) == {
@@ -209,20 +374,19 @@ def test_labels_are_judged_as_they_are_measured(n, is_masked):
     is_kept = along < np.quantile(along, 0.8)
     mesh, along = part_of(mesh, is_kept), along[is_kept]
     of_cell = np.where(along < np.median(along), 13, tetopt.cell_labels(labels, mesh))
-    owner = tetopt.cell_of_voxel(target.image, mesh)
-    fits = _label_fits(target, target.memberships, mesh, of_cell, owner)
+    fits = measure(mesh, target, of_cell)["labels"]
     rows = tetopt.label_fidelity(labels, mesh, of_cell, mask)
     assert [fit.label for fit in fits] == [row.label for row in rows]
-    assert any(fit.components for fit in fits)
+    assert any(fit.lost_components for fit in fits)
     for fit, row in zip(fits, rows, strict=True):
-        assert (fit.voxels, fit.is_met) == (row.covered_voxels, row.dice > 0.0)
+        assert (fit.covered_voxels, fit.is_met) == (row.covered_voxels, row.dice > 0.0)
         assert fit.volume_ratio == pytest.approx(
             row.mesh_volume / (row.covered_voxels * labels.voxel_volume)
         )
-        assert [each.voxels for each in fit.components] == [
+        assert [each.voxels for each in fit.lost_components] == [
             each.voxels for each in row.lost_components
         ]
-        for one, other in zip(fit.components, row.lost_components, strict=True):
+        for one, other in zip(fit.lost_components, row.lost_components, strict=True):
             np.testing.assert_allclose(one.place, other.place)
             assert data[tuple(np.rint(labels.to_index(one.place)).astype(int))] == fit.label
 
@@ -234,7 +398,7 @@ def test_volumes_of_labels():
     image = tetopt.Image(labels)
     target, mesh = content(image, image), tetopt.lattice_mesh(image, blocks=(12, 12, 12))
     of_cell = tetopt.cell_labels(image, mesh)
-    assert "labels" not in judged(mesh, target, of_cell).violated
+    assert "labels" not in judged(mesh, target, of_cell)
     rng = np.random.default_rng(5)
     own, other = (rng.permutation(np.flatnonzero(of_cell == label)) for label in (1, 0))
     of_cell[np.flatnonzero(of_cell == 2)[::2]] = 0  # it has 64 voxels
@@ -244,7 +408,7 @@ def test_volumes_of_labels():
         changed[own[round(n_own * len(own)) :]] = 0
         changed[other[: round(n_other * len(own))]] = 1
         ratios.append(volumes(mesh.points, mesh.cells)[changed == 1].sum() / 216.0)
-        said = judged(mesh, target, changed).violated.get("labels", "")
+        said = judged(mesh, target, changed).get("labels", "")
         words = (
             f"the volume of cells is not 0.6 to 1.5 times that of voxels: {ratios[-1]:.3g} "
             "for label 1; allow more"
@@ -263,7 +427,7 @@ def test_components_of_a_mask_without_a_cell():
     gone = number == next(
         k for k in (1, 2) if not ((number == k) & (tetopt.cell_of_voxel(mask, one) >= 0)).any()
     )
-    words = judged(one, target).violated["components"]
+    words = judged(one, target)["components"]
     assert words.startswith(
         f"components of the mask of 50 voxels or more without a cell: {gone.sum()} voxels at ("
     )
@@ -284,11 +448,11 @@ def test_a_part_of_a_mask_without_cells_is_named_with_its_place():
         tetopt.Image(data.copy()),
         tetopt.lattice_mesh(tetopt.Image(data), blocks=(20, 8, 8)),
     )
-    block = part_of(box, (np.abs(centroids(box.points, box.cells) - 6.5) < 5.0).all(axis=1))
-    assert "components" not in judged(block, content(mask, mask=mask)).violated
+    part = part_of(box, (np.abs(centroids(box.points, box.cells) - 6.5) < 5.0).all(axis=1))
+    assert "components" not in judged(part, content(mask, mask=mask))
     data[12:38, 2:12, 6:8] = 1.0
     mask = tetopt.Image(data)
-    words = judged(block, content(mask, mask=mask)).violated["components"]
+    words = judged(part, content(mask, mask=mask))["components"]
     found = re.match(
         r"parts of the mask of 50 voxels or more with no cell near: (\d+) voxels at \(([\d.]+), ",
         words,
@@ -303,7 +467,7 @@ def test_small_components_of_a_mask_may_be_lost_and_are_counted():
     mask = tetopt.Image(data)
     mesh = tetopt.lattice_mesh(mask, blocks=(9, 9, 9))
     mesh = part_of(mesh, (centroids(mesh.points, mesh.cells) < 10.0).all(axis=1))
-    assert "components" not in judged(mesh, content(mask, mask=mask)).violated
+    assert "components" not in judged(mesh, content(mask, mask=mask))
     assert [each.voxels for each in tetopt.mask_fidelity(mask, mesh).lost_components] == [27]
 
 
