@@ -34,9 +34,9 @@ test-deep: $(VENV)/.test
 	$(TESTED) -q -m "deep and not slow" $(ALL_CORES)
 	$(MAKE) --no-print-directory -j 2 test-onethread test-nojit
 
-# Whether tests see the faults of tests/mutants: an hour and a half.
+# Whether tests see the faults of tests/mutants, two at a time: about an hour.
 test-mutants: $(VENV)/.test
-	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python tests/mutants/run.py
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python tests/mutants/run.py --jobs 2
 
 # The small cases again on one thread, and with the kernels run as plain Python; no other file is read for that.
 KERNEL_TESTS = $(shell grep -rl --include='test_*.py' 'mark\.kernel' tests)

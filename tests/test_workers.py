@@ -139,7 +139,6 @@ def deadly(folder, n_deaths, name):
 
 
 @pytest.mark.deep
-@pytest.mark.deep
 def test_a_task_whose_worker_dies_is_run_again(run, tmp_path, capfd):
     ended = run(partial(deadly, tmp_path, 1), list("abc"))
     assert ended == {"a": "a", "b": "b", "c": "c"}
@@ -147,7 +146,6 @@ def test_a_task_whose_worker_dies_is_run_again(run, tmp_path, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.deep
 @pytest.mark.deep
 def test_a_task_that_ends_its_workers_or_fails_takes_no_others_with_it(run, tmp_path, capfd):
     ended = run(partial(deadly, tmp_path, 9), ["a", "b", "error", *"cdef"])
