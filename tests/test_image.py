@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from meshes import random_affine
+from numpy.testing import assert_allclose, assert_array_equal
 
 from tetopt import Image, InputError
 from tetopt.image import transformed
@@ -34,7 +35,7 @@ def test_sheared_voxels_have_the_parallelepiped_s_volume():
 
 def test_default_is_a_voxel_of_1_mm_with_its_centre_at_the_origin():
     image = Image(np.zeros((3, 4)))
-    np.testing.assert_array_equal(image.affine, np.eye(3))
+    assert_array_equal(image.affine, np.eye(3))
     assert image.to_world([0, 0]).tolist() == [0, 0]
     assert image.volume == 12
 
@@ -52,9 +53,9 @@ def test_to_index_inverts_to_world(seed, n):
     rng = np.random.default_rng(seed)
     image = Image(np.zeros((3,) * n), random_affine(rng, n))
     index = rng.uniform(-50, 200, (20, n))
-    np.testing.assert_allclose(image.to_index(image.to_world(index)), index, atol=1e-10)
+    assert_allclose(image.to_index(image.to_world(index)), index, atol=1e-10)
     homogeneous = np.column_stack([index, np.ones(20)]) @ image.affine.T
-    np.testing.assert_allclose(image.to_world(index), homogeneous[:, :n], rtol=1e-12, atol=1e-12)
+    assert_allclose(image.to_world(index), homogeneous[:, :n], rtol=1e-12, atol=1e-12)
 
 
 @given(seeds, dimensions)
@@ -65,9 +66,9 @@ def test_transformed_is_a_matrix_product_row_by_row(seed, n):
     rng = np.random.default_rng(seed)
     matrix, vectors = rng.normal(size=(n, n)), rng.normal(size=(37, n))
     product = transformed(vectors, matrix)
-    np.testing.assert_allclose(product, vectors @ matrix.T, rtol=1e-12, atol=1e-14)
+    assert_allclose(product, vectors @ matrix.T, rtol=1e-12, atol=1e-14)
     for vector, row in zip(vectors, product, strict=True):
-        np.testing.assert_array_equal(transformed(vector, matrix), row)
+        assert_array_equal(transformed(vector, matrix), row)
 
 
 # What is kept
@@ -94,7 +95,7 @@ def test_values_are_kept_as_float32_where_that_loses_nothing(data, dtype):
     image = Image(data)
     assert image.data.dtype == dtype
     assert image.data.dtype.isnative
-    np.testing.assert_array_equal(image.data, np.asarray(data))
+    assert_array_equal(image.data, np.asarray(data))
     assert image.data.flags.c_contiguous
 
 
@@ -104,7 +105,7 @@ def test_arrays_are_copied_and_read_only():
     data[:] = 7
     affine[:] = 7
     assert (image.data == 0).all()
-    np.testing.assert_array_equal(image.affine, np.eye(3))
+    assert_array_equal(image.affine, np.eye(3))
     with pytest.raises(ValueError, match="read-only"):
         image.data[0, 0] = 1
     with pytest.raises(ValueError, match="read-only"):
@@ -115,9 +116,9 @@ def test_arrays_are_copied_and_read_only():
 
 def test_fortran_order_and_negative_strides_are_read_right():
     data = np.arange(24.0).reshape(2, 3, 4)
-    np.testing.assert_array_equal(Image(np.asfortranarray(data)).data, data)
-    np.testing.assert_array_equal(Image(data[::-1, :, ::-1]).data, data[::-1, :, ::-1])
-    np.testing.assert_array_equal(Image(data.T).data, data.T)
+    assert_array_equal(Image(np.asfortranarray(data)).data, data)
+    assert_array_equal(Image(data[::-1, :, ::-1]).data, data[::-1, :, ::-1])
+    assert_array_equal(Image(data.T).data, data.T)
 
 
 # Messages

@@ -6,6 +6,7 @@ import pickle
 import numpy as np
 import pytest
 from meshes import ALL_SMALL, BAD_TETS, REGULAR_TET, SQUARE, single
+from numpy.testing import assert_array_equal
 
 import tetopt
 from tetopt import Image, InputError, Mesh
@@ -18,8 +19,8 @@ def test_small_meshes_are_held_as_given(arrays):
     points, cells = arrays
     mesh = Mesh(points, cells)
     assert mesh.ndim == points.shape[1]
-    np.testing.assert_array_equal(mesh.points, points)
-    np.testing.assert_array_equal(mesh.cells, cells)
+    assert_array_equal(mesh.points, points)
+    assert_array_equal(mesh.cells, cells)
 
 
 @pytest.mark.parametrize("kind", BAD_TETS)
@@ -39,8 +40,8 @@ def test_arrays_are_copied_contiguous_and_read_only():
     mesh = Mesh(points, cells)
     points[:] = 0
     cells[:] = 0
-    np.testing.assert_array_equal(mesh.points, SQUARE[0])
-    np.testing.assert_array_equal(mesh.cells, SQUARE[1])
+    assert_array_equal(mesh.points, SQUARE[0])
+    assert_array_equal(mesh.cells, SQUARE[1])
     assert mesh.points.flags.c_contiguous
     assert mesh.cells.flags.c_contiguous
     with pytest.raises(ValueError, match="read-only"):
@@ -66,7 +67,7 @@ def test_copies_of_nouns_are_locked_and_equal(again):
         other = again(noun)
         assert repr(other) == repr(noun)
         for name in names:
-            np.testing.assert_array_equal(getattr(other, name), getattr(noun, name))
+            assert_array_equal(getattr(other, name), getattr(noun, name))
             assert not getattr(other, name).flags.writeable
 
 

@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 import scipy
+from numpy.testing import assert_allclose, assert_array_equal
 
 import tetopt
 from tetopt.contents.align import (
@@ -108,24 +109,22 @@ def test_nearest_is_its_twin(which):
     expected = nearest_twin(labels, image)
     assert 0 < np.count_nonzero(expected == 0) < expected.size  # both inside and outside are tried
     aligned = resample_labels(labels, image, "l")
-    np.testing.assert_array_equal(aligned.data, expected)
-    np.testing.assert_array_equal(aligned.affine, image.affine)
+    assert_array_equal(aligned.data, expected)
+    assert_array_equal(aligned.affine, image.affine)
     mask = tetopt.Image(255 * (labels.data > 4), labels.affine)
     aligned = resample_mask(mask, image, "m")
-    np.testing.assert_array_equal(aligned.data, nearest_twin(mask, image) / 255)
-    np.testing.assert_array_equal(aligned.affine, image.affine)
+    assert_array_equal(aligned.data, nearest_twin(mask, image) / 255)
+    assert_array_equal(aligned.affine, image.affine)
     chance = tetopt.Image(labels.data / 16, labels.affine)
-    np.testing.assert_array_equal(
-        resample_mask(chance, image, "m").data, nearest_twin(chance, image)
-    )
+    assert_array_equal(resample_mask(chance, image, "m").data, nearest_twin(chance, image))
 
 
 @pytest.mark.parametrize("which", PAIRS)
 def test_linear_is_its_twin(which):
     image, other = pair(which, lambda rng: rng.normal(size=OTHER).astype(np.float32))
     aligned = resample_contrast(other, image, "c")
-    np.testing.assert_allclose(aligned.data, linear_twin(other, image), atol=1e-6)
-    np.testing.assert_array_equal(aligned.affine, image.affine)
+    assert_allclose(aligned.data, linear_twin(other, image), atol=1e-6)
+    assert_array_equal(aligned.affine, image.affine)
 
 
 def _translation(*shift):
@@ -141,16 +140,16 @@ def test_same_grid_is_taken_as_it_is():
     image = tetopt.Image(np.zeros(SHAPE), affine)
     data = rng.normal(size=SHAPE).astype(np.float32)
     near = tetopt.Image(data, affine @ _translation(9e-5, 0, 0))
-    np.testing.assert_array_equal(resample_contrast(near, image, "c").data, data)
-    np.testing.assert_array_equal(resample_contrast(near, image, "c").affine, affine)
+    assert_array_equal(resample_contrast(near, image, "c").data, data)
+    assert_array_equal(resample_contrast(near, image, "c").affine, affine)
     far = tetopt.Image(data, affine @ _translation(2e-3, 0, 0))
     assert 1e-4 < np.abs(resample_contrast(far, image, "c").data - data).max() < 2e-2
     shape_only = tetopt.Image(
         np.arange(1, 1 + np.prod(SHAPE)).reshape(SHAPE), affine @ _translation(0, 2, 0)
     )
     moved = resample_labels(shape_only, image, "l").data
-    np.testing.assert_array_equal(moved[:, 2:], shape_only.data[:, :-2])
-    np.testing.assert_array_equal(moved[:, :2], 0)
+    assert_array_equal(moved[:, 2:], shape_only.data[:, :-2])
+    assert_array_equal(moved[:, :2], 0)
 
 
 @pytest.mark.parametrize("spacing", [1.0, 0.1, 0.7])
@@ -167,10 +166,10 @@ def test_grid_shifted_by_half_a_voxel(spacing, sign):
     )
     aligned = resample_labels(labels, image, "l").data
     if sign > 0:  # index i + 1/2: the upper is i + 1, the last is on the upper face, outside
-        np.testing.assert_array_equal(aligned[:-1], labels.data[1:])
-        np.testing.assert_array_equal(aligned[-1], 0)
+        assert_array_equal(aligned[:-1], labels.data[1:])
+        assert_array_equal(aligned[-1], 0)
     else:  # index i - 1/2: the upper is i, the first on the lower face, inside
-        np.testing.assert_array_equal(aligned, labels.data)
+        assert_array_equal(aligned, labels.data)
 
 
 def test_cropped_and_finer_masks():
@@ -179,12 +178,12 @@ def test_cropped_and_finer_masks():
     expected = np.zeros(image.shape)
     expected[1:3, 2:5, 5] = 1
     aligned = resample_mask(crop, image, "m").data
-    np.testing.assert_array_equal(aligned, expected)
+    assert_array_equal(aligned, expected)
     fine = tetopt.Image(
         expected.repeat(3, 0).repeat(3, 1).repeat(3, 2), np.diag([2 / 3] * 3 + [1.0])
     )
     fine = tetopt.Image(fine.data, fine.affine @ _translation(-1, -1, -1))
-    np.testing.assert_array_equal(resample_mask(fine, image, "m").data, expected)
+    assert_array_equal(resample_mask(fine, image, "m").data, expected)
 
 
 def test_two_dimensions():
@@ -194,10 +193,8 @@ def test_two_dimensions():
     other = tetopt.Image(rng.integers(1, 5, (6, 5)), affine)
     expected = nearest_twin(other, image)
     assert 0 < (expected == 0).sum() < expected.size
-    np.testing.assert_array_equal(resample_labels(other, image, "l").data, expected)
-    np.testing.assert_allclose(
-        resample_contrast(other, image, "c").data, linear_twin(other, image), atol=1e-6
-    )
+    assert_array_equal(resample_labels(other, image, "l").data, expected)
+    assert_allclose(resample_contrast(other, image, "c").data, linear_twin(other, image), atol=1e-6)
 
 
 def test_labels_without_a_voxel_in_the_image_or_mask_are_named(recwarn):
@@ -250,7 +247,7 @@ def test_a_label_that_falls_between_voxels_of_its_size_is_told():
 def test_what_a_mask_may_hold(values, expected):
     mask = tetopt.Image(values)
     aligned = resample_mask(mask, tetopt.Image(np.zeros(mask.shape)), "m")
-    np.testing.assert_array_equal(aligned.data, expected)
+    assert_array_equal(aligned.data, expected)
     assert aligned.data.dtype == np.float32
     doubles = resample_mask(tetopt.Image([[0.1, 0.7]]), tetopt.Image(np.zeros((1, 2))), "m").data
     assert doubles.dtype == np.float32
@@ -317,21 +314,19 @@ def test_labels_that_are_none():
 
 def test_label_files_of_floats():
     labels = tetopt.Image(np.array([[0.0, 32_767.0], [2.0, 1.0]], dtype=np.float64))
-    np.testing.assert_array_equal(
+    assert_array_equal(
         resample_labels(labels, tetopt.Image(np.zeros((2, 2))), "l").data, labels.data
     )
     # One value in its own box, but a box smaller than the image: label and background.
     crop = tetopt.Image([[4.0]])
-    np.testing.assert_array_equal(
-        resample_labels(crop, tetopt.Image(np.zeros((1, 2))), "l").data, [[4, 0]]
-    )
+    assert_array_equal(resample_labels(crop, tetopt.Image(np.zeros((1, 2))), "l").data, [[4, 0]])
 
 
 def test_a_contrast_covers_half_of_the_image():
     image = tetopt.Image(np.zeros((4, 3, 2)))
     other = np.arange(24.0).reshape(4, 3, 2)
     aligned = resample_contrast(tetopt.Image(other, _translation(2, 0, 0)), image, "t2").data
-    np.testing.assert_array_equal(aligned, other[[0, 0, 0, 1]])  # the border goes on
+    assert_array_equal(aligned, other[[0, 0, 0, 1]])  # the border goes on
     assert message(resample_contrast, "t2", tetopt.Image(other, _translation(3, 0, 0)), image) == (
         "t2: expected it to cover at least half of the image's voxels, got 25.0 %; it spans "
         "2.5..6.5 x -0.5..2.5 x "
@@ -364,21 +359,19 @@ def test_foreground_by_hand(shape):
     bright = (body | piece | speck) & ~ball(shape, 4) & ~pocket
     image = tetopt.Image(np.where(bright, 50.0, 3.0), np.diag([2.0] * n + [1.0]))
     front = foreground_mask(image, 3.0)
-    np.testing.assert_array_equal(front.data, body | piece)
-    np.testing.assert_array_equal(front.affine, image.affine)
-    np.testing.assert_array_equal(foreground_mask(image).data, body | piece)
+    assert_array_equal(front.data, body | piece)
+    assert_array_equal(front.affine, image.affine)
+    assert_array_equal(foreground_mask(image).data, body | piece)
     assert background_level(image) == 3.0
     # A channel to the cavity: face neighbours leak, voxels that touch in an edge do not.
     channel = image.data.copy()
     middle = tuple((s - 1) // 2 for s in shape)
     channel[(slice(0, middle[0]), *middle[1:])] = 3.0
     leaking = foreground_mask(tetopt.Image(channel), 3.0).data
-    np.testing.assert_array_equal(
-        leaking, (body | piece) & ~ball(shape, 4) & (channel > 3.0) | pocket
-    )
+    assert_array_equal(leaking, (body | piece) & ~ball(shape, 4) & (channel > 3.0) | pocket)
     assert leaking[middle] == 0
     diagonal = tetopt.Image([[9.0, 9, 9, 9], [9, 9, 9, 9], [9, 9, 1, 9], [9, 9, 9, 1]])
-    np.testing.assert_array_equal(foreground_mask(diagonal, 1.0).data == 0, np.diag([0, 0, 0, 1]))
+    assert_array_equal(foreground_mask(diagonal, 1.0).data == 0, np.diag([0, 0, 0, 1]))
 
 
 @pytest.mark.parametrize("air", [-1000.0, 0.0, 20.0])
@@ -394,7 +387,7 @@ def test_level_of_noisy_air(air):
         data[0, start : start + 5] = air + 150.0  # all three 6 % of the dark voxels on the faces
     image = tetopt.Image(data)
     assert background_level(image) == pytest.approx(air + 42.0, abs=4.0)
-    np.testing.assert_array_equal(foreground_mask(image).data, body)
+    assert_array_equal(foreground_mask(image).data, body)
 
 
 def test_background_of_one_value_is_exact():
@@ -403,7 +396,7 @@ def test_background_of_one_value_is_exact():
     body = ball(data.shape, 7)
     data[body] = np.random.default_rng(2).uniform(1e-3, 100.0, body.sum())
     assert background_level(tetopt.Image(data)) == 0.0
-    np.testing.assert_array_equal(foreground_mask(tetopt.Image(data)).data, body)
+    assert_array_equal(foreground_mask(tetopt.Image(data)).data, body)
 
 
 def test_images_without_background():
@@ -451,7 +444,7 @@ def test_levels_that_leave_nothing():
     # A level given is taken at its word, however little it leaves.
     data = np.zeros((40, 40))
     data[20, 20] = 1.0
-    np.testing.assert_array_equal(foreground_mask(tetopt.Image(data), 0.0).data, data)
+    assert_array_equal(foreground_mask(tetopt.Image(data), 0.0).data, data)
 
 
 def test_foreground_of_labels_by_hand():
@@ -466,12 +459,12 @@ def test_foreground_of_labels_by_hand():
     image = tetopt.Image(labels)
     front = foreground_mask(image, 0.0, image)
     cavity = ball(labels.shape, 4) & (labels == 0)
-    np.testing.assert_array_equal(front.data, (labels > 0) | cavity)
+    assert_array_equal(front.data, (labels > 0) | cavity)
     # Labels of a grey image: dark labelled voxels stay, and bright specks without a label go.
     data = np.where(labels == 1, 100.0, 0.0)
     data[2, 28, 2] = 100.0
     grey = tetopt.Image(data)
-    np.testing.assert_array_equal(foreground_mask(grey, 0.0, image).data, (labels > 0) | cavity)
+    assert_array_equal(foreground_mask(grey, 0.0, image).data, (labels > 0) | cavity)
     assert message(foreground_mask, grey, 0.0, tetopt.Image(labels[1:])).startswith(
         "labels: expected the image's shape"
     )
@@ -515,7 +508,7 @@ def test_voxels_divided_to_the_size_of_labels_keep_all_of_them(shift):
         np.count_nonzero(moved.data == label) / np.count_nonzero(labels.data == label)
         for label in (1, 2, 3)
     ]
-    np.testing.assert_allclose(n_lost, 1.0)
+    assert_allclose(n_lost, 1.0)
     with pytest.warns(
         UserWarning,
         match=r"0.5 x 0.5 x 0.5 mm to 2 x 2 x 2 mm; label \d keeps \d+% .*in \d+ pieces",
@@ -535,10 +528,8 @@ def test_voxels_are_divided_only_where_others_are_finer():
     assert parts.volume == pytest.approx(image.volume)
     for place in ((0, 0, 0), (3, 4, 5), (1, 2, 3)):
         i, j, k = place
-        np.testing.assert_array_equal(
-            parts.data[i, 2 * j : 2 * j + 2, 5 * k : 5 * k + 5], data[place]
-        )
-    np.testing.assert_allclose(parts.to_world([1, 4.5, 17.0]), image.to_world([1, 2, 3]))
+        assert_array_equal(parts.data[i, 2 * j : 2 * j + 2, 5 * k : 5 * k + 5], data[place])
+    assert_allclose(parts.to_world([1, 4.5, 17.0]), image.to_world([1, 2, 3]))
 
 
 def test_values_near_whole_numbers_are_rounded():
@@ -548,7 +539,7 @@ def test_values_near_whole_numbers_are_rounded():
         UserWarning, match=r"l: 19 voxels were rounded to whole numbers \(by up to 0.00061\)"
     ):
         moved = resample_labels(tetopt.Image(labels * 1.000152), image, "l")
-    np.testing.assert_array_equal(moved.data, labels)
+    assert_array_equal(moved.data, labels)
     assert "the first 0.002 at (0, 0, 0)" in message(
         resample_labels, "l", tetopt.Image(labels + 0.002), image
     )
@@ -569,4 +560,4 @@ def test_a_grey_image_is_no_label_image(levels):
     assert re.match(words, message(resample_labels, "l", tetopt.Image(grey), image))
     assert re.match(words, message(tetopt.content, image, tetopt.Image(grey)))
     cubes = rng.permutation(512).reshape(8, 8, 8).repeat(3, 0).repeat(3, 1).repeat(3, 2)
-    np.testing.assert_array_equal(resample_labels(tetopt.Image(cubes), image, "l").data, cubes)
+    assert_array_equal(resample_labels(tetopt.Image(cubes), image, "l").data, cubes)

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from shapes import OBLIQUE, channels, grid, shaped
 
 import tetopt
@@ -41,7 +42,7 @@ def test_contrasts_count_by_their_weights_not_their_scales(weights):
     weights_ = [1.0, 1.0, 1.0] if weights is None else weights
     unit = float(np.var(images[0].data, dtype=np.float64))
     variances = [target.unit * float(np.var(v, dtype=np.float64)) for v in channels(target)]
-    np.testing.assert_allclose(variances, [w * unit for w in weights_ if w > 0.0], rtol=2e-3)
+    assert_allclose(variances, [w * unit for w in weights_ if w > 0.0], rtol=2e-3)
     kept = [image for image, w in zip(images, weights_, strict=True) if w > 0.0]
     for values, image in zip(channels(target), kept, strict=True):
         assert np.corrcoef(values.ravel(), image.data.ravel())[0, 1] > 0.99999
@@ -118,7 +119,7 @@ def test_sums_of_a_rare_label():
     square = (channels(target).astype(np.float64) ** 2).sum(axis=0)
     assert square.sum(axis=-1).max() > 2**31
     prefix = channel_grid(target, tetopt.lattice_mesh(image, blocks=(1, 1, 1)).points).prefix
-    np.testing.assert_array_equal(np.diff(prefix[..., 1], axis=2), square)
+    assert_array_equal(np.diff(prefix[..., 1], axis=2), square)
 
 
 @pytest.mark.parametrize("n", [2, 3])
@@ -144,7 +145,7 @@ def test_sums_of_channels(n):
         if target.region is not None:
             rows.append(np.where(region.inside.ravel(), -1.0, 1.0))
         expected = np.stack([np.bincount(owner, row, len(mesh.cells)) for row in rows], axis=1)
-        np.testing.assert_array_equal(sums, expected[:, : sums.shape[1]])
+        assert_array_equal(sums, expected[:, : sums.shape[1]])
         assert sums.shape[1] == len(rows)
 
 
@@ -154,17 +155,17 @@ def test_beyond_a_mask_the_nearest_value_inside_counts():
     target = content(far, mask=mask)
     assert target.image.data.min() > -1e3
     whole = continued(far, mask)
-    np.testing.assert_array_equal(whole.data, target.image.data)
-    np.testing.assert_array_equal(continued(far, target.continuation).data, whole.data)
+    assert_array_equal(whole.data, target.image.data)
+    assert_array_equal(continued(far, target.continuation).data, whole.data)
     # The same place in the world, and the same voxels inside.
     index = image.to_index(target.image.to_world(grid(target.image.shape)))
     start = np.rint(index[0, 0, 0]).astype(int)
-    np.testing.assert_allclose(index - start, grid(target.image.shape), atol=1e-9)
+    assert_allclose(index - start, grid(target.image.shape), atol=1e-9)
     part = tuple(slice(s, s + n) for s, n in zip(start, target.image.shape, strict=True))
     inside = mask.data[part] > 0
     assert inside.sum() == mask.data.sum() == target.n_voxels
-    np.testing.assert_array_equal(target.image.data[inside], image.data[part][inside])
-    np.testing.assert_array_equal(target.region.inside, inside)
+    assert_array_equal(target.image.data[inside], image.data[part][inside])
+    assert_array_equal(target.region.inside, inside)
     assert target.variance == pytest.approx(
         float(np.var(image.data[mask.data > 0], dtype=np.float64)), rel=1e-9
     )

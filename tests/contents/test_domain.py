@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.ndimage import binary_opening, map_coordinates
 from shapes import OBLIQUE, distance, grid, shaped
 
@@ -38,8 +39,8 @@ def test_voxels_stay_on_their_side():
     rng = np.random.default_rng(1)
     mask = rng.random((12, 13, 14)) < 0.4
     region = region_of(tetopt.Image(1.0 * mask))
-    np.testing.assert_array_equal(region.level < 0.0, mask)
-    np.testing.assert_array_equal(region.inside, mask)
+    assert_array_equal(region.level < 0.0, mask)
+    assert_array_equal(region.inside, mask)
 
 
 @pytest.mark.parametrize("thickness", [2.0, 3.0, 5.0])
@@ -72,8 +73,8 @@ def test_far_from_the_surface_the_level_counts_voxels():
     mask = distance((40, 24, 25), 8.0, 11.0, 12.0) < 5.0
     for fraction in (1.0, 0.9):  # of two values, and of fractions
         level = region_of(tetopt.Image(fraction * mask)).level[:, 11, 12]
-        np.testing.assert_allclose(level[12:], np.arange(12, 40) - 12.6, atol=1.0)
-        np.testing.assert_allclose(np.diff(level[20:]), 1.0)
+        assert_allclose(level[12:], np.arange(12, 40) - 12.6, atol=1.0)
+        assert_allclose(np.diff(level[20:]), 1.0)
 
 
 def test_fractions_have_their_own_surface():
@@ -97,7 +98,7 @@ def test_all_inside_has_no_surface():
 def test_levels_are_linear_between_centres():
     level = np.random.default_rng(0).normal(size=(5, 6, 7)).astype(np.float32)
     at = np.random.default_rng(1).uniform(-0.5, 6.0, size=(50, 3))
-    np.testing.assert_allclose(
+    assert_allclose(
         levels(level, at), map_coordinates(level.astype(float), at.T, order=1, mode="nearest")
     )
 
@@ -117,7 +118,7 @@ def test_the_way_onto_the_surface_is_the_shortest_in_mm(n):
     way = (there - at) @ affine[:-1, :-1].T
     side = way - np.outer(way @ world, world) / (world @ world)
     assert np.abs(side).max() < 1e-3 * np.abs(way).max()
-    np.testing.assert_allclose((there - 9.3) @ normal, 0.0, atol=2e-3)
+    assert_allclose((there - 9.3) @ normal, 0.0, atol=2e-3)
 
 
 def test_nodes_on_the_box_stay_on_it():
@@ -215,6 +216,4 @@ def test_voxels_in_cubes_of_two_are_scipys(shape):
     rng = np.random.default_rng(0)
     for fraction in (0.7, 0.9, 0.97):
         inside = rng.random(shape) < fraction
-        np.testing.assert_array_equal(
-            _opened(inside), binary_opening(inside, np.ones((2,) * len(shape)))
-        )
+        assert_array_equal(_opened(inside), binary_opening(inside, np.ones((2,) * len(shape))))

@@ -2,6 +2,7 @@ import naive
 import numba
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
 from scipy.ndimage import label as components
 from shapes import OBLIQUE, distance, grid
@@ -65,20 +66,18 @@ def test_every_voxel_keeps_its_label():
     for shape in [(9, 10, 11), (17, 16)]:
         labels = rng.choice([0, 3, 4, 90], size=shape)
         members = memberships(tetopt.Image(labels))
-        np.testing.assert_array_equal(members.labels, [0, 3, 4, 90])
-        np.testing.assert_array_equal(members.labels[members.partition], labels)
-        np.testing.assert_array_equal(
-            members.levels.argmin(axis=0), members.channel[members.partition]
-        )
+        assert_array_equal(members.labels, [0, 3, 4, 90])
+        assert_array_equal(members.labels[members.partition], labels)
+        assert_array_equal(members.levels.argmin(axis=0), members.channel[members.partition])
 
 
 @pytest.mark.parametrize("n_labels", [180, 181])
 def test_numbers_of_labels_leave_room_for_those_of_pairs(n_labels):
     labels = np.arange(200).reshape(10, 20) % n_labels * 3
     values, rows = numbered(tetopt.Image(labels))
-    np.testing.assert_array_equal(values[rows], labels)
+    assert_array_equal(values[rows], labels)
     pairs = (n_labels + 1) * rows + n_labels
-    np.testing.assert_array_equal(pairs, (n_labels + 1) * rows.astype(np.int64) + n_labels)
+    assert_array_equal(pairs, (n_labels + 1) * rows.astype(np.int64) + n_labels)
 
 
 @pytest.mark.parametrize("shape", [(19, 5, 4), (22, 9)])
@@ -87,9 +86,7 @@ def test_a_level_as_by_its_plain_twin(shape):
     inside = at[..., 0] < 9.3 + 0.2 * at[..., 1]
     inside[14, 2], inside[3, 1] = True, False
     members = memberships(tetopt.Image(1.0 * inside))
-    np.testing.assert_allclose(
-        members.levels[members.channel[1]], naive.smooth_level(inside), atol=2e-5
-    )
+    assert_allclose(members.levels[members.channel[1]], naive.smooth_level(inside), atol=2e-5)
 
 
 @pytest.mark.parametrize("shape", [(19, 5, 4), (22, 9), (3, 40, 2), (1, 7, 30)])
@@ -142,7 +139,7 @@ def test_nothing_is_lost():
         labels = np.zeros((20, 21, 22))
         labels[part] = 5.0
         level = between(memberships(tetopt.Image(labels)), 5, 0)
-        np.testing.assert_array_equal(level < 0.0, labels == 5.0)
+        assert_array_equal(level < 0.0, labels == 5.0)
 
 
 def test_an_interface_of_two_labels_is_that_of_each():
@@ -189,9 +186,9 @@ def test_finer_voxels_fill_the_same_box(factors):
     assert fine.shape == tuple(np.multiply(image.shape, factors))
     corners = np.array([[-0.5] * 3, np.array(image.shape) - 0.5])
     fine_corners = np.array([[-0.5] * 3, np.array(fine.shape) - 0.5])
-    np.testing.assert_allclose(fine.to_world(fine_corners), image.to_world(corners), atol=1e-9)
+    assert_allclose(fine.to_world(fine_corners), image.to_world(corners), atol=1e-9)
     at = np.clip(image.to_index(fine.to_world(grid(fine.shape))), 0.0, np.array(image.shape) - 1.0)
-    np.testing.assert_allclose(fine.data, at @ [1.0, -2.0, 3.0], atol=1e-5)
+    assert_allclose(fine.data, at @ [1.0, -2.0, 3.0], atol=1e-5)
 
 
 @pytest.mark.full
@@ -204,7 +201,7 @@ def test_thick_slices_do_not_show(spacing, shape):
     members = memberships(image, factors)
     labels = members.labels[members.partition]
     planes = tuple(slice(factor // 2, None, factor) for factor in factors)
-    np.testing.assert_array_equal(labels[planes], image.data)  # each slice keeps what it has
+    assert_array_equal(labels[planes], image.data)  # each slice keeps what it has
     affine = finer_affine(image.affine, factors)
     true, inner = bumpy(grid(labels.shape) * np.diag(affine)[:3] + affine[:3, 3])
     nearest = image.data
@@ -234,7 +231,7 @@ def test_a_piece_that_ends_between_slices_is_rounded():
     assert np.flatnonzero(area).tolist() == [10, 11, 12, 13, 14]
     assert 0.6 * disc < area[10] < 0.9 * disc
     assert area[10] < area[11] <= disc
-    np.testing.assert_allclose(area, area[::-1], atol=2)
+    assert_allclose(area, area[::-1], atol=2)
     assert area.sum() == pytest.approx(5.0 * disc, rel=0.1)
 
 
@@ -250,7 +247,7 @@ def test_labels_get_no_pieces_between_slices():
     for k in range(8):
         same = labels[..., k] == labels[..., k + 1]
         for fine in range(5 * k + 2, 5 * k + 8):
-            np.testing.assert_array_equal(partition[same][:, fine], labels[same][:, k])
+            assert_array_equal(partition[same][:, fine], labels[same][:, k])
     for row in range(6):
         piece, n = components(partition == row)
         assert set(piece[..., 2::5].ravel()) | {0} == set(range(n + 1))
@@ -265,7 +262,7 @@ def test_the_same_on_any_number_of_threads():
         results.append(memberships(image, (1, 1, 3)))
     numba.set_num_threads(before)
     for one, other in zip(*results, strict=True):
-        np.testing.assert_array_equal(one, other)
+        assert_array_equal(one, other)
 
 
 def test_labels_must_be_whole_numbers():

@@ -6,6 +6,7 @@ import naive
 import numba
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial import Delaunay
 from states import CASES, ball
 
@@ -35,7 +36,7 @@ def test_mappings(name, retessellate):
     assert result.history[-1].E < 0.99
     assert any(row.is_retessellated for row in result.history) <= (retessellate != "never")
     if retessellate == "never":
-        np.testing.assert_array_equal(result.mesh.cells, mesh.cells)
+        assert_array_equal(result.mesh.cells, mesh.cells)
 
 
 def test_history_holds_the_energies_of_the_mesh():
@@ -128,7 +129,7 @@ def test_lloyd_moves_to_the_weighted_circumcentre():
         retessellate="never",
         boundary="fixed",
     )
-    np.testing.assert_allclose(result.mesh.points[8], expected, atol=1e-6)
+    assert_allclose(result.mesh.points[8], expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("boundary", ["slide", "fixed"])
@@ -144,10 +145,10 @@ def test_boundary_nodes(boundary):
     before, after = image.to_index(mesh.points), image.to_index(result.mesh.points)
     outer = np.unique(boundary_facets(mesh.cells))
     if boundary == "fixed":
-        np.testing.assert_allclose(after[outer], before[outer], atol=1e-6)
+        assert_allclose(after[outer], before[outer], atol=1e-6)
         return
     is_on_face = np.isclose(before, -0.5) | np.isclose(before, np.array(image.shape) - 0.5)
-    np.testing.assert_allclose(after[is_on_face], before[is_on_face], atol=1e-9)
+    assert_allclose(after[is_on_face], before[is_on_face], atol=1e-9)
     assert np.abs(after[outer] - before[outer]).max() > 0.1
 
 
@@ -162,7 +163,7 @@ def test_nodes_inside_the_box_on_a_free_boundary_stay():
     mesh = tetopt.Mesh(small.points + 6.0, small.cells)
     result = optimize_paper(image, mesh, k_D=0.5, iterations=3, retessellate="never")
     outer = np.unique(boundary_facets(mesh.cells))
-    np.testing.assert_allclose(result.mesh.points[outer], mesh.points[outer], atol=1e-6)
+    assert_allclose(result.mesh.points[outer], mesh.points[outer], atol=1e-6)
     assert result.history[-1].E < result.history[0].E
     with pytest.raises(tetopt.InputError, match=r"fills the image's box exactly.*never"):
         optimize_paper(image, mesh, k_D=0.5, iterations=3)
@@ -199,9 +200,7 @@ def test_turned_world_turned_mesh():
         optimize_paper(i, tetopt.lattice_mesh(i, blocks=blocks), k_D=0.3, iterations=6)
         for i in (plain, turned)
     ]
-    np.testing.assert_allclose(
-        turned.to_index(results[1].mesh.points), results[0].mesh.points, atol=1e-3
-    )
+    assert_allclose(turned.to_index(results[1].mesh.points), results[0].mesh.points, atol=1e-3)
     assert results[1].history[-1].E == pytest.approx(results[0].history[-1].E, rel=1e-6)
 
 
@@ -216,7 +215,7 @@ def test_scaled_world_scaled_mesh():
         optimize_paper(i, tetopt.lattice_mesh(i, blocks=blocks), k_D=0.3, iterations=6)
         for i in (plain, scaled)
     ]
-    np.testing.assert_allclose(results[1].mesh.points, 2.0 * results[0].mesh.points, atol=1e-4)
+    assert_allclose(results[1].mesh.points, 2.0 * results[0].mesh.points, atol=1e-4)
     assert results[1].history[-1].E == pytest.approx(results[0].history[-1].E, rel=1e-9)
     assert results[1].history[-1].E_G == pytest.approx(
         2.0**5 * results[0].history[-1].E_G, rel=1e-9
@@ -427,10 +426,10 @@ def test_spoiled_tessellations_are_not_taken(spoil, monkeypatch):
     good = delaunay(image.to_index(mesh.points), image.affine)
     monkeypatch.setattr(sys.modules["tetopt.engine.paper"], "delaunay", lambda *_: spoil(good))
     result = optimize_paper(image, mesh, k_D=0.3, iterations=1, n_t=1)
-    np.testing.assert_array_equal(result.mesh.cells, mesh.cells)
+    assert_array_equal(result.mesh.cells, mesh.cells)
     assert not any(row.is_retessellated for row in result.history)
     monkeypatch.setattr(sys.modules["tetopt.engine.paper"], "delaunay", lambda *_: good[::-1])
-    np.testing.assert_array_equal(
+    assert_array_equal(
         optimize_paper(image, mesh, k_D=0.3, iterations=1, n_t=1).mesh.cells, good[::-1]
     )
 
@@ -443,9 +442,9 @@ def test_flat_cells_are_left_but_not_made(monkeypatch):
     image, mesh = ball((12, 12)), tetopt.Mesh(points, [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
     monkeypatch.setattr(sys.modules["tetopt.engine.paper"], "delaunay", lambda *_: mesh.cells[::-1])
     result = optimize_paper(image, mesh, k_D=0.0, iterations=1, n_t=1)
-    np.testing.assert_array_equal(result.mesh.cells, mesh.cells)
+    assert_array_equal(result.mesh.cells, mesh.cells)
     assert not result.history[1].is_retessellated
-    np.testing.assert_allclose(result.mesh.points[4], [5.5, 5.5], atol=1e-5)
+    assert_allclose(result.mesh.points[4], [5.5, 5.5], atol=1e-5)
 
 
 def test_step_length_is_a_ratio_of_the_nearest_centroid():

@@ -5,6 +5,7 @@ from itertools import pairwise
 import numba
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from shapes import OBLIQUE, channels, distance, grid, shaped
 
 import tetopt
@@ -148,7 +149,7 @@ def test_the_boundary_may_be_fixed():
         target, start, k_D=0.5, iterations=3, min_dihedral=0.0, boundary="fixed"
     )
     outer = np.unique(boundary_facets(start.cells))
-    np.testing.assert_allclose(result.mesh.points[outer], start.points[outer], atol=1e-5)
+    assert_allclose(result.mesh.points[outer], start.points[outer], atol=1e-5)
     assert np.abs(result.mesh.points - start.points).max() > 0.3
 
 
@@ -162,8 +163,8 @@ def test_what_lies_beyond_the_mask_does_not_matter():
         tetopt.mesh_image(content(each, mask=mask), 300, iterations=3).mesh
         for each in (image, other)
     ]
-    np.testing.assert_array_equal(meshes[0].points, meshes[1].points)
-    np.testing.assert_array_equal(meshes[0].cells, meshes[1].cells)
+    assert_array_equal(meshes[0].points, meshes[1].points)
+    assert_array_equal(meshes[0].cells, meshes[1].cells)
 
 
 @pytest.mark.full
@@ -179,8 +180,8 @@ def test_same_bits_on_any_number_of_threads():
             meshes.append(tetopt.mesh_image(target, 400, iterations=3).mesh)
     finally:
         numba.set_num_threads(most)
-    np.testing.assert_array_equal(meshes[0].points, meshes[1].points)
-    np.testing.assert_array_equal(meshes[0].cells, meshes[1].cells)
+    assert_array_equal(meshes[0].points, meshes[1].points)
+    assert_array_equal(meshes[0].cells, meshes[1].cells)
 
 
 def test_a_lift_that_lays_cells_over_one_another_is_undone(monkeypatch):
@@ -255,7 +256,7 @@ def test_an_interface_that_touches_itself_is_mended_by_labels_alone():
     assert any("touches itself" in line for line in manifold_problems(mesh, run.labels()))
     assert run.mend_surfaces(True) == 0
     assert manifold_problems(run.mesh(), run.labels()) == []
-    np.testing.assert_array_equal(run.mesh().points, mesh.points)
+    assert_array_equal(run.mesh().points, mesh.points)
 
 
 def corners(shape=(24, 24, 24)):
@@ -367,9 +368,7 @@ def test_level_between_voxels():
         level = rng.normal(size=shape).astype(np.float32)
         at = rng.uniform(-1.0, 6.0, size=(30, 3))
         values = [level_at(level, *place) for place in at]
-        np.testing.assert_allclose(
-            values, levels(level, np.clip(at, 0, np.array(shape) - 1.0)), atol=1e-6
-        )
+        assert_allclose(values, levels(level, np.clip(at, 0, np.array(shape) - 1.0)), atol=1e-6)
 
 
 @pytest.mark.kernel
@@ -399,7 +398,7 @@ def test_put_on_surface():
     assert reached.mean() > 0.8
     there = ticks[reached] * 2.0**-grid_.bits
     assert np.abs(levels(region_level, there)).max() < 1.5e-3
-    np.testing.assert_array_equal(ticks[20:, 2], before[20:, 2])
+    assert_array_equal(ticks[20:, 2], before[20:, 2])
 
 
 @pytest.mark.kernel

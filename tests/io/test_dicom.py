@@ -9,6 +9,7 @@ import warnings
 import numpy as np
 import pytest
 from commands import exit_code
+from numpy.testing import assert_allclose, assert_array_equal
 
 import tetopt
 from tetopt.errors import InputError
@@ -124,10 +125,8 @@ def affine_of(step=STEP * NORMAL):
 
 
 def assert_placed(image, pixels=RAMP, affine=None):
-    np.testing.assert_array_equal(image.data, pixels.T)
-    np.testing.assert_allclose(
-        image.affine, affine_of() if affine is None else affine, rtol=0, atol=1e-7
-    )
+    assert_array_equal(image.data, pixels.T)
+    assert_allclose(image.affine, affine_of() if affine is None else affine, rtol=0, atol=1e-7)
 
 
 def assert_refused(path, match, **options):
@@ -356,7 +355,7 @@ def test_one_slice_has_the_thickness_that_it_states(tmp_path):
 def test_a_picture_without_place(tmp_path):
     path = saved(tmp_path / "a.dcm", file_of("1.2.840.10008.5.1.4.1.1.7", RAMP[0]))
     with pytest.warns(UserWarning, match="no size of pixels: 1 mm") as caught:
-        np.testing.assert_array_equal(load_image(path).affine, np.diag([-1.0, -1.0, 1.0, 1.0]))
+        assert_array_equal(load_image(path).affine, np.diag([-1.0, -1.0, 1.0, 1.0]))
     assert any("no position" in str(each.message) for each in caught)
     saved(tmp_path / "b.dcm", file_of("1.2.840.10008.5.1.4.1.1.7", RAMP[1]))
     assert_refused(tmp_path, r"DICOM file a\.dcm does not state where it lies")
@@ -459,9 +458,7 @@ def test_bits_beyond_those_stored_are_ignored(tmp_path):
     """Signed numbers of 12 bits, below others' bits."""
     data = one_slice((np.array([[-5, 7, -2048]]) & 0xFFF) | 0x5000, ORIGIN, SliceThickness=3)
     data.BitsStored, data.HighBit = 12, 11
-    np.testing.assert_array_equal(
-        load_image(saved(tmp_path / "a.dcm", data)).data[:, 0, 0], [-5, 7, -2048]
-    )
+    assert_array_equal(load_image(saved(tmp_path / "a.dcm", data)).data[:, 0, 0], [-5, 7, -2048])
 
 
 def test_values_in_the_upper_bits(tmp_path):
@@ -472,7 +469,7 @@ def test_values_in_the_upper_bits(tmp_path):
         UserWarning, match="HighBit is 15: the lowest 4 bits of its values are left out"
     ):
         image = load_image(saved(tmp_path / "a.dcm", data))
-    np.testing.assert_array_equal(image.data[:, 0, 0], [-5, 7, -2048])
+    assert_array_equal(image.data[:, 0, 0], [-5, 7, -2048])
     data.HighBit = 9
     assert_refused(
         saved(tmp_path / "a.dcm", data), "BitsStored 12 and HighBit 9, which contradict each other"
@@ -511,9 +508,7 @@ def test_more_voxels_than_the_header_declares(tmp_path):
     data = one_slice(RAMP[0], ORIGIN, SliceThickness=3)
     data.PixelData = RAMP.tobytes()
     with pytest.warns(UserWarning, match="more bytes of voxels than its header declares"):
-        np.testing.assert_array_equal(
-            load_image(saved(tmp_path / "a.dcm", data)).data[:, :, 0], RAMP[0].T
-        )
+        assert_array_equal(load_image(saved(tmp_path / "a.dcm", data)).data[:, :, 0], RAMP[0].T)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -652,10 +647,10 @@ def test_public_segmentations(data_dir, hd, name, counts, slices):
     image = load_image(path)
     there = hd.seg.segread(path).get_volume(combine_segments=False, allow_missing_positions=True)
     assert image.shape[2] == there.spatial_shape[0] == slices
-    np.testing.assert_array_equal(np.bincount(image.data.astype(int).ravel())[1:], counts)
+    assert_array_equal(np.bincount(image.data.astype(int).ravel())[1:], counts)
     is_in = there.array.any(axis=-1)
     world = there.map_indices_to_reference(np.argwhere(is_in)).mean(axis=0) * [-1, -1, 1]
-    np.testing.assert_allclose(
+    assert_allclose(
         image.to_world(np.argwhere(image.data > 0)).mean(axis=0), world, rtol=0, atol=1e-4
     )
 
@@ -731,9 +726,7 @@ def test_names_and_colours_of_segments(tmp_path, hd):
     for source in (path, tmp_path):
         table = load_label_table(source)
         assert table.names == {1: "liver", 2: "tumour 2", 3: "tumour 3"}
-        np.testing.assert_allclose(
-            list(table.colours.values()), np.array(COLOURS) / 255, rtol=0, atol=0.004
-        )
+        assert_allclose(list(table.colours.values()), np.array(COLOURS) / 255, rtol=0, atol=0.004)
     with pytest.raises(InputError, match="expected names of segments in this file, found none"):
         load_label_table(saved(tmp_path / "b.dcm", enhanced(RAMP, places())))
 
@@ -768,7 +761,7 @@ def test_mesh_of_a_scan_and_its_segmentation(tmp_path, hd, capsys):
     expected = np.count_nonzero(voxels[..., 0]) * BETWEEN_COLUMNS * BETWEEN_ROWS * STEP
     assert volume[is_in].sum() == pytest.approx(expected, rel=0.03)
     at = np.average(points[is_in].mean(axis=1), axis=0, weights=volume[is_in])
-    np.testing.assert_allclose(at, centre * [-1, -1, 1], rtol=0, atol=0.2)
+    assert_allclose(at, centre * [-1, -1, 1], rtol=0, atol=0.2)
     data.FrameOfReferenceUID = "1.2.99"
     other = saved(tmp_path / "other.dcm", data)
     words = ["-o", tmp_path / "b.vtu", "--nodes", 50, "--iterations", 0]

@@ -7,6 +7,7 @@ from pathlib import Path
 import nibabel
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from tetopt.errors import InputError
 from tetopt.image import Image
@@ -41,9 +42,9 @@ def test_round_trip(tmp_path, affine, dtype, suffix):
     save_image(tmp_path / f"a{suffix}", image)
     back = load_image(tmp_path / f"a{suffix}")
     assert back.data.dtype == dtype
-    np.testing.assert_array_equal(back.data, image.data)
+    assert_array_equal(back.data, image.data)
     # NIfTI's sform is float32.
-    np.testing.assert_array_equal(back.affine, affine.astype(np.float32).astype(np.float64))
+    assert_array_equal(back.affine, affine.astype(np.float32).astype(np.float64))
     assert [p.name for p in tmp_path.iterdir()] == [f"a{suffix}"]
 
 
@@ -51,7 +52,7 @@ def test_a_plane_lies_at_z_0(tmp_path):
     save_image(tmp_path / "a.nii", Image(values((5, 7), np.float32), SHEARED))
     file = nibabel.load(tmp_path / "a.nii")
     assert file.shape == (5, 7)
-    np.testing.assert_allclose(
+    assert_allclose(
         file.affine @ [2.0, 3.0, 0.0, 1.0], [*(SHEARED @ [2.0, 3.0, 1.0])[:2], 0.0, 1.0]
     )
 
@@ -85,5 +86,5 @@ def test_an_axis_too_long_for_nifti_1_goes_into_nifti_2(tmp_path):
     save_image(tmp_path / "a.nii.gz", image)
     assert isinstance(nibabel.load(tmp_path / "a.nii.gz"), nibabel.Nifti2Image)
     back = load_image(tmp_path / "a.nii.gz")
-    np.testing.assert_array_equal(back.data, image.data)
-    np.testing.assert_array_equal(back.affine, image.affine)
+    assert_array_equal(back.data, image.data)
+    assert_array_equal(back.affine, image.affine)

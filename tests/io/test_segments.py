@@ -4,6 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 import tetopt
 from tetopt.errors import InputError
@@ -55,8 +56,8 @@ def test_layers_that_share_values(tmp_path):
     image, said = read(path)
     expected = LAYERS[0].copy()
     expected[LAYERS[1] == 1] = 3
-    np.testing.assert_array_equal(image.data, expected)
-    np.testing.assert_array_equal(
+    assert_array_equal(image.data, expected)
+    assert_array_equal(
         image.affine, np.array([[-1, 0, 0, -5], [0, -2, 0, -6], [0, 0, 3, 7], [0, 0, 0, 1.0]])
     )
     assert said == [
@@ -72,7 +73,7 @@ def test_values_of_the_file_are_kept(tmp_path):
     layer[layer == 2] = 77
     path = seg_nrrd(tmp_path, layer, [("liver", 1, 0), ("bone", 77, 0)])
     image, said = read(path)
-    np.testing.assert_array_equal(image.data, layer[0])
+    assert_array_equal(image.data, layer[0])
     assert (said, load_label_table(path).names) == ([], {1: "liver", 77: "bone"})
     layers = LAYERS * np.array([1, 9], np.uint8)[:, None, None, None]
     image, said = read(
@@ -149,7 +150,7 @@ def test_real_overlapping_segments(data_dir):
     raw = sitk.GetArrayFromImage(
         sitk.ReadImage(str(data_dir / "SegmentationOverlapping.seg.nrrd"))
     ).T
-    np.testing.assert_array_equal(image.data, np.where(raw[1] == 1, 8, raw[0]))
+    assert_array_equal(image.data, np.where(raw[1] == 1, 8, raw[0]))
     assert 'segment "overlapping sphere" covers 491 of the 8487 voxels of "ribs", 118' in said[1]
     assert (
         load_label_table(data_dir / "SegmentationOverlapping.seg.nrrd").names[8]

@@ -4,6 +4,7 @@ import numpy as np
 import PIL.Image
 import pytest
 from commands import assert_refused as assert_command_refused
+from numpy.testing import assert_allclose, assert_array_equal
 
 from tetopt.errors import InputError
 from tetopt.io.images import load_image
@@ -56,8 +57,8 @@ def test_calibrated_stack(tmp_path, name):
     options, steps = CALIBRATED[name]
     path = stack(tmp_path, **options)
     image = load_image(path)
-    np.testing.assert_array_equal(image.data, VOXELS.T)
-    np.testing.assert_allclose(image.affine, np.diag([-steps[0], -steps[1], steps[2], 1.0]))
+    assert_array_equal(image.data, VOXELS.T)
+    assert_allclose(image.affine, np.diag([-steps[0], -steps[1], steps[2], 1.0]))
     assert load_image(path, spacing_mm=steps).shape == (7, 5, 10)
     with pytest.raises(InputError, match=r"but `spacing_mm` is 0\.1 x 0\.1 x 0\.1"):
         load_image(path, spacing_mm=0.1)
@@ -116,8 +117,8 @@ def test_folder_of_slices(tmp_path, suffix):
     """In the order of their numbers, 8, 9, 10, 11."""
     path = folder_of(tmp_path, range(8, 12), suffix)
     image = load_image(path, spacing_mm=0.02)
-    np.testing.assert_array_equal(image.data, (VOXELS[[8, 9, 0, 1]] % 256).T)
-    np.testing.assert_allclose(image.affine, np.diag([-0.02, -0.02, 0.02, 1.0]))
+    assert_array_equal(image.data, (VOXELS[[8, 9, 0, 1]] % 256).T)
+    assert_allclose(image.affine, np.diag([-0.02, -0.02, 0.02, 1.0]))
     with pytest.raises(InputError, match="this folder of 4 slices states no voxel size"):
         load_image(path)
     (path / f"scan_v2_10{suffix}").unlink()
@@ -151,8 +152,8 @@ def test_stack_and_folder_of_the_same_slices_agree(tmp_path, kind, options):
         options.get("extratags", [[0] * 4])[0][3], voxels
     )
     for image in images:
-        np.testing.assert_array_equal(image.data, right.T)
-    np.testing.assert_array_equal(*(image.affine for image in images))
+        assert_array_equal(image.data, right.T)
+    assert_array_equal(*(image.affine for image in images))
 
 
 def test_order_of_ome_and_its_full_level(tmp_path):
@@ -169,11 +170,11 @@ def test_order_of_ome_and_its_full_level(tmp_path):
             writer.write(
                 plane, description=words if k == 0 else None, contiguous=False, metadata=None
             )
-    np.testing.assert_array_equal(load_image(tmp_path / "a.ome.tif").data, VOXELS[::-1].T)
+    assert_array_equal(load_image(tmp_path / "a.ome.tif").data, VOXELS[::-1].T)
     with tifffile.TiffWriter(tmp_path / "b.ome.tif", ome=True) as writer:
         writer.write(VOXELS, subifds=1, metadata={"axes": "ZYX"})
         writer.write(VOXELS[:, ::2, ::2], subfiletype=1)
-    np.testing.assert_array_equal(load_image(tmp_path / "b.ome.tif", spacing_mm=1).data, VOXELS.T)
+    assert_array_equal(load_image(tmp_path / "b.ome.tif", spacing_mm=1).data, VOXELS.T)
 
 
 def test_calibrated_values_of_imagej(tmp_path):
@@ -187,15 +188,15 @@ def test_calibrated_values_of_imagej(tmp_path):
         "metadata": IMAGEJ | line | {"unit": "mm", "spacing": 0.5},
     }
     path = stack(tmp_path, **options)
-    np.testing.assert_array_equal(load_image(path).data, 2.0 * VOXELS.T - 32768)
+    assert_array_equal(load_image(path).data, 2.0 * VOXELS.T - 32768)
     page = load_image(path, volume=3)
-    np.testing.assert_array_equal(page.data, 2.0 * VOXELS[3] - 32768)
+    assert_array_equal(page.data, 2.0 * VOXELS[3] - 32768)
     assert page.spacing.tolist() == pytest.approx([0.1, 0.05])
     with pytest.raises(InputError, match=r"voxels of 0\.05 x 0\.1 mm, but `spacing_mm` is 1 x 1"):
         load_image(path, volume=3, spacing_mm=1)
     options["metadata"].pop("axes")
     folder = load_image(sliced(tmp_path / "d", **options))
-    np.testing.assert_array_equal(folder.data, 2.0 * VOXELS.T - 32768)
+    assert_array_equal(folder.data, 2.0 * VOXELS.T - 32768)
     assert folder.spacing.tolist() == pytest.approx([0.05, 0.1, 0.5])
     with pytest.raises(InputError, match=r"0\.05 x 0\.1 x 0\.5 mm, but `spacing_mm` is 1 x 1 x 1"):
         load_image(tmp_path / "d", spacing_mm=1)
@@ -208,14 +209,14 @@ def test_calibrated_values_of_imagej(tmp_path):
     with pytest.warns(
         UserWarning, match="calibration of them is no straight line and is not applied"
     ):
-        np.testing.assert_array_equal(load_image(stack(tmp_path, **options)).data, VOXELS.T)
+        assert_array_equal(load_image(stack(tmp_path, **options)).data, VOXELS.T)
 
 
 def test_slices_written_one_by_one(tmp_path):
     with tifffile.TiffWriter(tmp_path / "a.tif") as writer:
         for plane in VOXELS:
             writer.write(plane)
-    np.testing.assert_array_equal(load_image(tmp_path / "a.tif", spacing_mm=1).data, VOXELS.T)
+    assert_array_equal(load_image(tmp_path / "a.tif", spacing_mm=1).data, VOXELS.T)
     with tifffile.TiffWriter(tmp_path / "b.tif") as writer:
         for plane in VOXELS[0], VOXELS[1, :3]:
             writer.write(plane)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import pyvista
 from meshes import random_affine, random_rotation
+from numpy.testing import assert_allclose, assert_array_equal
 
 import tetopt
 from tetopt.geometry.simplex import centroids, oriented, volumes
@@ -126,17 +127,17 @@ def test_half_level_of_a_plane(n):
     ):
         points, facets = half_level_surface(level, flat)
         assert facets.shape[1] == n
-        np.testing.assert_allclose(points[:, 0], place, atol=1e-5)
-        np.testing.assert_array_equal(points[:, 1:].min(axis=0), -0.5)
-        np.testing.assert_array_equal(points[:, 1:].max(axis=0), 7.5)
+        assert_allclose(points[:, 0], place, atol=1e-5)
+        assert_array_equal(points[:, 1:].min(axis=0), -0.5)
+        assert_array_equal(points[:, 1:].max(axis=0), 7.5)
         edges = points[facets[:, 1:]] - points[facets[:, :1]]
         area = np.linalg.norm(
             edges[:, 0] if n == 2 else np.cross(edges[:, 0], edges[:, 1]) / 2, axis=-1
         ).sum()
         assert area == pytest.approx(8.0 ** (n - 1), rel=1e-6)
         in_world = half_level_surface(level, image.affine)
-        np.testing.assert_allclose(image.to_index(in_world.points), points, atol=1e-9)
-        np.testing.assert_array_equal(in_world.facets, facets)
+        assert_allclose(image.to_index(in_world.points), points, atol=1e-9)
+        assert_array_equal(in_world.facets, facets)
 
 
 @pytest.mark.parametrize("n", [2, 3])
@@ -172,7 +173,7 @@ def test_distances_against_twin(n):
     )
     distances = surface_distances(points, FacetSurface(corners.reshape(-1, n), facets))
     expected = [min(naive.facet_distance(p, c) for c in corners) for p in points]
-    np.testing.assert_allclose(distances, expected, rtol=1e-9, atol=1e-9)
+    assert_allclose(distances, expected, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("n", [2, 3])
@@ -196,12 +197,12 @@ def test_points_are_spread_evenly(n):
     assert np.abs(counts - 3000 * areas / areas.sum()).max() < 2.0
     for k in range(3):
         inside = points[apart.argmin(axis=0) == k]
-        np.testing.assert_allclose(inside.mean(axis=0), corners[k].mean(axis=0), atol=0.02)
+        assert_allclose(inside.mean(axis=0), corners[k].mean(axis=0), atol=0.02)
         # of a uniform density on a simplex
         spread = np.cov((inside - inside.mean(axis=0)).T, bias=True)
         offset = corners[k] - corners[k].mean(axis=0)
-        np.testing.assert_allclose(spread, offset.T @ offset / (n * (n + 1)), atol=0.03)
-    np.testing.assert_array_equal(points, evenly_spread(surface, 3000))
+        assert_allclose(spread, offset.T @ offset / (n * (n + 1)), atol=0.03)
+    assert_array_equal(points, evenly_spread(surface, 3000))
 
 
 def test_no_side_of_a_plate_is_left_out():
@@ -372,8 +373,8 @@ def test_mask_of_a_shifted_plane(n):
     assert fidelity.volume == pytest.approx(4 * layer * image.voxel_volume)
     assert fidelity.mesh_volume == pytest.approx(6 * layer * image.voxel_volume)
     assert fidelity.dice == pytest.approx(2 * 4 / (4 + 6))
-    np.testing.assert_allclose(fidelity[4:8], 2.0, atol=1e-9)
-    np.testing.assert_allclose(fidelity[8:12], 3.0, atol=1e-9)
+    assert_allclose(fidelity[4:8], 2.0, atol=1e-9)
+    assert_allclose(fidelity[8:12], 3.0, atol=1e-9)
     assert fidelity[12:] == (1, 1, 1, 1, ())
 
 
@@ -389,7 +390,7 @@ def test_mask_of_a_ball(n):
     mesh = tetopt.Mesh(points, oriented(points, cells))
     fidelity = mask_fidelity(image, mesh)
     assert fidelity.mesh_volume == pytest.approx(volumes(points, mesh.cells).sum())
-    np.testing.assert_allclose(fidelity[4:8], 1.5, atol=0.03)
+    assert_allclose(fidelity[4:8], 1.5, atol=0.03)
     factors = np.linalg.svd(image.affine[:n, :n])[1]
     assert factors[-1] * 1.5 < fidelity.distance_mean_mm < factors[0] * 1.5
     assert factors[-1] * 1.5 < fidelity.reverse_p95_mm < factors[0] * 1.55
@@ -455,7 +456,7 @@ def test_volume_dice_does_not_depend_on_the_unit():
                 for row in label_fidelity(image, tetopt.lattice_mesh(image, blocks=(6, 6, 6)))
             ]
         )
-    np.testing.assert_allclose(dice[0], dice[1], rtol=1e-6)
+    assert_allclose(dice[0], dice[1], rtol=1e-6)
     assert 0.5 < dice[0][1] < 1.0
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import skfem
 from models import LOAD_CASES, cell_energies, loaded_model, sample_model, young_of
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.sparse.linalg import spsolve
 from skfem.helpers import ddot, sym_grad, trace
 
@@ -132,7 +133,7 @@ def energy(printed):
 
 def assert_printed(values, expected, digits=PRINTED):
     """Equal as far as printed: relative to the largest."""
-    np.testing.assert_allclose(values, expected, rtol=0.0, atol=digits * np.abs(expected).max())
+    assert_allclose(values, expected, rtol=0.0, atol=digits * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("loading", LOADS)
@@ -140,14 +141,14 @@ def test_energy_displacement_and_reactions_are_our_own(loading, tmp_path):
     model = pressed_model(loading)
     printed = answer(abaqus(model), tmp_path)
     u, total, force = ours(model)
-    np.testing.assert_allclose(energy(printed), total, rtol=PRINTED)
+    assert_allclose(energy(printed), total, rtol=PRINTED)
     assert_printed(printed.u, u, 6e-6)  # .frd has a digit less
     by_cell = printed.tables["internal energy", "all_cells"]
-    np.testing.assert_array_equal(by_cell[:, 0], np.arange(1, len(model.mesh.cells) + 1))
+    assert_array_equal(by_cell[:, 0], np.arange(1, len(model.mesh.cells) + 1))
     assert_printed(by_cell[:, 1], cell_energies(model.mesh, young_of(model), NU, u))
     for name in ("superior", "inferior"):
         nodes = nodes_of(model.mesh, model.sets.facets[name])
-        np.testing.assert_array_equal(printed.tables["forces", name][:, 0], nodes + 1)
+        assert_array_equal(printed.tables["forces", name][:, 0], nodes + 1)
         assert_printed(printed.tables["forces", name][:, 1:], force[nodes])
         assert_printed(printed.tables["total force", name].ravel(), force[nodes].sum(axis=0))
 
@@ -169,7 +170,7 @@ def test_a_ratio_and_a_material_for_each_cell(tmp_path):
     is_given, values = prescribed(model, len(mesh.points), lambda rows: nodes_of(mesh, rows))
     free, u = np.flatnonzero(~is_given), values.ravel()
     u[free] = spsolve(K[free][:, free], -(K @ u)[free])
-    np.testing.assert_allclose(energy(printed), 0.5 * u @ (K @ u), rtol=PRINTED)
+    assert_allclose(energy(printed), 0.5 * u @ (K @ u), rtol=PRINTED)
     for is_in, nu in parts:
         cells = Mesh(mesh.points, mesh.cells[is_in])
         expected = cell_energies(cells, young[is_in], nu, u.reshape(-1, 3))
@@ -180,14 +181,14 @@ def test_megapascals_give_millijoules_and_lps_turns_the_displacement(tmp_path):
     model = pressed_model("shear")
     printed = answer(abaqus(model), tmp_path)
     in_mpa = answer(abaqus(in_units(model, "MPa")), tmp_path)
-    np.testing.assert_allclose(1e3 * energy(in_mpa), energy(printed), rtol=2.0 * PRINTED)
+    assert_allclose(1e3 * energy(in_mpa), energy(printed), rtol=2.0 * PRINTED)
     assert_printed(in_mpa.u, printed.u, 1e-5)
     in_metres = answer(abaqus(in_units(model, "Pa")), tmp_path)
     # uJ in a J
-    np.testing.assert_allclose(1e6 * energy(in_metres), energy(printed), rtol=2.0 * PRINTED)
+    assert_allclose(1e6 * energy(in_metres), energy(printed), rtol=2.0 * PRINTED)
     assert_printed(1e3 * in_metres.u, printed.u, 1e-5)
     turned = answer(abaqus(in_space(model, "lps")), tmp_path)
-    np.testing.assert_allclose(energy(turned), energy(printed), rtol=2.0 * PRINTED)
+    assert_allclose(energy(turned), energy(printed), rtol=2.0 * PRINTED)
     assert_printed(turned.u * [-1.0, -1.0, 1.0], printed.u, 1e-5)
 
 
@@ -223,7 +224,7 @@ def test_quadratic_cells_are_scikit_fem_s(tmp_path):
     model = pressed_model("shear")
     printed = answer(abaqus(model._replace(order=2)), tmp_path)
     u, total = second_order(model)
-    np.testing.assert_allclose(energy(printed), total, rtol=PRINTED)
+    assert_allclose(energy(printed), total, rtol=PRINTED)
     assert_printed(printed.u[: len(u)], u, 6e-6)
     linear = ours(model)[1]
     assert 0.8 * linear < energy(printed) < 0.99 * linear  # less stiff
@@ -242,9 +243,9 @@ def test_every_set_arrives(order, tmp_path):
     printed = answer(raw, tmp_path).tables
     for name, rows in model.sets.facets.items():
         nodes = np.unique((quadratic_facet_nodes if order == 2 else facet_triples)(cells, rows))
-        np.testing.assert_array_equal(printed["displacements", name.lower()][:, 0], nodes + 1)
+        assert_array_equal(printed["displacements", name.lower()][:, 0], nodes + 1)
     for name, members in model.sets.cells.items():
-        np.testing.assert_array_equal(printed["internal energy", name.lower()][:, 0], members + 1)
+        assert_array_equal(printed["internal energy", name.lower()][:, 0], members + 1)
 
 
 def test_pressure_on_each_surface_pushes_its_facets_inwards(tmp_path):
@@ -277,9 +278,7 @@ def test_numbers_of_full_length_arrive(tmp_path):
     assert max(len(repr(x)) for x in shrunk.points.ravel().tolist()) > 20
     loads = tuple(load._replace(numbers=load.numbers * (np.pi * 1e-6)) for load in model.loads)
     small = model._replace(mesh=shrunk, loads=loads)
-    np.testing.assert_allclose(
-        energy(answer(abaqus(small), tmp_path)), ours(small)[1], rtol=PRINTED
-    )
+    assert_allclose(energy(answer(abaqus(small), tmp_path)), ours(small)[1], rtol=PRINTED)
 
 
 # Every kind of load, both orders, moduli of cells and moduli that vary within them
@@ -291,7 +290,7 @@ def test_numbers_of_full_length_arrive(tmp_path):
 def test_each_load_is_what_fem_makes_of_it(case, order, moduli, tmp_path):
     model = loaded_model(case, order=order, moduli=moduli)
     printed, own = answer(abaqus(model), tmp_path), solve(model)
-    np.testing.assert_allclose(energy(printed), own.strain_energy, rtol=PRINTED)
+    assert_allclose(energy(printed), own.strain_energy, rtol=PRINTED)
     assert own.strain_energy > 1.0
     assert_printed(printed.u, own.u, 6e-6)
     # what CalculiX prints leaves out what acts on the held nodes themselves
@@ -299,7 +298,7 @@ def test_each_load_is_what_fem_makes_of_it(case, order, moduli, tmp_path):
         return
     for name in {load.set_name for load in model.loads if load.kind == "displacement"}:
         total = printed.tables["total force", name].ravel()
-        np.testing.assert_allclose(
+        assert_allclose(
             total, own.reactions[name], rtol=0.0, atol=1e-5 * np.abs(own.reactions[name]).max()
         )
 
@@ -325,7 +324,7 @@ def test_each_step_is_a_case_of_its_own(order, tmp_path):
     assert len(totals) == len(blocks) == 5
     for step, (total, block) in enumerate(zip(totals, blocks, strict=True), 1):
         own = solve(model, step)
-        np.testing.assert_allclose(float(total), own.strain_energy, rtol=PRINTED)
+        assert_allclose(float(total), own.strain_energy, rtol=PRINTED)
         assert_printed(displacements(f" DISP {block}"), own.u, 6e-6)
 
 
@@ -341,7 +340,7 @@ def test_lps_and_megapascals_are_the_same_loads(tmp_path):
     model = loaded_model("all", order=2, moduli="nodes")
     printed = answer(abaqus(in_units(in_space(model, "lps"), "MPa")), tmp_path)
     own = solve(model)
-    np.testing.assert_allclose(1e3 * energy(printed), own.strain_energy, rtol=PRINTED)
+    assert_allclose(1e3 * energy(printed), own.strain_energy, rtol=PRINTED)
     assert_printed(printed.u * [-1.0, -1.0, 1.0], own.u, 6e-6)
 
 

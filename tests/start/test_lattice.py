@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from meshes import random_affine
+from numpy.testing import assert_allclose, assert_array_equal
 
 from tetopt import Image, InputError, lattice_mesh
 from tetopt.geometry.simplex import dihedral_angles, rho, volumes
@@ -66,7 +67,7 @@ def test_one_cube_of_bcc_is_twelve_congruent_cells():
     assert (len(mesh.points), len(mesh.cells)) == (9, 12)
     assert volumes(mesh.points, mesh.cells) == pytest.approx([8 / 12] * 12)
     angles = np.sort(dihedral_angles(mesh.points, mesh.cells), axis=1)
-    np.testing.assert_allclose(angles, np.broadcast_to(angles[0], angles.shape))
+    assert_allclose(angles, np.broadcast_to(angles[0], angles.shape))
 
 
 # For every box
@@ -115,10 +116,10 @@ def test_shapes_of_bcc_on_cubes():
     assert is_inside.sum() == 4 * (5 * 4 * 5 + 6 * 3 * 5 + 6 * 4 * 4)
     assert len(mesh.cells) - is_inside.sum() == 2 * 2 * (6 * 4 + 4 * 5 + 5 * 6)
     angles = np.sort(dihedral_angles(mesh.points, mesh.cells), axis=1)
-    np.testing.assert_allclose(
+    assert_allclose(
         angles[is_inside], np.tile([60.0] * 4 + [90.0] * 2, (is_inside.sum(), 1)), rtol=1e-13
     )
-    np.testing.assert_allclose(rho(mesh.points, mesh.cells)[is_inside], sqrt(10) / 10, rtol=1e-13)
+    assert_allclose(rho(mesh.points, mesh.cells)[is_inside], sqrt(10) / 10, rtol=1e-13)
     assert round(sqrt(10) / 10, 4) == 0.3162
     assert angles.min() == pytest.approx(45, rel=1e-13)
     assert angles.max() == pytest.approx(120, rel=1e-13)
@@ -163,7 +164,7 @@ def test_the_count_asked_for_is_found_where_cubes_have_it(seed, dimension_and_ki
     exact = lattice_mesh(image, kind, blocks=blocks)
     mesh = lattice_mesh(image, kind, nodes=len(exact.points))
     assert abs(len(mesh.points) - len(exact.points)) <= 0.03 * len(exact.points)
-    np.testing.assert_array_equal(mesh.points, exact.points)
+    assert_array_equal(mesh.points, exact.points)
 
 
 @pytest.mark.parametrize(("n", "kind"), KINDS)
@@ -185,16 +186,14 @@ def test_spacing_is_in_mm_and_the_nearest_that_divides_the_box():
         (9.9, (2, 1, 3)),
     ]:
         mesh = lattice_mesh(image, "five-tet", spacing=spacing)
-        np.testing.assert_array_equal(
-            mesh.points, lattice_mesh(image, "five-tet", blocks=blocks).points
-        )
+        assert_array_equal(mesh.points, lattice_mesh(image, "five-tet", blocks=blocks).points)
 
 
 def test_default_kinds():
     cube, square = Image(np.zeros((4, 4, 4))), Image(np.zeros((4, 4)))
     for image, kind in ((cube, "bcc"), (square, "criss-cross")):
         blocks = (2,) * image.ndim
-        np.testing.assert_array_equal(
+        assert_array_equal(
             lattice_mesh(image, blocks=blocks).cells, lattice_mesh(image, kind, blocks=blocks).cells
         )
 

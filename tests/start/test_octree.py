@@ -7,6 +7,7 @@ import sys
 import numba
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from scipy import ndimage
 
 import tetopt
@@ -74,8 +75,8 @@ def test_octree_is_a_good_mesh_of_the_box(name):
     if image.ndim == 3:
         assert shape.min_dihedral > 10.0
     again = octree_mesh(image, nodes)
-    np.testing.assert_array_equal(again.points, mesh.points)
-    np.testing.assert_array_equal(again.cells, mesh.cells)
+    assert_array_equal(again.points, mesh.points)
+    assert_array_equal(again.cells, mesh.cells)
 
 
 @pytest.mark.full
@@ -192,9 +193,7 @@ def test_every_number_of_nodes(kind, nodes):
 def test_scale_of_intensities(scale):
     image = ball(30, 30, 30, noise=3.0)
     expected = octree_mesh(image, 800).points
-    np.testing.assert_array_equal(
-        octree_mesh(tetopt.Image(image.data * scale), 800).points, expected
-    )
+    assert_array_equal(octree_mesh(tetopt.Image(image.data * scale), 800).points, expected)
 
 
 def test_intensities_that_overflow():
@@ -214,8 +213,8 @@ def test_same_bits_for_any_number_of_threads():
     finally:
         numba.set_num_threads(threads)
     for other in results[1:]:
-        np.testing.assert_array_equal(other.points, results[0].points)
-        np.testing.assert_array_equal(other.cells, results[0].cells)
+        assert_array_equal(other.points, results[0].points)
+        assert_array_equal(other.cells, results[0].cells)
 
 
 def test_a_bound_beyond_all_boxes_bounds_nothing():
@@ -227,7 +226,7 @@ def test_a_bound_beyond_all_boxes_bounds_nothing():
         tetopt.mesh_image(image, 50, iterations=0, sizes=tetopt.Sizes(longest=mm)).mesh
         for mm in (1e3, 1e300)
     ]
-    np.testing.assert_array_equal(meshes[0].points, meshes[1].points)
+    assert_array_equal(meshes[0].points, meshes[1].points)
 
 
 def shell(size, radius):
@@ -305,7 +304,7 @@ def test_a_mask_that_finer_octrees_hardly_keep_better_has_the_nearest_number_of_
     monkeypatch.setattr(octree, "FINER_STEPS", 2)
     mesh = octree_mesh(content, 300)
     monkeypatch.setattr(octree, "FINER_STEPS", 0)
-    np.testing.assert_array_equal(mesh.points, octree_mesh(content, 300).points)
+    assert_array_equal(mesh.points, octree_mesh(content, 300).points)
 
 
 def test_the_same_mesh_at_half_of_the_free_memory_or_a_refusal(monkeypatch):

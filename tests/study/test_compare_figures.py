@@ -4,6 +4,7 @@ import numpy as np
 import PIL.Image
 import pytest
 from matplotlib.collections import PolyCollection
+from numpy.testing import assert_array_equal
 from test_compare_page import fake_report, finished, meshes_of, with_runs
 
 import tetopt
@@ -37,14 +38,14 @@ def test_slices_hold_means_and_losses(small, n_meshes):
     figure = slices_figure(image, meshes, means)
     grid = np.array(figure.axes[: 3 * (n_meshes + 1)]).reshape(3, n_meshes + 1)
     view = SliceView(image, None, None)
-    np.testing.assert_array_equal(grid[0, 0].images[0].get_array(), view.pixels.T)
+    assert_array_equal(grid[0, 0].images[0].get_array(), view.pixels.T)
     for column, ((title, mesh), mean) in enumerate(zip(meshes, means, strict=True), 1):
         polygons, cells = view.section(mesh)
         assert grid[0, column].get_title() == title
         assert len(painted(grid[0, column]).get_paths()) == len(polygons)
-        np.testing.assert_array_equal(painted(grid[1, column]).get_array(), mean[cells])
+        assert_array_equal(painted(grid[1, column]).get_array(), mean[cells])
         density = cell_E_D(image, mesh) / volumes(mesh.points, mesh.cells)
-        np.testing.assert_array_equal(painted(grid[2, column]).get_array(), density[cells])
+        assert_array_equal(painted(grid[2, column]).get_array(), density[cells])
     # one scale for all
     assert len({painted(grid[2, column]).get_clim() for column in range(1, n_meshes + 1)}) == 1
     assert {painted(grid[1, c]).get_clim() for c in range(1, n_meshes + 1)} == {
@@ -74,10 +75,8 @@ def test_label_marks_are_those_of_the_report():
         assert list(marks) == [p.title for p in done]
         for pipeline in done:
             values = {row.label: getattr(row, name) for row in pipeline.median.measurement.labels}
-            np.testing.assert_array_equal(
-                marks[pipeline.title][:n, 1], [values[k] for k in range(n)]
-            )
-            np.testing.assert_array_equal(np.rint(marks[pipeline.title][:n, 0]), np.arange(n))
+            assert_array_equal(marks[pipeline.title][:n, 1], [values[k] for k in range(n)])
+            assert_array_equal(np.rint(marks[pipeline.title][:n, 0]), np.arange(n))
         is_open = [
             line.get_markerfacecolor() == "none" and len(line.get_xdata()) > 0
             for line in axes.lines
@@ -85,7 +84,7 @@ def test_label_marks_are_those_of_the_report():
         own = axes.lines[is_open.index(True)].get_xydata()
         assert sum(is_open) == 1  # of all meshes but the first
         own_rows = {row.label: getattr(row, name) for row in done[0].median.measurement.own_labels}
-        np.testing.assert_array_equal(own[:n, 1], [own_rows[k] for k in range(n)])
+        assert_array_equal(own[:n, 1], [own_rows[k] for k in range(n)])
 
 
 def test_histograms_are_those_of_the_report():
@@ -97,8 +96,8 @@ def test_histograms_are_those_of_the_report():
         assert list(outlines) == [p.title for p in finished(report)]
         for pipeline in finished(report):
             histogram = getattr(pipeline.median.measurement, name)
-            np.testing.assert_array_equal(outlines[pipeline.title].values, histogram.fraction)
-            np.testing.assert_array_equal(outlines[pipeline.title].edges, histogram.edges)
+            assert_array_equal(outlines[pipeline.title].values, histogram.fraction)
+            assert_array_equal(outlines[pipeline.title].edges, histogram.edges)
 
 
 def test_bars_are_the_steps():

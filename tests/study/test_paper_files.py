@@ -8,6 +8,7 @@ import numpy as np
 import PIL.Image
 import pytest
 from browser import browser, copied, document
+from numpy.testing import assert_allclose
 
 import tetopt
 from tetopt.cli import main
@@ -98,7 +99,7 @@ def test_every_other_number_is_on_the_page(run):
     (figure_1,) = [s for title, s in sections.items() if title.startswith("Fig. 1")]
     spread = paper.figure_1_spread(2)
     for row in figure_1["errors"]:
-        np.testing.assert_allclose(
+        assert_allclose(
             [row["p5"], row["p95"]], np.percentile(spread[row["name"]], [5, 95], axis=0)
         )
 
@@ -293,11 +294,9 @@ def test_fem_of_a_crop_and_its_output(tmp_path, capsys):
     assert main(["fem", a, mesh, *box, "--compress", "2", "-o", str(tmp_path / "p.vtu")]) == 0
     grid = meshio.read(tmp_path / "p.vtu")
     u, z = grid.point_data["displacement"], grid.points[:, 2]
-    np.testing.assert_allclose(u[np.isclose(z, z.max())], 0.0, atol=1e-12)
+    assert_allclose(u[np.isclose(z, z.max())], 0.0, atol=1e-12)
     bottom = u[np.isclose(z, z.min())]
-    np.testing.assert_allclose(
-        bottom, np.tile([0.0, 0.0, 0.02 * np.ptp(z)], (len(bottom), 1)), atol=1e-12
-    )
+    assert_allclose(bottom, np.tile([0.0, 0.0, 0.02 * np.ptp(z)], (len(bottom), 1)), atol=1e-12)
     assert (grid.cell_data["young"][0] > 0).all()
     assert grid.cell_data["strain"][0].shape == (len(grid.cells[0].data), 9)
     assert main(["fem", a, mesh, *box, "-o", mesh, "--force"]) == 2
@@ -318,15 +317,15 @@ def test_simulate_is_the_compression_it_says(turn):
     means = [
         image.data[owner == cell].mean() for cell in range(len(mesh.cells)) if (owner == cell).any()
     ]
-    np.testing.assert_allclose(
+    assert_allclose(
         np.sort(simulated.young[np.bincount(owner.ravel(), minlength=len(mesh.cells)) > 0]),
         np.sort(means),
     )
     k = image.to_index(mesh.points)[:, 2]
     normal = affine[:3, 2] / 1.5
-    np.testing.assert_allclose(pressed.u[k > 7.4], 0.0, atol=1e-12)
+    assert_allclose(pressed.u[k > 7.4], 0.0, atol=1e-12)
     low = pressed.u[k < -0.4]
-    np.testing.assert_allclose(low, np.tile(0.01 * 12.0 * normal, (len(low), 1)), atol=1e-12)
+    assert_allclose(low, np.tile(0.01 * 12.0 * normal, (len(low), 1)), atol=1e-12)
 
 
 def test_turning_the_world_changes_nothing():
@@ -340,4 +339,4 @@ def test_turning_the_world_changes_nothing():
         energies.append(
             paper.simulate(image, tetopt.lattice_mesh(image, blocks=(3, 3, 3)))[0].strain_energy
         )
-    np.testing.assert_allclose(energies, energies[0], rtol=1e-9)
+    assert_allclose(energies, energies[0], rtol=1e-9)

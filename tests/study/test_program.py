@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from test_child import is_running, wait_for
 
 import tetopt
@@ -87,7 +88,7 @@ def test_number_of_nodes_is_corrected(tmp_path):
     """
     few, enough = lattice(670), lattice(1000)
     made = by_program(JOB, mesher(tmp_path, few, enough))
-    np.testing.assert_array_equal(made.mesh.points, enough.points)
+    assert_array_equal(made.mesh.points, enough.points)
     assert list(made.seconds) == ["program", "search"]
     assert made.notes == ["2 runs"]
     said = [line.split() for line in (tmp_path / "log").read_text().splitlines()]
@@ -96,7 +97,7 @@ def test_number_of_nodes_is_corrected(tmp_path):
     assert second == pytest.approx(1000 * 1000 / len(few.points), abs=1)
     assert smaller / size == pytest.approx((first / second) ** (1 / 3), rel=1e-5)
     assert {words[4] for words in said} == {"$HOME;"}
-    np.testing.assert_array_equal(
+    assert_array_equal(
         tetopt.load_image(tmp_path / "kept.nii.gz").data, class_labels(IMAGE, 3).data
     )
 
@@ -113,10 +114,10 @@ def test_labels_go_to_the_program_and_come_back(tmp_path):
     labels = np.where(number % 2 == 0, 7 * (number // 2 % 2), 99)
     program = mesher(tmp_path, mesh, mesh, words="{labels} {output}", label=labels)
     made = by_program(JOB._replace(labels=given), program)
-    np.testing.assert_array_equal(tetopt.load_image(tmp_path / "kept.nii.gz").data, given.data)
+    assert_array_equal(tetopt.load_image(tmp_path / "kept.nii.gz").data, given.data)
     n = len(made.mesh.cells)
     assert n < len(mesh.cells)
-    np.testing.assert_array_equal(made.labels, np.where(number % 2 == 0, labels, -1)[:n])
+    assert_array_equal(made.labels, np.where(number % 2 == 0, labels, -1)[:n])
     assert (
         made.notes[-1]
         == f'{(number[:n] % 2 == 0).sum()} of {n} cells use the "label" in their file'
@@ -129,7 +130,7 @@ def test_other_suffixes(tmp_path):
     made = by_program(JOB, mesher(tmp_path, lattice(400), words="{image} {output}.msh"))
     n = len(made.mesh.points)
     assert made.notes == ["1 runs", f"{n} nodes instead of 1000; the runs gave {n}"]
-    np.testing.assert_array_equal(tetopt.load_image(tmp_path / "kept.nii.gz").data, IMAGE.data)
+    assert_array_equal(tetopt.load_image(tmp_path / "kept.nii.gz").data, IMAGE.data)
 
 
 def test_a_count_that_cannot_be_met_is_told(tmp_path):
