@@ -31,6 +31,7 @@ from tetopt.job.advice import required_of
 from tetopt.job.events import note, warning
 from tetopt.job.inputs import (
     Align,
+    Balance,
     Beside,
     Originals,
     balance_of,
@@ -180,26 +181,10 @@ def read_source(
     ):
         image = labels
     contrasts = [image, *(beside(path, resample_contrast) for path in paths[1:])]
-    level = None
-    if options.background is None:
-        mask = mask_for(options, image, beside, loaded)
-    else:
-        is_auto = options.background == "auto"
-        level = (
-            background_level(image) if is_auto else number_of("`background`", options.background)
-        )
-        mask = _foreground(image, level, labels)
+    mask, level = _region(options, image, labels, beside, loaded)
     labels, mask, kept = _chosen(options, labels, mask, table, kept)
     del finest, beside  # the files as read: their memory is needed
-    balance = balance_of(options)
-    if options.weights is None and is_own:
-        whose, used = (
-            ("the label image", "labels")
-            if options.tissues is None
-            else ("one of the tissues", "tissues")
-        )
-        note(f"the image is also {whose}: only the {used} are used")
-        balance = balance._replace(weights=[0.0])
+    balance = _balance(options, is_own)
     combined = content(
         contrasts,
         labels,
@@ -210,29 +195,17 @@ def read_source(
     )
     if max(factors) > 1:
         combined = combined._replace(repeats=factors)
-    of_tissues = [file_and_volume(path)[0] for path in tissue_files(options.tissues)]
-    files = [
-        *paths[1:],
-        *(path for path in (options.mask, options.labels, *of_tissues) if path is not None),
-    ]
-    inputs = {
-        "images": [path.name for path in paths],
-        "weights": balance.weights,
-        "mask": None if options.mask is None else options.mask.name,
-        "background": level,
-        "labels": None if options.labels is None else options.labels.name,
-        "label_weight": options.label_weight,
-        **({} if options.tissues is None else {"tissues": [path.name for path in of_tissues]}),
-        **({} if labels is None else {"smooth_interfaces": balance.smooth_interfaces}),
-        **({"free_volumes": True} if options.free_volumes else {}),
-        **({"merged": {str(old): new for old, new in numbers.items()}} if numbers else {}),
-        **({} if options.mask_label is None else {"mask_label": options.mask_label}),
-        **({"divided": factors} if max(factors) > 1 else {}),
-        **({} if mask is None else {"keep_components": options.keep_components}),
-        **({} if kept is None else {"kept_labels": kept}),
-        **({} if filled is None else {"filled_holes": filled}),
-        "sha256": {path.name: checksum(path) for path in files},
+    found = {
+        "smooth_interfaces": None if labels is None else balance.smooth_interfaces,
+        "free_volumes": options.free_volumes or None,
+        "merged": {str(old): new for old, new in numbers.items()} if numbers else None,
+        "mask_label": options.mask_label,
+        "divided": factors if max(factors) > 1 else None,
+        "keep_components": None if mask is None else options.keep_components,
+        "kept_labels": kept,
+        "filled_holes": filled,
     }
+    inputs = _inputs(options, balance.weights, level, found)
     about = {
         "image": paths[0].name,
         "image_sha256": checksum(paths[0]),
@@ -243,6 +216,52 @@ def read_source(
     return Source(
         paths, balance.weights, combined, contrasts, labels, mask, about, NO_TABLE
     ).with_table(table)
+
+
+def _balance(options: SourceOptions, is_own: bool) -> Balance:
+    """Return the requested balance; an image that is its own labels has no weight by default."""
+    balance = balance_of(options)
+    if options.weights is not None or not is_own:
+        return balance
+    whose, used = "one of the tissues", "tissues"
+    if options.tissues is None:
+        whose, used = "the label image", "labels"
+    note(f"the image is also {whose}: only the {used} are used")
+    return balance._replace(weights=[0.0])
+
+
+def _region(
+    options: SourceOptions,
+    image: Image,
+    labels: Image | None,
+    beside: Beside,
+    loaded: MeshFile | None,
+) -> tuple[Image | None, float | None]:
+    """Return the mask, and the background's level if the options remove one."""
+    if options.background is None:
+        return mask_for(options, image, beside, loaded), None
+    is_auto = options.background == "auto"
+    level = background_level(image) if is_auto else number_of("`background`", options.background)
+    return _foreground(image, level, labels), level
+
+
+def _inputs(
+    options: SourceOptions, weights: list[float], level: float | None, found: dict[str, Any]
+) -> dict[str, Any]:
+    """Return what a mesh's file states of its inputs; of the optional ones, those not None."""
+    tissues = [file_and_volume(path)[0] for path in tissue_files(options.tissues)]
+    others = [path for path in (options.mask, options.labels, *tissues) if path is not None]
+    optional = {"tissues": [path.name for path in tissues] or None, **found}
+    return {
+        "images": [path.name for path in options.images],
+        "weights": weights,
+        "mask": None if options.mask is None else options.mask.name,
+        "background": level,
+        "labels": None if options.labels is None else options.labels.name,
+        "label_weight": options.label_weight,
+        **{name: each for name, each in optional.items() if each is not None},
+        "sha256": {path.name: checksum(path) for path in (*options.images[1:], *others)},
+    }
 
 
 def _without_holes(
