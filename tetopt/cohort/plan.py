@@ -29,7 +29,7 @@ from tetopt.io.formats import BUILT_IN
 from tetopt.job.events import note
 from tetopt.job.inputs import file_and_volume, tissue_files
 from tetopt.job.options import JobOptions, RunOptions, given_options
-from tetopt.job.plan import Plan, changed, check_files, resolved
+from tetopt.job.plan import Plan, changed, resolved
 from tetopt.job.request import requested
 from tetopt.job.texts import option_words, with_options
 from tetopt.model.mappings import FILES_IN_TEXTS
@@ -142,8 +142,7 @@ def _planned(subject: Subject, options: RunOptions, output: Path) -> Plan:
         )
     own = with_options(options, {name.replace("_", "-"): text for name, text in texts.items()})
     job = JobOptions(**vars(own), images=list(subject.images), output=output)
-    check_files(job)
-    return resolved(job)
+    return resolved(job, reads_files=True)
 
 
 def _missing(job: JobOptions) -> Iterator[str]:

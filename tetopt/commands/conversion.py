@@ -25,7 +25,6 @@ from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.events import note, progress, warning, warnings_heard
 from tetopt.job.inputs import listed, read_mesh
 from tetopt.job.model import (
-    check_mapping_files,
     check_solver_options,
     choices_of,
     converted_model,
@@ -118,7 +117,6 @@ def convert_file(
     )
     loaded = _with_straight_edges(loaded) if solver.order == 1 else loaded
     check_solver_options(output, solver, has_materials="young" in loaded.cell_data)
-    check_mapping_files(solver)
     if image is None and solver.average is not None:
         raise InputError(
             f"`average`: {solver.average} averages over voxels and needs an image; pass `image`"

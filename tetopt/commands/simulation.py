@@ -17,7 +17,6 @@ from tetopt.io.images import sha256
 from tetopt.job.events import warning, warnings_heard
 from tetopt.job.inputs import read_mesh
 from tetopt.job.model import (
-    check_mapping_files,
     check_model_options,
     converted_model,
     large_words,
@@ -124,7 +123,6 @@ def _check_options(
     if image is None and model.average is not None:
         raise InputError("`average`: averages over an image's voxels; pass `image`")
     check_model_options(model, has_materials=True)
-    check_mapping_files(model)
 
 
 def _filled(

@@ -72,7 +72,7 @@ class Job(JobOptions):
         """Convert values to the types of their fields, and reject invalid ones."""
         for name in kinds_of(Job):
             object.__setattr__(self, name, _of_field(Job, name, getattr(self, name)))
-        resolved(self)
+        resolved(self, reads_files=False)
 
     def given(self) -> dict[str, Any]:
         """Return options that differ from the default, by name; paths as strings.

@@ -58,8 +58,15 @@ SMALL_FRACTION = 0.1
 SLOW_MATERIALS = 30_000
 
 
-def check_solver_options(output: Path, solver: SolverOptions, has_materials: bool = False) -> None:
-    """Check the options that depend on neither mesh nor file, before the work starts.
+def check_solver_options(
+    output: Path,
+    solver: SolverOptions,
+    has_materials: bool = False,
+    *,
+    reads_files: bool = True,
+) -> None:
+    """Check the options that do not depend on the mesh, before the work starts; files that they
+    name only if `reads_files`.
 
     Raises
     ------
@@ -75,7 +82,7 @@ def check_solver_options(output: Path, solver: SolverOptions, has_materials: boo
             f"{output}: contains only the boundary; leave out `young`, `bins`, `sets`, "
             "`written_sets` and `loads`"
         )
-    check_model_options(solver, has_materials)
+    check_model_options(solver, has_materials, reads_files=reads_files)
     if solver.average is not None and solver.young is None:
         raise InputError("`average`: needs `young`")
     if solver.units not in STRESS_UNITS:
@@ -100,8 +107,10 @@ def check_solver_options(output: Path, solver: SolverOptions, has_materials: boo
         )
 
 
-def check_model_options(options: ModelOptions, has_materials: bool) -> None:
-    """Check the options that depend on neither mesh nor file, which `check_mapping_files` reads;
+def check_model_options(
+    options: ModelOptions, has_materials: bool, *, reads_files: bool = True
+) -> None:
+    """Check the options that do not depend on the mesh; files that they name only if `reads_files`.
     `has_materials` is that of the mesh's file, or an image.
 
     Raises
@@ -109,8 +118,11 @@ def check_model_options(options: ModelOptions, has_materials: bool) -> None:
     InputError
         An invalid mapping, average, number of bins or order; options that need moduli without any.
     """
-    for name, text in mappings_in(options):
-        if named_file(text) is None:
+    texts = ((name, getattr(options, name)) for name in MAPPED_OPTIONS)
+    for name, text in texts:
+        if text is None:
+            continue
+        if reads_files or named_file(text) is None:
             _check_mapping(text, name)
         if options.young is None and not has_materials:
             raise InputError(f"`{name}`: needs `young`")
@@ -119,19 +131,6 @@ def check_model_options(options: ModelOptions, has_materials: bool) -> None:
     parsed_groups(options.written_sets)
     if options.order not in (None, 1, 2):
         raise InputError(f"`order`: expected 1 or 2, got {options.order}")
-
-
-def check_mapping_files(options: ModelOptions) -> None:
-    """Raise InputError for a mapping's file that cannot be read, or is invalid."""
-    for name, text in mappings_in(options):
-        if named_file(text) is not None:
-            _check_mapping(text, name)
-
-
-def mappings_in(options: ModelOptions) -> list[tuple[str, str]]:
-    """Return the options' mappings, by name."""
-    texts = ((name, getattr(options, name)) for name in MAPPED_OPTIONS)
-    return [(name, text) for name, text in texts if text is not None]
 
 
 def _check_mapping(text: str, name: str) -> None:

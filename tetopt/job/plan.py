@@ -27,7 +27,7 @@ from tetopt.io.formats import FORMATS
 from tetopt.io.images import checked_bounds, file_shape, parse_crop, parse_slice, smaller_words
 from tetopt.io.label_tables import NO_TABLE, LabelTable
 from tetopt.job.inputs import balance_of, checked_outputs, label_sizes_of, number_of, read_companion
-from tetopt.job.model import check_mapping_files, check_solver_options
+from tetopt.job.model import check_solver_options
 from tetopt.job.options import JobOptions, Method, stated_part
 from tetopt.model.mappings import named_file
 from tetopt.model.tissues import groups_of
@@ -189,19 +189,12 @@ def plan(job: JobOptions) -> Plan:
     checked_output(job.output, tuple(FORMATS), job.force)
     if job.json_path is not None:
         checked_output(job.json_path, (".json",), job.force)
-    check_files(job)
-    return resolved(job)._replace(pictures=_pictures(job))
+    return resolved(job, reads_files=True)._replace(pictures=_pictures(job))
 
 
-def check_files(job: JobOptions) -> None:
-    """Raise InputError for a file of mappings or of sizes that cannot be read, or is invalid."""
-    check_mapping_files(job)
-    if job.label_size is not None:
-        label_sizes_of(job.label_size)
-
-
-def resolved(job: JobOptions) -> Plan:
-    """Plan a job without accessing any file.
+def resolved(job: JobOptions, *, reads_files: bool) -> Plan:
+    """Plan a job; of all files, those of mappings and sizes alone are read, and only if
+    `reads_files`.
 
     Raises
     ------
@@ -209,8 +202,8 @@ def resolved(job: JobOptions) -> Plan:
         Options contradict each other or are out of range, as far as no file has to be read.
     """
     _check_source(job)
-    _check_numbers(job)
-    check_solver_options(job.output, job)
+    _check_numbers(job, reads_files)
+    check_solver_options(job.output, job, reads_files=reads_files)
     mode = _mode(job)
     for name in (*SIZE_NAMES, "target_error"):
         if mode != "graded" and getattr(job, name) is not None:
@@ -274,7 +267,7 @@ def _check_source(job: JobOptions) -> None:
         groups_of(job.merge)
 
 
-def _check_numbers(job: JobOptions) -> None:
+def _check_numbers(job: JobOptions, reads_files: bool) -> None:
     """Raise InputError for numbers that are invalid for any image."""
     check_weights(len(job.images), *balance_of(job))
     if job.background not in (None, "auto"):
@@ -297,7 +290,7 @@ def _check_numbers(job: JobOptions) -> None:
             "`nodes_max`: needs `target_error`; without it, `nodes` is the number of nodes"
         )
     _limits(changed(job, sizing=None, label_size=None))
-    if job.label_size is not None and named_file(job.label_size) is None:
+    if job.label_size is not None and (reads_files or named_file(job.label_size) is None):
         label_sizes_of(job.label_size)
 
 

@@ -195,7 +195,7 @@ def read_source(
     )
     if max(factors) > 1:
         combined = combined._replace(repeats=factors)
-    found = {
+    extras = {
         "smooth_interfaces": None if labels is None else balance.smooth_interfaces,
         "free_volumes": options.free_volumes or None,
         "merged": {str(old): new for old, new in numbers.items()} if numbers else None,
@@ -205,7 +205,7 @@ def read_source(
         "kept_labels": kept,
         "filled_holes": filled,
     }
-    inputs = _inputs(options, balance.weights, level, found)
+    inputs = _inputs(options, balance.weights, level, extras)
     about = {
         "image": paths[0].name,
         "image_sha256": checksum(paths[0]),
@@ -246,12 +246,12 @@ def _region(
 
 
 def _inputs(
-    options: SourceOptions, weights: list[float], level: float | None, found: dict[str, Any]
+    options: SourceOptions, weights: list[float], level: float | None, extras: dict[str, Any]
 ) -> dict[str, Any]:
     """Return what a mesh's file states of its inputs; of the optional ones, those not None."""
     tissues = [file_and_volume(path)[0] for path in tissue_files(options.tissues)]
     others = [path for path in (options.mask, options.labels, *tissues) if path is not None]
-    optional = {"tissues": [path.name for path in tissues] or None, **found}
+    optional = {"tissues": [path.name for path in tissues] or None, **extras}
     return {
         "images": [path.name for path in options.images],
         "weights": weights,
