@@ -30,11 +30,12 @@ SPACES_OF_NIFTI = {
     5: "template space",
 }
 # Fields of MetaImage that state the same; MetaIO uses the first that is there.
-META_FIELDS = (
-    ("voxel sizes", ("ElementSpacing", "ElementSize")),
-    ("positions", ("Origin", "Offset", "Position")),
-    ("directions", ("TransformMatrix", "Rotation", "Orientation")),
-)
+DIRECTIONS = ("TransformMatrix", "Rotation", "Orientation")
+META_FIELDS = {
+    key: keys
+    for keys in (("ElementSpacing", "ElementSize"), ("Origin", "Offset", "Position"), DIRECTIONS)
+    for key in keys
+}
 SPACES_OF_ITK = (  # of NRRD: ITK turns their coordinates to LPS and takes all others as LPS
     "left-posterior-superior",
     "lps",
@@ -102,24 +103,14 @@ def notes_of_nifti(header: Any, shape: Sequence[int]) -> list[str]:
         )
     elif sform is not None:
         n = min(len(shape), 3)
-        steps, sizes = (
-            np.linalg.norm(sform[:3, :n], axis=0),
-            np.array(header["pixdim"][1 : n + 1], dtype=np.float64),
-        )
-        if (np.abs(sizes - steps) > SAME_SIZE * steps).any():
-            of_each = (
-                f"its sform has voxels of {sizes_words(steps)} mm, its pixdim "
-                f"{sizes_words(sizes)} mm"
+        steps = np.linalg.norm(sform[:3, :n], axis=0)
+        sizes = np.array(header["pixdim"][1 : n + 1], dtype=np.float64)
+        if not _is_alike(steps, sizes):
+            notes.append(
+                _two(f"an sform of {sizes_words(steps)} mm", f"pixdim {sizes_words(sizes)}")
             )
-            notes.append(f"{of_each}; the sform is used, check it")
     elif qform is None and header.get_sform()[:3, :3].any():
         notes.append("its sform has code 0 (unset) and is ignored; give it a code if it is right")
-    n_axes = len(shape)
-    if any(size > 1 for size in header["dim"][n_axes + 1 :]):
-        notes.append(
-            f"its dim lists {header['dim'][1:].tolist()} voxels, but only {n_axes} axes (dim[0]) "
-            "are read"
-        )
     return notes
 
 
@@ -140,40 +131,26 @@ def notes_of_metaimage(stated: Sequence[tuple[str, str]]) -> list[str]:
     """Return warnings of the fields of a MetaImage header, in their order."""
     fields, notes = dict(stated), []
     for key, value in stated:
-        if value.split() != fields[key].split():
-            notes.append(
-                f"states {key} twice, {plain(value)} and {plain(fields[key])}; the last is used, "
-                "check it"
-            )
-    for what, keys in META_FIELDS:
-        used, *others = [key for key in keys if key in fields] or [""]
-        notes += [
-            f"states two {what}, {used} = {plain(fields[used])} and {key} = "
-            f"{plain(fields[key])}; the first is used, "
-            "check it"
-            for key in others
-            if not _is_alike(_numbers(fields[used]), _numbers(fields[key]))
-        ]
+        # A field that is stated twice has the last value.
+        used = next(each for each in (*META_FIELDS.get(key, ()), key) if each in fields)
+        if value.split() != fields[used].split() and not _is_alike(
+            _numbers(fields[used]), _numbers(value)
+        ):
+            notes.append(_two(f"{used} = {plain(fields[used])}", f"{key} = {plain(value)}"))
     if "ElementSpacing" not in fields and "ElementSize" not in fields:
         notes.append("has no voxel size: assuming 1 mm")
-    matrix = next(
-        (_numbers(fields[key]) for key in META_FIELDS[2][1] if key in fields), np.zeros(0)
-    )
+    matrix = next((_numbers(fields[key]) for key in DIRECTIONS if key in fields), np.zeros(0))
     # a row per axis of the voxels
     directions = matrix.reshape(3, 3) if len(matrix) == 9 else np.eye(3)
     lengths = np.linalg.norm(directions, axis=1)
     if not _is_alike(lengths, np.ones(3)):
-        notes.append(
-            f"its directions have lengths {sizes_words(lengths)}, not 1, and scale its voxel "
-            "sizes; check them"
-        )
+        words = f"directions of lengths {sizes_words(lengths)}, which scale its voxel sizes"
+        notes.append(f"states {words}; check them")
     letters = fields.get("AnatomicalOrientation", "").upper()
     if _is_other_orientation(letters, directions):
-        notes.append(
-            f"its AnatomicalOrientation {letters} contradicts its directions, "
-            f"{'x'.join(_along(directions, 'LPS'))}; "
-            "the second is used, check left and right"
-        )
+        along = "x".join(_along(directions, "LPS"))
+        letters = f"AnatomicalOrientation {letters}, which has other sides (left/right)"
+        notes.append(_two(f"directions {along}", letters))
     return notes
 
 
@@ -246,13 +223,9 @@ def notes_of_nrrd(fields: Mapping[str, str], sizes: Sequence[int]) -> list[str]:
     if len(mins) == len(maxs) == len(spacings) == len(sizes):
         # of cells, of nodes
         steps = [(maxs - mins) / np.maximum(np.array(sizes) - k, 1) for k in (0, 1)]
-        if not any(_is_alike(each, spacings) for each in steps):
-            words = f"{'are' if n_unknown == 0 else 'are taken as'} {sizes_words(spacings)}"
-            words += (
-                f", but {sizes_words(steps[0])} by its axis mins and maxs; the spacings "
-                "are used, check them"
-            )
-            notes.append(f"its spacings {words}")
+        if not any(_is_alike(spacings, each) for each in steps):
+            by_ends = f"axis mins and maxs of {sizes_words(steps[0])}"
+            notes.append(_two(f"spacings {sizes_words(spacings)}", by_ends))
     notes.append(
         "it has no space, which leaves left and right open: assuming left-posterior-superior, as "
         "ITK does"
@@ -269,7 +242,15 @@ def _numbers(text: str) -> NDArray[np.float64]:
 
 
 def _is_alike(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
-    return len(one) == len(other) and bool(np.allclose(one, other, rtol=SAME_SIZE, atol=SAME_SIZE))
+    """Return whether two lists of numbers are the same but for rounding."""
+    if len(one) != len(other) or not len(one):
+        return False
+    return bool((np.abs(one - other) <= SAME_SIZE * (np.abs(other) + np.abs(one).max())).all())
+
+
+def _two(used: str, other: str) -> str:
+    """Return a warning of two statements that differ."""
+    return f"states {used}, which is used, and {other}; check it"
 
 
 def sizes_words(values: NDArray[np.float64]) -> str:

@@ -33,6 +33,12 @@ TEXT_RATIO = 4  # "0 " becomes 8 bytes
 VALUE_LETTERS = 32  # letters of text per byte of a value, at most
 BLOCK_BYTES = 2**14  # unpacked at a time, to 17 MB at most
 BZIP2_RATIO = 50_000  # bzip2 compresses zeros 45,000 times
+TRUE = ("true", "1")  # of MetaImage
+RATIOS = {  # by NRRD's encoding; others are bzip2
+    **dict.fromkeys(("raw", "hex"), 1),
+    **dict.fromkeys(("txt", "text", "ascii"), TEXT_RATIO),
+    **dict.fromkeys(("gz", "gzip"), DEFLATE_RATIO),
+}
 VALUE_BYTES = {  # types of NRRD without "unsigned" and the like, and those of MetaImage
     "char": 1,
     "int8": 1,
@@ -53,6 +59,26 @@ VALUE_BYTES = {  # types of NRRD without "unsigned" and the like, and those of M
     "float": 4,
     "double": 8,
 }
+
+
+class Names(NamedTuple):
+    """Names of a format's fields, the first four of which every header has, and its mark after
+    them.
+    """
+
+    axes: str
+    sizes: str
+    kind: str
+    needed: str
+    files: str
+    skip: str
+    mark: str
+
+
+NRRD_NAMES = Names("dimension", "sizes", "type", "encoding", "datafile", "byteskip", ":")
+METAIMAGE_NAMES = Names(
+    "NDims", "DimSize", "ElementType", "ElementDataFile", "ElementDataFile", "HeaderSize", "="
+)
 
 
 class VoxelHeader(NamedTuple):
@@ -149,7 +175,7 @@ def read_header(path: Path) -> VoxelHeader:
     """Return the header of a file; InputError for the reasons of `checked_header` in the header."""
     with path.open("rb") as stream:
         head = stream.read(HEADER_BYTES)
-    header = _nrrd(head) if path.suffix.lower() in NRRD_SUFFIXES else _metaimage(head)
+    header = _parsed(head, path.suffix.lower() in NRRD_SUFFIXES)
     if header.files and len(head) == HEADER_BYTES:  # the rest might name other files
         raise InputError(
             f"{UNREADABLE_FILE} (a header of more than {HEADER_BYTES} bytes with separate data "
@@ -186,83 +212,69 @@ def _n_axes(text: str) -> int:
     return int(text)
 
 
-def _metaimage(head: bytes) -> VoxelHeader:
-    stated: list[tuple[str, str]] = []
-    files: list[str] = []
-    lines = head.split(b"\n")
-    for number, line in enumerate(lines):
-        key, equals, value = (part.strip() for part in line.decode("latin-1").partition("="))
-        if (key and not equals) or ":" in key:  # ITK also ends a key at a colon
-            raise InputError(UNREADABLE_FILE)
-        stated.append((key, value))
-        if key == "ElementDataFile":
-            rest = [each.decode("latin-1").strip() for each in lines[number + 1 :]]
-            if value.upper().startswith("LIST"):
-                files = [each for each in rest if each]
-            elif value.upper() != "LOCAL":
-                files = [value]
-            break
+def _parsed(head: bytes, is_nrrd: bool) -> VoxelHeader:
+    """Parse the first bytes of a file as a header; `Names` are those of the format's fields."""
+    names = NRRD_NAMES if is_nrrd else METAIMAGE_NAMES
+    stated, texts, files, n_bytes = _lines(head, names)
     fields = dict(stated)
-    for key in ("NDims", "DimSize", "ElementType", "ElementDataFile"):
+    for key in names[:4]:
         if key not in fields:
             raise InputError(f"{UNREADABLE_FILE} (its header has no {key})")
-    sizes = _sizes(fields["DimSize"], _n_axes(fields["NDims"]))
-    channels = fields.get("ElementNumberOfChannels", "1")
+    sizes = _sizes(fields[names.sizes], _n_axes(fields[names.axes]))
+    channels = "1" if is_nrrd else fields.get("ElementNumberOfChannels", "1")
     if re.fullmatch(r"\d{1,9}", channels) is None:
         raise InputError(f"{UNREADABLE_FILE} (ElementNumberOfChannels = {channels[:80]})")
-    is_packed = fields.get("CompressedData", "").lower() in ("true", "1")
-    is_text = fields.get("BinaryData", "True").lower() not in ("true", "1")
-    ratio = DEFLATE_RATIO if is_packed else TEXT_RATIO if is_text else 1
-    value_bytes, end = (
-        math.prod(sizes) * int(channels) * _value_bytes(fields["ElementType"]),
-        lines[: number + 1],
-    )
-    skip, n_bytes = fields.get("HeaderSize", "0"), len(b"\n".join(end)) + 1
-    return VoxelHeader(stated, {}, sizes, value_bytes, files, ratio, skip, n_bytes)
+    if is_nrrd:
+        ratio = RATIOS.get(fields["encoding"].lower(), BZIP2_RATIO)
+    elif fields.get("CompressedData", "").lower() in TRUE:
+        ratio = DEFLATE_RATIO
+    else:
+        ratio = 1 if fields.get("BinaryData", "True").lower() in TRUE else TEXT_RATIO
+    value_bytes = math.prod(sizes) * int(channels) * _value_bytes(fields[names.kind])
+    skip = fields.get(names.skip, "0")
+    return VoxelHeader(stated, texts, sizes, value_bytes, files, ratio, skip, n_bytes)
 
 
-def _nrrd(head: bytes) -> VoxelHeader:
-    if not head.startswith(b"NRRD"):
-        raise InputError(UNREADABLE_FILE)
-    fields: dict[str, str] = {}
+def _lines(
+    head: bytes, names: Names
+) -> tuple[list[tuple[str, str]], dict[str, str], list[str], int]:
+    """Return the fields in order, NRRD's key:=value pairs, the data files, and the number of
+    bytes of the header.
+    """
+    is_nrrd = names is NRRD_NAMES
+    stated: list[tuple[str, str]] = []
     texts: dict[str, str] = {}
     files: list[str] = []
     raw = head.split(b"\n")
     lines = [line.decode("latin-1").rstrip("\r") for line in raw]
-    if len(head) == HEADER_BYTES and "" not in lines:
+    if is_nrrd and not head.startswith(b"NRRD"):
+        raise InputError(UNREADABLE_FILE)
+    if is_nrrd and len(head) == HEADER_BYTES and "" not in lines:
         raise InputError(f"{UNREADABLE_FILE} (a header of more than {HEADER_BYTES} bytes)")
-    for number, line in enumerate(lines[1:], 1):
-        if not line:
+    for number, line in enumerate(lines):
+        if is_nrrd and not line:
             break
-        key, _, value = line.partition(":")
-        if line.startswith("#"):
+        if is_nrrd and (number == 0 or line.startswith("#")):
             continue
-        if value.startswith("="):  # "key:=value", which is not a field; of bytes in UTF-8
+        key, mark, value = line.partition(names.mark)
+        if is_nrrd and value.startswith("="):  # "key:=value", which is not a field; in UTF-8
             texts[key] = value[1:].encode("latin-1").decode("utf-8", "replace")
             continue
-        key, value = key.strip().lower().replace(" ", ""), value.strip()
-        fields[key] = value
-        if key == "datafile":
-            if value.upper().startswith("LIST"):
+        key, value = key.strip(), value.strip()
+        if is_nrrd:
+            key = key.lower().replace(" ", "")
+        elif (key and not mark) or ":" in key:  # ITK also ends a key at a colon
+            raise InputError(UNREADABLE_FILE)
+        stated.append((key, value))
+        if key == names.files:
+            is_list = value.upper().startswith("LIST")
+            if is_list:
                 files += [each.strip() for each in lines[number + 1 :] if each.strip()]
+            elif is_nrrd or value.upper() != "LOCAL":
+                files.append(value)
+            if is_list or not is_nrrd:
                 break
-            files.append(value)
-    for key in ("dimension", "sizes", "type", "encoding"):
-        if key not in fields:
-            raise InputError(f"{UNREADABLE_FILE} (its header has no {key})")
-    sizes = _sizes(fields["sizes"], _n_axes(fields["dimension"]))
-    encoding = fields["encoding"].lower()
-    ratio = BZIP2_RATIO
-    for names, of_these in (
-        ("raw hex", 1),
-        ("txt text ascii", TEXT_RATIO),
-        ("gz gzip", DEFLATE_RATIO),
-    ):
-        if encoding in names.split():
-            ratio = of_these
-    value_bytes, skip = math.prod(sizes) * _value_bytes(fields["type"]), fields.get("byteskip", "0")
-    end = len(b"\n".join(raw[: number + 1])) + 1
-    return VoxelHeader(list(fields.items()), texts, sizes, value_bytes, files, ratio, skip, end)
+    return stated, texts, files, len(b"\n".join(raw[: number + 1])) + 1
 
 
 def _value_bytes(kind: str) -> int:
