@@ -10,6 +10,7 @@ import pytest
 from commands import exit_code
 
 import tetopt
+import tetopt.io.nifti
 from tetopt.io.images import parse_crop, smaller_words
 from tetopt.job import inputs
 from tetopt.system import budget
@@ -129,7 +130,7 @@ def test_a_crop_is_read_without_the_other_voxels(name, tmp_path, monkeypatch):
     bounds = [(2, 7), (None, 5), (1, None)]
     whole = tetopt.io.images.cropped(tetopt.load_image(tmp_path / name, volume=1), bounds)
     for planes in (1, 2**28):
-        monkeypatch.setattr(tetopt.io.images, "PLANES_BYTES", planes)
+        monkeypatch.setattr(tetopt.io.nifti, "PLANES_BYTES", planes)
         part = tetopt.load_image(tmp_path / name, volume=1, crop=bounds)
         assert part.data.tobytes() == whole.data.tobytes()
         assert part.affine.tobytes() == whole.affine.tobytes()

@@ -103,12 +103,88 @@ def test_shape_without_voxels(tmp_path, name, monkeypatch):
             images.file_shape(path)
 
 
-def test_ending_in_mixed_case(tmp_path):
-    """nibabel looks for A.nii.GZ; the user is told what to do rather than that the file is
-    missing.
-    """
-    path = save_nifti(tmp_path / "a.nii.gz", ramp(3, 4, 5)).rename(tmp_path / "A.Nii.GZ")
-    assert_refused(path, "rename it to lower case")
+PAIRS = {  # names of the two files as nibabel writes them, and renamed
+    "plain": ("a.hdr", "a.img", "a.hdr", "a.img"),
+    "packed": ("a.hdr.gz", "a.img.gz", "a.hdr.gz", "a.img.gz"),
+    "header packed": ("a.hdr.gz", "a.img.gz", "a.hdr.gz", None),
+    "voxels packed": ("a.hdr.gz", "a.img.gz", None, "a.img.gz"),
+    "upper case": ("a.hdr", "a.img", "A.HDR", "A.IMG"),
+}
+
+
+@pytest.mark.parametrize("kind", [nibabel.Nifti1Pair, nibabel.Nifti2Pair])
+@pytest.mark.parametrize("name", PAIRS)
+def test_nifti_pair(tmp_path, name, kind):
+    """Either file, whatever is packed: the voxels, place and shape; the checksum is of both."""
+    *written, header, voxels = PAIRS[name]
+    files = [tmp_path / each for each in written]
+    kept = [
+        tmp_path / (each or was.removesuffix(".gz"))
+        for was, each in zip(written, (header, voxels), strict=True)
+    ]
+    nibabel.save(kind(ramp(3, 4, 5, 2), OBLIQUE), files[1])
+    for file, path in zip(files, kept, strict=True):
+        file.rename(path)
+        if path.suffix != ".gz" and file.suffix == ".gz":
+            path.write_bytes(gzip.decompress(path.read_bytes()))
+    raw = [path.read_bytes() for path in kept]
+    for k, path in enumerate(kept):
+        image = load_image(path, volume=1)
+        np.testing.assert_array_equal(image.data, ramp(3, 4, 5, 2)[..., 1])
+        np.testing.assert_allclose(image.affine, OBLIQUE, rtol=1e-6)
+        assert file_shape(path) == (3, 4, 5, 2)
+        assert sha256(path) == hashlib.sha256(raw[k] + raw[1 - k]).hexdigest()
+        assert_refused(path, "has 2 volumes")
+
+
+@pytest.mark.parametrize(
+    ("gone", "left", "words"),
+    [
+        ("a.img", "a.hdr", r"its voxels should be in a.img \(or a.img.gz\) next to it; copy both"),
+        ("a.hdr", "a.img", r"its header, .* should be in a.hdr \(or a.hdr.gz\) next to it"),
+    ],
+)
+def test_one_file_of_a_pair(tmp_path, gone, left, words):
+    nibabel.save(nibabel.Nifti1Pair(ramp(3, 4, 5), OBLIQUE), tmp_path / "a.img")
+    (tmp_path / gone).unlink()
+    assert_refused(tmp_path / left, words)
+    (tmp_path / gone).mkdir()
+    assert_refused(tmp_path / left, f'its other file "{gone}" is a folder')
+
+
+def test_damaged_pairs(tmp_path):
+    path = tmp_path / "a.hdr"
+    nibabel.save(nibabel.Nifti1Pair(ramp(3, 4, 5), OBLIQUE), tmp_path / "a.img")
+    whole = (tmp_path / "a.img").read_bytes()
+    (tmp_path / "a.img").write_bytes(whole[:-1])
+    assert_refused(path, f"{DAMAGED}.*declares 3 x 4 x 5 voxels, 120 bytes, but the file has 119")
+    (tmp_path / "a.img").write_bytes(whole + bytes(24))
+    assert "24 more bytes after them" in warnings_of(path)[0]
+    path.write_text("ENVI\nsamples = 3\n")
+    assert_refused(path, f"{DAMAGED}, or not an image of this kind")
+    for endianness in "<>":
+        header = nibabel.AnalyzeHeader(endianness=endianness)
+        header.set_data_shape((3, 4, 5))
+        path.write_bytes(header.binaryblock)
+        for each in (path, tmp_path / "a.img"):
+            assert_refused(each, "an Analyze 7.5 image, whose format does not tell left from")
+
+
+@pytest.mark.parametrize("name", ["A.Nii.GZ", "a.MGz"])
+def test_suffix_in_any_case(tmp_path, name):
+    kind = nibabel.MGHImage if "MG" in name else nibabel.Nifti1Image
+    nibabel.save(kind(ramp(3, 4, 5, dtype=np.int32), np.eye(4)), tmp_path / name.lower())
+    (tmp_path / name.lower()).rename(tmp_path / name)
+    np.testing.assert_array_equal(load_image(tmp_path / name).data, ramp(3, 4, 5))
+
+
+def test_a_gzip_file_is_unpacked_once(tmp_path, monkeypatch):
+    path, blocks = save_nifti(tmp_path / "a.nii.gz", ramp(3, 4, 5, 2)), []
+    read = gzip.GzipFile.read
+    monkeypatch.setattr(gzip.GzipFile, "read", lambda *a: blocks.append(read(*a)) or blocks[-1])
+    load_image(path, volume=0)
+    # the header, and then the whole
+    assert sum(map(len, blocks[1:])) == 352 + ramp(3, 4, 5, 2).nbytes
 
 
 def test_path_may_be_a_string(tmp_path):
@@ -679,8 +755,8 @@ def test_unknown_suffix(tmp_path):
     path = tmp_path / "a.xyz"
     path.write_bytes(b"hello")
     known = (
-        ".nii.gz, .nii, .mgz, .mgh, .nrrd, .nhdr, .mha, .mhd, .dcm, .png, .tif, .tiff, "
-        ".jpg, .jpeg, .bmp, .zarr"
+        ".nii.gz, .nii, .mgz, .mgh, .hdr, .img, .hdr.gz, .img.gz, .nrrd, .nhdr, .mha, .mhd, .zarr, "
+        ".dcm, .png, .tif, .tiff, .jpg, .jpeg, .bmp"
     )
     assert_refused(path, f"unknown image format.*{re.escape(known)}, or a folder of DICOM files")
 
@@ -713,7 +789,9 @@ def test_web_page(tmp_path, name):
     assert_refused(tmp_path / name, "this is an HTML page, not an image; download")
 
 
-@pytest.mark.parametrize(("name", "better"), [("b.c.nii", "b.c.nii.gz"), ("b.mgh", "b.mgz")])
+@pytest.mark.parametrize(
+    ("name", "better"), [("b.c.nii", "b.c.nii.gz"), ("b.mgh", "b.mgz"), ("b.IMG", "b.img.gz")]
+)
 def test_gzip_file_of_another_name(tmp_path, name, better):
     save_nifti(tmp_path / "a.nii.gz", ramp(3, 4, 5)).rename(tmp_path / name)
     assert_refused(tmp_path / name, f"this is a gzip file; rename it to {re.escape(better)}$")

@@ -8,56 +8,33 @@ import contextlib
 import gzip
 import hashlib
 import io
-import logging
 import math
 import os
 import re
-import threading
-import zlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import nibabel
 import numpy as np
-from nibabel import imageglobals
-from nibabel.filebasedimages import ImageFileError
-from nibabel.freesurfer.mghformat import MGHError
-from nibabel.spatialimages import HeaderDataError, SpatialImage
-from nibabel.wrapstruct import WrapStructError
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError, Remark, warn
-from tetopt.image import Image, shifted_affine
-from tetopt.io.apart import DEFLATE_RATIO
-from tetopt.io.contradictions import notes_of_nifti, notes_of_rest
-from tetopt.io.itk_headers import HEADED_SUFFIXES, data_files, header_sizes
-from tetopt.io.pictures import PICTURE_SUFFIXES
-from tetopt.io.read_dicom import DICOM_SUFFIX, is_dicom, read_dicom
-from tetopt.io.read_itk import ITK_READERS, read_itk
+from tetopt.image import Image
+from tetopt.io.nifti import NIFTI
+from tetopt.io.read_dicom import DICOM
+from tetopt.io.read_itk import ITK
 from tetopt.io.readback import save_checked
-from tetopt.io.stacks import check_spacing, read_pictures, read_slices, slice_files
-from tetopt.io.units import mm_of_axes, notes_of_size
-from tetopt.io.volumes import (
-    DAMAGED_FILE,
-    TOO_LONG,
-    TRAILING_BYTES,
-    UNREADABLE_FILE,
-    check_room,
-    one_line,
-    volume_index,
-)
+from tetopt.io.stacks import PICTURES, SLICES, check_spacing
+from tetopt.io.volumes import Reader, Request, one_line, plane_affine
 from tetopt.io.zarr_images import (
     METADATA_FILES,
+    ZARR,
     ZARR_SUFFIX,
-    ZarrLevel,
-    check_chunks,
     image_folder,
     is_zarr,
-    read_chunks,
     save_zarr,
     zarr_levels,
-    zarr_picks,
 )
 from tetopt.system.files import check_suffix
 from tetopt.system.incoming import irregular
@@ -66,27 +43,13 @@ Bounds = Sequence[tuple[int | None, int | None]]
 """One half-open (start, stop) range of voxel indices per axis; None means an open end."""
 
 OUTPUT_SUFFIXES = (".nii", ".nii.gz")
-_NIBABEL_SUFFIXES = (".nii.gz", ".nii", ".mgz", ".mgh")
 
-# Errors that the two libraries raise for damaged files.
-_READER_ERRORS = (OSError, EOFError, ValueError, TypeError, KeyError)
-_NIBABEL_HEADER_ERRORS = (
-    *_READER_ERRORS,
-    ImageFileError,
-    HeaderDataError,
-    WrapStructError,
-    OverflowError,
-    MGHError,
-)
-PLANES_BYTES = 2**28  # of an uncompressed file, read at a time for a crop of it
 GZIP_LEVEL = 1  # nibabel's compression level
 MOST_OF_NIFTI_1 = 32767  # voxels along an axis, of 16 bits; NIfTI-2 allows more
-HEAD_BYTES_NIFTI = 1024  # read from a file: the longest header has 540
-EXTENSION_BYTES = 2**26  # 67 MB before the voxels: a NIfTI file's extensions are texts
-MGH_FLAG = slice(28, 30)  # the bytes of an MGH header that are 0 if it has no sizes and directions
 BEGINNING_BYTES = 512  # of a file: HTML pages begin with a tag, after at most some blanks
 WEB_BEGINNINGS = (b"<!doctype html", b"<html", b"<head", b"<body")
 GZIP_BEGINNING = b"\x1f\x8b"
+PACKED_NAMES = {".mgh": ".mgz"} | {each: f"{each}.gz" for each in (".nii", ".hdr", ".img")}
 
 
 def load_image(
@@ -99,7 +62,8 @@ def load_image(
 ) -> Image:
     """Read an image from a file, or from a folder of Zarr or of DICOM slices, in RAS+ millimetres.
 
-    The suffix, in any case, decides the format: nibabel reads NIfTI and MGZ; SimpleITK (the extra
+    The suffix, in any case, decides the format: nibabel reads NIfTI, also
+    as a pair (.hdr, .img), and MGZ; SimpleITK (the extra
     ``tetopt[itk]``) reads NRRD and MetaImage; pydicom (``tetopt[dicom]``) reads DICOM; Pillow reads
     2-D pictures and folders with one of them per slice, tifffile (``tetopt[tiff]``) TIFF stacks
     with the calibration of ImageJ or OME; zarr (``tetopt[zarr]``) reads OME-Zarr and Zarr arrays,
@@ -172,26 +136,20 @@ def load_image(
     >>> tetopt.load_image("ball.nii.gz", slice_=(2, 8)).shape
     (16, 16)
     """
-    path = Path(path)
-    notes: list[str] = []
-    try:
-        with os_errors_named():
-            is_folder = is_zarr(path)
-        if is_folder:
-            level = zarr_levels(path, notes)[0]
-            check_spacing(spacing_mm, np.linalg.norm(level.affine[:3, :3], axis=0))
-            image = _part_of_zarr(level, volume, slice_, crop, notes)
-        elif (
-            crop is not None
-            and slice_ is None
-            and check_beginning(path).endswith(_NIBABEL_SUFFIXES)
-        ):
-            image = _crop_of_nibabel(path, volume, crop, notes)
-            check_spacing(spacing_mm, image.spacing)
-        else:
-            image = part_of(Image(*_read(path, volume, notes, spacing_mm)), slice_, crop)
-    except InputError as error:
-        raise named_error(path, error) from error
+    path, notes = Path(path), list[str]()
+    with errors_named(path):
+        reader = reader_of(path)
+        is_part = reader.reads_crop if slice_ is None else reader.reads_slice
+        parts = (slice_, crop) if is_part else (None, None)
+        request = Request(volume, spacing_mm, lambda shape: _box_of(shape, *parts))
+        data, affine = reader.read(path, request, notes)
+        if reader.has_spacing:
+            check_spacing(spacing_mm, np.linalg.norm(affine[:-1, :-1], axis=0))
+        image = Image(data, affine)
+        if not is_part:
+            image = part_of(image, slice_, crop)
+        elif slice_ is not None:
+            image = image_slice(image, slice_[0], 0)
     for note in notes:
         warn(f"{path}: {note}")
     low = image.data.min()
@@ -200,18 +158,12 @@ def load_image(
     return image
 
 
-def named_error(path: Path, error: InputError) -> InputError:
-    """Return the error as one line that begins with the path."""
-    words = one_line(error)
-    return InputError(words if words.startswith(str(path)) else f"{path}: {words}")
-
-
 def file_shape(path: str | Path) -> tuple[int, ...] | None:
     """Return the lengths of all axes of a file's voxels, from its header; for NRRD they may include
     components.
 
-    Returns None for a picture or DICOM, which would have to be read. For Zarr the three spatial
-    axes come first.
+    Returns None for a picture or DICOM, which would have to be read, and for a missing file. For
+    Zarr the three spatial axes come first.
 
     Raises
     ------
@@ -219,22 +171,8 @@ def file_shape(path: str | Path) -> tuple[int, ...] | None:
         For the reasons of `load_image`, as far as the header shows them.
     """
     path = Path(path)
-    name = path.name.lower()
-    try:
-        with os_errors_named():
-            if is_zarr(path):
-                level = zarr_levels(path, [])[0]
-                return (*level.shape, *(int(level.array.shape[axis]) for axis in level.others))
-            if not name.endswith((*_NIBABEL_SUFFIXES, *HEADED_SUFFIXES)) or path.is_dir():
-                return None
-            check_beginning(path)
-            if name.endswith(HEADED_SUFFIXES):
-                return header_sizes(path)
-            _checked_head(path, name.endswith((".gz", ".mgz")))
-            with _nibabel_heard():
-                return tuple(int(size) for size in _nibabel_file(path).shape)
-    except InputError as error:
-        raise InputError(f"{path}: {one_line(error)}") from error
+    with errors_named(path):
+        return reader_of(path).shape(path) if path.exists() else None
 
 
 def smaller_words(path: Path, bounds: Sequence[tuple[int, int]], most_voxels: float) -> str:
@@ -374,11 +312,11 @@ def image_slice(image: Image, axis: int, index: int) -> Image:
     corner[axis] = index
     columns = np.delete(image.affine[:3, :3], axis, axis=1)
     return Image(
-        np.take(image.data, index, axis=axis), _plane_affine(columns, image.to_world(corner))
+        np.take(image.data, index, axis=axis), plane_affine(columns, image.to_world(corner))
     )
 
 
-def _check_slice(shape: tuple[int, ...], axis: int, index: int) -> None:
+def _check_slice(shape: Sequence[int], axis: int, index: int) -> None:
     if len(shape) != 3:
         raise InputError(f"slice: expected a 3-D image, got a {len(shape)}-D one; omit the slice")
     if axis not in (0, 1, 2):
@@ -467,8 +405,8 @@ def sha256(path: str | Path) -> str:
     """Return the SHA-256 of a file, or of the contents of a folder's files joined in the order of
     their names.
 
-    For a header with separate data files it includes these. For a Zarr folder it covers all files
-    in it and its subfolders, each after its name and length;
+    For a header with separate data files it includes these, for one file of a pair the other. For a
+    Zarr folder it covers all files in it and its subfolders, each after its name and length;
     `status_checksum` is a cheaper checksum.
 
     Raises
@@ -478,7 +416,7 @@ def sha256(path: str | Path) -> str:
     """
     path = Path(path)
     digest = hashlib.sha256()
-    with os_errors_named(path):
+    with errors_named(path):
         if is_zarr(path):
             return folder_checksum(path, lambda _: True)
         for file in image_files(path):
@@ -500,7 +438,7 @@ def status_checksum(path: str | Path) -> str:
         For the reasons of `sha256`.
     """
     path = Path(path)
-    with os_errors_named(path):
+    with errors_named(path):
         if is_zarr(path):
             return folder_checksum(path, lambda file: file.name in METADATA_FILES)
         words = []
@@ -511,8 +449,8 @@ def status_checksum(path: str | Path) -> str:
 
 
 def image_files(path: Path) -> list[Path]:
-    """Return the files of an image other than Zarr: the file itself, data files of a header, or
-    those in a folder.
+    """Return the files of an image other than Zarr: the file itself with the data files of a
+    header or the other one of a pair, or those in a folder.
 
     Raises
     ------
@@ -525,9 +463,9 @@ def image_files(path: Path) -> list[Path]:
         )
     # A DICOM series is read from the folder itself, not from its subfolders; so is its checksum.
     files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
-    if path.name.lower().endswith(HEADED_SUFFIXES):
-        with contextlib.suppress(InputError):  # an unreadable header has no data files
-            files += data_files(path)
+    with contextlib.suppress(InputError):  # an unreadable header has no other files
+        for reader in _named_readers(path):
+            files += reader.other_files(path)
     return files
 
 
@@ -579,77 +517,61 @@ def _raised(error: OSError) -> None:
 
 # Choice of the reader
 
+READERS = (NIFTI, ITK, ZARR, SLICES, DICOM, PICTURES)  # of folders, the first that recognises it
 
-def _read(
-    path: Path, volume: int | None, notes: list[str], spacing_mm: float | Sequence[float] | None
-) -> tuple[NDArray, NDArray[np.float64]]:
-    """Return data and affine of the file, 2-D or 3-D; `Image` checks them. Warnings are added to
-    `notes`.
+
+def reader_of(path: Path) -> Reader:
+    """Return the reader of a file or folder: by the suffix of a file, otherwise by contents.
+
+    Raises
+    ------
+    InputError
+        With the path: its format is unknown, or its first bytes do not fit it.
     """
-    with os_errors_named():
-        if path.is_dir() and (names := slice_files(path)):
-            return read_slices(path, names, notes, spacing_mm)
-    if path.name.lower().endswith(PICTURE_SUFFIXES):
-        check_beginning(path)
-        return read_pictures(path, volume, notes, spacing_mm)
-    data, affine = _read_placed(path, volume, notes)
-    check_spacing(spacing_mm, np.linalg.norm(affine[:-1, :-1], axis=0))
-    return data, affine
-
-
-def has_own_spacing(path: Path) -> bool:
-    """Return whether a file's format states voxel sizes: all do but pictures, stacks and folders
-    of slices.
-    """
-    with os_errors_named(path):
-        return not (
-            slice_files(path) if path.is_dir() else path.name.lower().endswith(PICTURE_SUFFIXES)
+    with errors_named(path):
+        if not path.is_dir():
+            _check_beginning(path)
+        readers = (*_named_readers(path), *READERS)
+        for k, reader in enumerate(readers):
+            if k < len(readers) - len(READERS) or reader.is_this(path):
+                return reader
+        known = ", ".join(suffix for reader in READERS for suffix in reader.suffixes)
+        raise InputError(
+            f"unknown image format; expected {known}, or a folder of DICOM files or of slices"
         )
 
 
-def _read_placed(
-    path: Path, volume: int | None, notes: list[str]
-) -> tuple[NDArray, NDArray[np.float64]]:
-    with os_errors_named():
-        if path.is_dir():
-            return read_dicom(path, volume, notes)
-    name = check_beginning(path)
-    for suffix, read in READERS.items():
-        if name.endswith(suffix):
-            return read(path, volume, notes)
-    if is_dicom(path):  # scanners name files without a suffix
-        return read_dicom(path, volume, notes)
-    known = ", ".join((*READERS, *PICTURE_SUFFIXES, ZARR_SUFFIX))
-    raise InputError(
-        f"unknown image format; expected {known}, or a folder of DICOM files or of slices"
-    )
+def _named_readers(path: Path) -> list[Reader]:
+    """Return the reader of a file's suffix, if any."""
+    is_file, name = not path.is_dir(), path.name.lower()
+    return [reader for reader in READERS if is_file and name.endswith(reader.suffixes)]
 
 
-def check_beginning(path: Path) -> str:
-    """Return the file's name in lower case; InputError if its first bytes do not fit the format."""
-    with os_errors_named():
-        if (other := irregular(path)) is not None:
-            raise InputError(f"expected a regular file, got {other}; copy its content into a file")
-        with path.open("rb") as stream:
-            beginning = stream.read(BEGINNING_BYTES)
+def _check_beginning(path: Path) -> None:
+    """Raise InputError if the first bytes of a file do not fit its format."""
+    if (other := irregular(path)) is not None:
+        raise InputError(f"expected a regular file, got {other}; copy its content into a file")
+    with path.open("rb") as stream:
+        beginning = stream.read(BEGINNING_BYTES)
     if not beginning:
         raise InputError("the file is empty; copy or export it again")
     if beginning.removeprefix(b"\xef\xbb\xbf").lstrip().lower().startswith(WEB_BEGINNINGS):
         raise InputError("this is an HTML page, not an image; download the file again")
-    name = path.name.lower()
-    if name.endswith((".nii", ".mgh")) and beginning.startswith(GZIP_BEGINNING):
-        ending = ".nii.gz" if name.endswith(".nii") else ".mgz"
-        raise InputError(f"this is a gzip file; rename it to {path.stem}{ending}")
-    return name
+    packed = PACKED_NAMES.get(path.suffix.lower())
+    if packed is not None and beginning.startswith(GZIP_BEGINNING):
+        raise InputError(f"this is a gzip file; rename it to {path.stem}{packed}")
 
 
 @contextlib.contextmanager
-def os_errors_named(path: Path | None = None) -> Iterator[None]:
-    """Turn system errors into InputErrors; with `path`, they begin with the file's name or the
-    path.
+def errors_named(path: Path) -> Iterator[None]:
+    """Turn system errors and InputErrors into InputErrors of one line that begins with the path, or
+    with the file's name.
     """
     try:
         yield
+    except InputError as error:
+        words = one_line(error)
+        raise InputError(words if words.startswith(str(path)) else f"{path}: {words}") from error
     except OSError as error:
         words = f"cannot be opened ({error.strerror or error})"
         if isinstance(error, FileNotFoundError):
@@ -661,228 +583,7 @@ def os_errors_named(path: Path | None = None) -> Iterator[None]:
             )
         elif isinstance(error, PermissionError):
             words = "permission denied; make the file readable for your account"
-        raise InputError(words if path is None else f"{error.filename or path}: {words}") from error
-
-
-# NIfTI and MGZ
-
-
-def _read_nibabel(
-    path: Path, volume: int | None, notes: list[str]
-) -> tuple[NDArray, NDArray[np.float64]]:
-    proxy, index, affine = nibabel_voxels(path, volume, notes)
-    check_room(proxy.shape, proxy.dtype.itemsize)
-    try:
-        data = np.asanyarray(proxy[(slice(None),) * 3 + index] if index else proxy)
-    except MemoryError as error:
-        raise InputError(
-            f"its {proxy.shape} voxels do not fit into memory; resample it first"
-        ) from error
-    except (OSError, EOFError, zlib.error, ValueError, TypeError, OverflowError) as error:
-        raise InputError(f"{DAMAGED_FILE} ({one_line(error)})") from error
-    if data.ndim == 2:
-        return data, _plane_affine(affine[:3, :2], affine[:3, 3])
-    return data, affine
-
-
-def _crop_of_nibabel(path: Path, volume: int | None, crop: Bounds, notes: list[str]) -> Image:
-    """Return a crop of a file, of which only its planes are read, some at a time."""
-    proxy, index, affine = nibabel_voxels(path, volume, notes)
-    if len(proxy.shape) < 3:
-        return part_of(Image(*_read_nibabel(path, volume, [])), None, crop)
-    bounds = checked_bounds(tuple(proxy.shape[:3]), crop)
-    check_room([stop - start for start, stop in bounds], proxy.dtype.itemsize)
-    *within, (first, last) = bounds
-    box = tuple(slice(*ends) for ends in within)
-    n_planes = max(PLANES_BYTES // (math.prod(proxy.shape[:2]) * proxy.dtype.itemsize), 1)
-    if path.name.lower().endswith((".gz", ".mgz")):  # read from its beginning each time
-        n_planes = last - first
-        check_room((*proxy.shape[:2], n_planes), proxy.dtype.itemsize)
-    try:
-        parts = [
-            np.asanyarray(
-                proxy[(slice(None), slice(None), slice(k, min(k + n_planes, last)), *index)]
-            )[box]
-            for k in range(first, last, n_planes)
-        ]
-    except MemoryError as error:
-        raise InputError("its voxels do not fit into memory; crop it to fewer") from error
-    except (OSError, EOFError, zlib.error, ValueError, TypeError, OverflowError) as error:
-        raise InputError(f"{DAMAGED_FILE} ({one_line(error)})") from error
-    data = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=2)
-    return Image(data, shifted_affine(affine, [start for start, _ in bounds]))
-
-
-# By suffix; each returns data and affine for a path and a volume, and adds notes.
-READERS: dict[str, Callable[[Path, int | None, list[str]], tuple[NDArray, NDArray[np.float64]]]] = {
-    **dict.fromkeys(_NIBABEL_SUFFIXES, _read_nibabel),
-    **dict.fromkeys(ITK_READERS, read_itk),
-    DICOM_SUFFIX: read_dicom,
-}
-
-
-def nibabel_voxels(
-    path: Path, volume: int | None, notes: list[str]
-) -> tuple[Any, tuple[int, ...], NDArray[np.float64]]:
-    """Return nibabel's proxy of the voxels, the index beyond the third axis, and the affine in
-    mm, (4, 4).
-    """
-    is_packed = path.name.lower().endswith((".gz", ".mgz"))
-    head = _checked_head(path, is_packed)
-    with _nibabel_heard() as words:
-        file = _nibabel_file(path)
-    notes += [
-        f"nibabel repaired its header ({word}); check its voxel sizes and position"
-        for word in words
-    ]
-    notes += _notes_of_place(file, head)
-    lengths = _units(file, notes)
-    affine = np.array(file.affine, dtype=np.float64)
-    affine[:3] *= 1.0 if lengths is None else lengths[:, None]
-    notes += notes_of_size(file.shape, affine, lengths)
-    index = volume_index(file.shape[3:], volume)
-    _check_size(path, file, 0 if volume is None else volume, is_packed, notes)
-    return file.dataobj, index, affine
-
-
-def _checked_head(path: Path, is_packed: bool) -> bytes:
-    """Return the file's first bytes, unpacked; InputError if it should be a gzip file, or has
-    excessive extensions.
-
-    nibabel reads extensions whole together with the header, before their sizes can be checked.
-    """
-    try:
-        with gzip.open(path) if is_packed else path.open("rb") as stream:
-            head = stream.read(HEAD_BYTES_NIFTI)
-    except (OSError, EOFError, zlib.error) as error:
-        raise _of_gzip(error) from error
-    for header in (nibabel.Nifti1Header, nibabel.Nifti2Header):
-        if path.name.lower().endswith((".nii", ".nii.gz")) and header.may_contain_header(head):
-            offset = float(header(head[: header.sizeof_hdr], check=False)["vox_offset"])
-            if not 0.0 <= offset <= EXTENSION_BYTES:
-                raise InputError(f"{DAMAGED_FILE} (its voxels would begin at byte {offset:g})")
-    return head
-
-
-@contextlib.contextmanager
-def _nibabel_heard() -> Iterator[list[str]]:
-    """Collect nibabel's log messages of this thread, which are then not printed."""
-    words: list[str] = []
-    thread = threading.get_ident()
-
-    def keep(record: logging.LogRecord) -> bool:
-        if record.thread != thread:
-            return True
-        if record.levelno >= logging.WARNING:
-            words.append(one_line(record.getMessage()))
-        return False
-
-    imageglobals.logger.addFilter(keep)
-    try:
-        yield words
-    finally:
-        imageglobals.logger.removeFilter(keep)
-
-
-def _notes_of_place(file: SpatialImage, head: bytes) -> list[str]:
-    """Return warnings for a header without orientation, which nibabel guesses."""
-    if isinstance(file, nibabel.MGHImage):
-        if any(head[MGH_FLAG]):
-            return []
-        return [
-            "has no orientation: its voxel sizes (1 mm), position and left/right are nibabel's "
-            "guess"
-        ]
-    header: Any = file.header
-    notes = notes_of_nifti(header, file.shape)
-    if int(header["sform_code"]) or int(header["qform_code"]):
-        return notes
-    guess = "has no orientation: position and left/right are nibabel's guess"
-    return [f"{guess}; if they matter, convert it again with its sform or qform", *notes]
-
-
-def _nibabel_file(path: Path) -> SpatialImage:
-    """Open a file of one of three formats with its header; nibabel alone would try many more."""
-    path = path.absolute()  # nibabel expands a leading ~ to the home folder
-    try:
-        if nibabel.Cifti2Image.path_maybe_image(path)[0]:
-            raise InputError("expected an image on a voxel grid, got a Cifti2Image")
-        for kind in (nibabel.Nifti1Image, nibabel.Nifti2Image, nibabel.MGHImage):
-            if kind.path_maybe_image(path)[0]:
-                return kind.from_filename(path)
-    except InputError:
-        raise
-    except FileNotFoundError as error:
-        # The file exists: nibabel looked for its suffix in another case.
-        raise InputError(
-            "nibabel cannot read a suffix in mixed case; rename it to lower case"
-        ) from error
-    except _NIBABEL_HEADER_ERRORS as error:
-        raise InputError(f"{UNREADABLE_FILE} ({one_line(error)})") from error
-    raise InputError(UNREADABLE_FILE)
-
-
-def _check_size(
-    path: Path, file: SpatialImage, volume: int, is_packed: bool, notes: list[str]
-) -> None:
-    """Raise InputError unless the file can hold all volumes up to the requested one, before
-    memory is allocated.
-    """
-    proxy: Any = file.dataobj
-    volume_bytes = math.prod(file.shape[:3]) * proxy.dtype.itemsize
-    n_bytes, size = proxy.offset + (volume + 1) * volume_bytes, path.stat().st_size
-    if min(file.shape) < 0 or n_bytes > size * (DEFLATE_RATIO if is_packed else 1):
-        raise InputError(
-            f"{DAMAGED_FILE} (its header declares {' x '.join(str(each) for each in file.shape)} "
-            "voxels, "
-            f"{n_bytes:.4g} bytes, but the file has {size})"
-        )
-    whole = proxy.offset + math.prod(file.shape[3:]) * volume_bytes
-    if is_packed:
-        size = _check_gzip(path, whole + TRAILING_BYTES)
-    elif size > whole + TRAILING_BYTES:  # its checksum would cover all of it
-        raise InputError(TOO_LONG.format(whole + TRAILING_BYTES))
-    if isinstance(file, nibabel.Nifti1Pair):  # MGH has tags there
-        notes += notes_of_rest(size - whole, file.shape, proxy.dtype.itemsize)
-
-
-def _check_gzip(path: Path, most: int) -> int:
-    """Unpack the whole file once, in blocks, and return its size: nibabel stops before the
-    checksum at its end.
-    """
-    n_bytes = 0
-    try:
-        with gzip.open(path) as stream:
-            while block := stream.read(1 << 20):
-                n_bytes += len(block)
-                if n_bytes > most:
-                    raise InputError(TOO_LONG.format(most))
-        return n_bytes
-    except (OSError, EOFError, zlib.error) as error:
-        raise _of_gzip(error) from error
-
-
-def _of_gzip(error: Exception) -> InputError:
-    if "Not a gzipped file" in str(error):
-        return InputError(
-            "not a gzip file; if it is not compressed, remove .gz (or z) from its name"
-        )
-    return InputError(f"{DAMAGED_FILE} ({one_line(error)})")
-
-
-def _units(file: SpatialImage, notes: list[str]) -> NDArray[np.float64] | None:
-    """Return the length of the file's unit, mm, for each axis; None if it states none."""
-    header: Any = file.header
-    if not isinstance(file, nibabel.Nifti1Pair):
-        return None
-    try:
-        unit = header.get_xyzt_units()[0]
-    except KeyError:
-        notes.append(
-            f"its unit of length has the unknown code {header['xyzt_units'] % 8}: assuming mm"
-        )
-        return None
-    return mm_of_axes([unit.replace("unknown", "")] * 3, "xyzt_units", notes)
+        raise InputError(f"{error.filename or path}: {words}") from error
 
 
 # Geometry of parts
@@ -894,45 +595,29 @@ def part_of(image: Image, slice_: tuple[int, int] | None, crop: Bounds | None) -
     """
     if slice_ is None:
         return image if crop is None else cropped(image, crop)
+    bounds = _box_of(image.shape, slice_, crop)
     plane = image_slice(image, *slice_)
-    if crop is None:
-        return plane
-    bounds = checked_bounds(image.shape, crop)
-    _check_in_crop(bounds, *slice_)
-    return cropped(plane, [each for axis, each in enumerate(bounds) if axis != slice_[0]])
+    return cropped(plane, bounds[: slice_[0]] + bounds[slice_[0] + 1 :])
 
 
-def _part_of_zarr(
-    level: ZarrLevel,
-    volume: int | None,
-    slice_: tuple[int, int] | None,
-    crop: Bounds | None,
-    notes: list[str],
-) -> Image:
-    """Do the same for a Zarr image, of which only this part is read."""
-    bounds = checked_bounds(level.shape, [(None, None)] * 3 if crop is None else crop)
+def _box_of(
+    shape: Sequence[int], slice_: tuple[int, int] | None, crop: Bounds | None
+) -> list[tuple[int, int]]:
+    """Return the box of indices that a crop and a slice have in common."""
+    bounds = [(0, size) for size in shape] if crop is None else checked_bounds(shape, crop)
     if slice_ is not None:
         axis, index = slice_
-        _check_slice(level.shape, axis, index)
-        _check_in_crop(bounds, axis, index)
+        _check_slice(shape, axis, index)
+        start, stop = bounds[axis]
+        if not start <= index < stop:
+            raise InputError(
+                f"slice: index {index} along axis {axis} is outside the crop {start}:{stop}"
+            )
         bounds[axis] = (index, index + 1)
-    shape, picks = [stop - start for start, stop in bounds], zarr_picks(level, volume, bounds)
-    check_room(shape, level.array.dtype.itemsize)
-    check_chunks(level, picks, notes)
-    affine = shifted_affine(level.affine, [start for start, _ in bounds])
-    part = Image(read_chunks(level, picks, math.prod(shape)), affine)
-    return part if slice_ is None else image_slice(part, slice_[0], 0)
+    return bounds
 
 
-def _check_in_crop(bounds: list[tuple[int, int]], axis: int, index: int) -> None:
-    start, stop = bounds[axis]
-    if not start <= index < stop:
-        raise InputError(
-            f"slice: index {index} along axis {axis} is outside the crop {start}:{stop}"
-        )
-
-
-def checked_bounds(shape: tuple[int, ...], bounds: Bounds) -> list[tuple[int, int]]:
+def checked_bounds(shape: Sequence[int], bounds: Bounds) -> list[tuple[int, int]]:
     """Return the bounds with open ends filled in, after checking them."""
     if len(bounds) != len(shape):
         raise InputError(f"crop: expected {len(shape)} ranges for shape {shape}, got {len(bounds)}")
@@ -946,21 +631,3 @@ def checked_bounds(shape: tuple[int, ...], bounds: Bounds) -> list[tuple[int, in
             )
         ranges.append((start, stop))
     return ranges
-
-
-def _plane_affine(columns: NDArray[np.float64], origin: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the 2-D affine (3, 3) of a plane in 3-D with voxel steps `columns` (3, 2) and first
-    voxel `origin`, mm.
-    """
-    if not np.isfinite(columns).all():
-        raise InputError(f"affine: expected finite entries, got {columns.tolist()}")
-    spanned = np.flatnonzero(columns.any(axis=1))
-    if len(spanned) == 2:  # the plane of two world axes keeps their coordinates
-        frame = np.eye(3)[:, spanned]
-    else:
-        frame, _ = np.linalg.qr(columns)
-        frame *= np.sign(frame[np.abs(frame).argmax(axis=0), [0, 1]])
-    affine = np.eye(3)
-    affine[:2, :2] = frame.T @ columns
-    affine[:2, 2] = frame.T @ origin
-    return affine

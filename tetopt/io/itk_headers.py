@@ -26,7 +26,6 @@ from tetopt.io.volumes import (
 from tetopt.system.incoming import irregular
 
 NRRD_SUFFIXES = (".nrrd", ".nhdr")
-HEADED_SUFFIXES = (*NRRD_SUFFIXES, ".mha", ".mhd")  # files whose headers are read here
 HEADER_BYTES = 2**20  # at most in a header: 3D Slicer's long ones have 10,000
 MOST_AXES = 8  # more than space, time and components
 TEXT_RATIO = 4  # "0 " becomes 8 bytes

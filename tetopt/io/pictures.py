@@ -22,9 +22,7 @@ PHOTOMETRIC_TAG = 262  # 0 if 0 is white
 MOST_PIXELS = 2**30  # in a frame: 32,768 squared, more than any slide scanner's plain picture
 
 
-def read_picture(
-    path: Path, volume: int | None, _notes: list[str]
-) -> tuple[NDArray, NDArray[np.float64]]:
+def read_picture(path: Path, volume: int | None) -> tuple[NDArray, NDArray[np.float64]]:
     """Return grey values (rows, columns) and affine of a frame; InputError without a leading
     path.
     """

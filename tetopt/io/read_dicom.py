@@ -26,12 +26,19 @@ from tetopt.errors import InputError
 from tetopt.io.apart import read_apart
 from tetopt.io.text import plain
 from tetopt.io.units import notes_of_size
-from tetopt.io.volumes import UNREADABLE_FILE, check_room, exact_type, one_line, volume_index
+from tetopt.io.volumes import (
+    UNREADABLE_FILE,
+    Reader,
+    Request,
+    check_room,
+    exact_type,
+    one_line,
+    volume_index,
+)
 from tetopt.model.labels import LabelTable
 from tetopt.system.extras import install_hint
 from tetopt.system.incoming import irregular
 
-DICOM_SUFFIX = ".dcm"
 # Slices may deviate from an even spacing by this fraction of it, because positions are often
 # rounded.
 _UNEVEN_FRACTION = 0.05
@@ -116,14 +123,24 @@ class FrameGrid(NamedTuple):
 
 
 def read_dicom(
-    path: Path, volume: int | None, notes: list[str]
+    path: Path, request: Request, notes: list[str]
 ) -> tuple[NDArray, NDArray[np.float64]]:
     """Return data and affine of a file, or of the one series in a folder; InputError without a
     leading path.
     """
-    data, affine, words = _read(image_of, path, volume)
+    data, affine, words = _read(image_of, path, request.volume)
     notes += words + notes_of_size(data.shape, affine, np.ones(3))  # DICOM's unit is the mm
     return data, affine
+
+
+def _is_dicom_source(path: Path) -> bool:
+    """Return whether to read a path as DICOM: any folder, and files with its mark, as scanners name
+    files without a suffix.
+    """
+    return path.is_dir() or is_dicom(path)
+
+
+DICOM = Reader((".dcm",), read_dicom, is_this=_is_dicom_source)
 
 
 def read_segments_table(path: Path) -> LabelTable:

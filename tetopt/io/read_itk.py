@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 from tetopt.io.apart import read_apart
 from tetopt.io.contradictions import notes_of_metaimage, notes_of_nrrd, notes_of_rest
-from tetopt.io.itk_headers import NRRD_SUFFIXES, checked_header
+from tetopt.io.itk_headers import NRRD_SUFFIXES, checked_header, data_files, header_sizes
 from tetopt.io.segments import labels_of_layers, segments_of
 from tetopt.io.units import mm_of_axes, notes_of_size
-from tetopt.io.volumes import UNREADABLE_FILE, one_line, volume_index
+from tetopt.io.volumes import UNREADABLE_FILE, Reader, Request, one_line, volume_index
 from tetopt.system.extras import install_hint
 
 # ITK chooses its reader by the case-sensitive suffix; naming the reader also opens SCAN.MHA.
@@ -33,9 +33,7 @@ ITK_READERS = {
 SPATIAL_KINDS = ("domain", "space", "???", "none")
 
 
-def read_itk(
-    path: Path, volume: int | None, notes: list[str]
-) -> tuple[NDArray, NDArray[np.float64]]:
+def read_itk(path: Path, request: Request, notes: list[str]) -> tuple[NDArray, NDArray[np.float64]]:
     """Return data and affine of a file; InputError without a leading path."""
     _check_installed()
     header, size = checked_header(path)
@@ -55,7 +53,7 @@ def read_itk(
     data, affine = read_apart(
         _volume_of,
         path,
-        volume,
+        request.volume,
         bool(segments),
         size=size,
         value_bytes=header.value_bytes,
@@ -67,6 +65,9 @@ def read_itk(
     affine[:n] *= 1.0 if lengths is None else lengths[:n, None]
     notes += about + notes_of_size(data.shape, affine, lengths)
     return data, affine
+
+
+ITK = Reader(tuple(ITK_READERS), read_itk, shape=header_sizes, other_files=data_files)
 
 
 def _nrrd_units(fields: dict[str, str], notes: list[str]) -> NDArray[np.float64] | None:

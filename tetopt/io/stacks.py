@@ -27,7 +27,7 @@ from tetopt.io.pictures import MOST_PIXELS, PICTURE_SUFFIXES, frame_of, read_pic
 from tetopt.io.read_dicom import is_dicom
 from tetopt.io.text import plain
 from tetopt.io.units import mm_of_unit
-from tetopt.io.volumes import UNREADABLE_FILE, check_room, exact_type, one_line
+from tetopt.io.volumes import UNREADABLE_FILE, Reader, Request, check_room, exact_type, one_line
 from tetopt.system.extras import install_hint
 from tetopt.system.incoming import irregular
 
@@ -102,22 +102,22 @@ class Tiff(NamedTuple):
 
 
 def read_pictures(
-    path: Path, volume: int | None, notes: list[str], spacing_mm: float | Sequence[float] | None
+    path: Path, request: Request, notes: list[str]
 ) -> tuple[NDArray, NDArray[np.float64]]:
     """Return data and affine of a picture, or of a TIFF file's stack of pages; InputError
     without a leading path.
     """
     tiff = Tiff(None)
     if path.name.lower().endswith(TIFF_SUFFIXES) and _has_tifffile():
-        is_page = volume is not None
+        is_page = request.volume is not None
         tiff = Tiff(
             *read_apart(_stack_of, path, is_page, value_bytes=MOST_PIXELS, library="tifffile")
         )
     notes += tiff.notes
     n = 2 if tiff.voxels is None else 3
-    steps = _steps(tiff, n, spacing_mm, notes)
+    steps = _steps(tiff, n, request.spacing_mm, notes)
     if tiff.voxels is None:
-        data, affine = read_picture(path, volume, notes)
+        data, affine = read_picture(path, request.volume)
         affine[:2] *= 1.0 if steps is None else steps[:, None]
         return _scaled(data, tiff.scale), affine
     if steps is None:
@@ -126,19 +126,19 @@ def read_pictures(
 
 
 def read_slices(
-    path: Path, names: list[str], notes: list[str], spacing_mm: float | Sequence[float] | None
+    path: Path, request: Request, notes: list[str]
 ) -> tuple[NDArray, NDArray[np.float64]]:
     """Return data and affine of a folder of slices, in their order; InputError without a leading
     path.
     """
-    series, said = _series(names)
+    series, said = _series(slice_files(path))
     size = sum((path / name).stat().st_size for name in series)
     tiff = Tiff(
         *read_apart(
             _slices_of,
             path,
             series,
-            spacing_mm is not None,
+            request.spacing_mm is not None,
             size=size,
             value_bytes=MOST_PIXELS,
             library="Pillow",
@@ -146,9 +146,13 @@ def read_slices(
     )
     notes += [*said, *tiff.notes]
     assert tiff.voxels is not None
-    steps = _steps(tiff, 3, spacing_mm, notes)
+    steps = _steps(tiff, 3, request.spacing_mm, notes)
     assert steps is not None
     return _scaled(tiff.voxels, tiff.scale), _affine(steps)
+
+
+PICTURES = Reader(PICTURE_SUFFIXES, read_pictures, has_spacing=False)
+SLICES = Reader((), read_slices, is_this=lambda path: bool(slice_files(path)), has_spacing=False)
 
 
 def _has_tifffile() -> bool:
@@ -197,7 +201,7 @@ def slice_files(path: Path) -> list[str]:
     may show.
     """
     names = []
-    for file in path.iterdir():
+    for file in path.iterdir() if path.is_dir() else ():
         if file.name.startswith(".") or irregular(file) is not None:
             continue
         if file.name.lower().endswith(PICTURE_SUFFIXES):

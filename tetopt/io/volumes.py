@@ -1,12 +1,16 @@
-"""Shared code of image readers: choice of a volume, and messages about damaged files."""
+"""Shared code of image readers: a format's row in their table, choice of a volume, and messages
+about damaged files.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.system.budget import check_memory
@@ -21,6 +25,52 @@ TOO_LONG = f"{DAMAGED_FILE} (it continues far after the last voxel, beyond byte 
 UNREADABLE_FILE = (
     "truncated or damaged, or not an image of this kind; copy it again, or check its name"
 )
+
+
+class Request(NamedTuple):
+    """The part of a file to read, and voxel sizes for files that state none."""
+
+    volume: int | None
+    spacing_mm: float | Sequence[float] | None
+    box: Callable[[Sequence[int]], list[tuple[int, int]]]  # of a volume with this shape
+
+
+def _no_files(_path: Path) -> list[Path]:
+    return []
+
+
+class Reader(NamedTuple):
+    """A format of images: a row of the table in `tetopt.io.images`, from the module that reads it.
+
+    Functions raise InputError without a leading path.
+
+    Parameters
+    ----------
+    suffixes : tuple of str
+        Its files end in one of these, in any case.
+    read : function
+        Returns data and affine for a path and a `Request`, 2-D or 3-D, and adds notes to a list.
+    is_this : function, optional
+        Returns whether a folder, or a file with no reader's suffix, has this format.
+    shape : function, optional
+        Returns the lengths of all axes from the header, the spatial ones first; by default None, as
+        all would have to be read.
+    other_files : function, optional
+        Returns the files that belong to a file.
+    has_spacing : bool
+        Whether the format states voxel sizes.
+    reads_crop, reads_slice : bool
+        Whether it reads only the request's box for a crop, and for a slice.
+    """
+
+    suffixes: tuple[str, ...]
+    read: Callable[[Path, Request, list[str]], tuple[NDArray, NDArray[np.float64]]]
+    is_this: Callable[[Path], bool] = lambda _path: False
+    shape: Callable[[Path], tuple[int, ...] | None] = lambda _path: None
+    other_files: Callable[[Path], list[Path]] = _no_files
+    has_spacing: bool = True
+    reads_crop: bool = False
+    reads_slice: bool = False
 
 
 def volume_index(trailing: Sequence[int], volume: int | None, axes: str = "") -> tuple[int, ...]:
@@ -77,3 +127,21 @@ def exact_type(bits: int, scales: Iterable[tuple[float, float]]) -> type[np.floa
 def one_line(words: object) -> str:
     """Format a library's text on one line."""
     return " ".join(str(words).split())
+
+
+def plane_affine(columns: NDArray[np.float64], origin: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the 2-D affine (3, 3) of a plane in 3-D with voxel steps `columns` (3, 2) and first
+    voxel `origin`, mm.
+    """
+    if not np.isfinite(columns).all():
+        raise InputError(f"affine: expected finite entries, got {columns.tolist()}")
+    spanned = np.flatnonzero(columns.any(axis=1))
+    if len(spanned) == 2:  # the plane of two world axes keeps their coordinates
+        frame = np.eye(3)[:, spanned]
+    else:
+        frame, _ = np.linalg.qr(columns)
+        frame *= np.sign(frame[np.abs(frame).argmax(axis=0), [0, 1]])
+    affine = np.eye(3)
+    affine[:2, :2] = frame.T @ columns
+    affine[:2, 2] = frame.T @ origin
+    return affine

@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from tetopt.errors import InputError
-from tetopt.image import check_kind, checked_affine
+from tetopt.image import check_kind, checked_affine, shifted_affine
 from tetopt.io.apart import read_apart
 from tetopt.io.text import plain
 from tetopt.io.units import mm_of_axes, notes_of_size
-from tetopt.io.volumes import one_line, volume_index
+from tetopt.io.volumes import Reader, Request, check_room, one_line, volume_index
 from tetopt.system.budget import check_memory
 from tetopt.system.extras import install_hint
 from tetopt.system.files import folder_written_whole
@@ -106,6 +106,35 @@ def image_folder(level: Path) -> Path | None:
 def is_node(path: Path) -> bool:
     """Return whether a folder is a Zarr array or group, by its contents."""
     return any((path / name).exists() for name in NODE_FILES)
+
+
+def read_zarr(
+    path: Path, request: Request, notes: list[str]
+) -> tuple[NDArray, NDArray[np.float64]]:
+    """Return data and affine of the requested box of the finest level, of which nothing else is
+    read.
+    """
+    level = zarr_levels(path, notes)[0]
+    bounds = request.box(level.shape)
+    shape, picks = (
+        [stop - start for start, stop in bounds],
+        zarr_picks(level, request.volume, bounds),
+    )
+    check_room(shape, level.array.dtype.itemsize)
+    check_chunks(level, picks, notes)
+    affine = shifted_affine(level.affine, [start for start, _ in bounds])
+    return read_chunks(level, picks, math.prod(shape)), affine
+
+
+def zarr_shape(path: Path) -> tuple[int, ...]:
+    """Return the number of voxels along the three spatial axes, then the lengths of the others."""
+    level = zarr_levels(path, [])[0]
+    return (*level.shape, *(int(level.array.shape[axis]) for axis in level.others))
+
+
+ZARR = Reader(
+    (ZARR_SUFFIX,), read_zarr, is_this=is_zarr, shape=zarr_shape, reads_crop=True, reads_slice=True
+)
 
 
 def zarr_picks(

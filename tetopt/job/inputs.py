@@ -32,11 +32,11 @@ from tetopt.errors import InputError, Remark
 from tetopt.image import Image
 from tetopt.io.images import (
     file_shape,
-    has_own_spacing,
     load_image,
     parse_crop,
     parse_slice,
     part_of,
+    reader_of,
     sha256,
 )
 from tetopt.io.label_tables import LabelTable, load_label_table, own_label_table
@@ -222,7 +222,8 @@ def read_companion(path: Path, spacing_mm: str | None = None) -> Image:
     Voxel sizes are for a stack or folder of slices; files of other formats have their own.
     """
     file, volume = file_and_volume(path)
-    spacing = None if spacing_mm is None or has_own_spacing(file) else parse_spacing(spacing_mm)
+    has_own = spacing_mm is None or reader_of(file).has_spacing
+    spacing = None if has_own else parse_spacing(spacing_mm)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Remark)
         return load_image(file, volume=volume, spacing_mm=spacing)

@@ -1,0 +1,328 @@
+"""Reading of NIfTI, as single files and as pairs (.hdr, .img), and of MGH, plain or in gzip.
+
+nibabel reads the headers and scales the voxels. Files are opened here, so that sizes are checked
+before memory is allocated, and a gzip file is unpacked only once, to the checksum at its end.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gzip
+import io
+import logging
+import math
+import re
+import threading
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import nibabel
+import numpy as np
+from nibabel import imageglobals
+from nibabel.arrayproxy import ArrayProxy
+from nibabel.freesurfer.mghformat import MGHError, MGHHeader
+from nibabel.nifti1 import Nifti1PairHeader
+from nibabel.nifti2 import Nifti2PairHeader
+from nibabel.spatialimages import HeaderDataError
+from nibabel.wrapstruct import WrapStructError
+from numpy.typing import NDArray
+
+from tetopt.errors import InputError
+from tetopt.image import shifted_affine
+from tetopt.io.apart import DEFLATE_RATIO
+from tetopt.io.contradictions import notes_of_nifti, notes_of_rest
+from tetopt.io.units import mm_of_axes, notes_of_size
+from tetopt.io.volumes import (
+    DAMAGED_FILE,
+    TOO_LONG,
+    TRAILING_BYTES,
+    UNREADABLE_FILE,
+    Reader,
+    Request,
+    check_room,
+    one_line,
+    plane_affine,
+    volume_index,
+)
+from tetopt.system.incoming import irregular
+
+NIFTI_HEAD_BYTES = 1024  # read from a file: the longest header has 540
+ANALYZE_BYTES = (
+    b"\x5c\x01\0\0",
+    b"\0\0\x01\x5c",
+)  # 348, the length of an Analyze header, at its start
+EXTENSION_BYTES = 2**26  # 67 MB before the voxels: a NIfTI file's extensions are texts
+PLANES_BYTES = 2**28  # of a file, read at a time for a crop of it
+MGH_FLAG = slice(28, 30)  # the bytes of an MGH header that are 0 if it has no sizes and directions
+CIFTI_INTENTS = range(3000, 3100)  # of NIfTI-2 files without a grid of voxels
+PACKED_SUFFIXES = (".gz", ".mgz")
+PAIR = re.compile(r"(.*)\.(hdr|img)(\.gz)?", re.IGNORECASE | re.DOTALL)
+HEADER_KINDS = {
+    ".nii": (nibabel.Nifti1Header, nibabel.Nifti2Header),
+    ".hdr": (Nifti1PairHeader, Nifti2PairHeader),
+    ".mgh": (MGHHeader,),
+    ".mgz": (MGHHeader,),
+}
+# Errors for damaged files.
+FILE_ERRORS = (OSError, EOFError, zlib.error)
+DATA_ERRORS = (*FILE_ERRORS, ValueError, TypeError, OverflowError)
+HEADER_ERRORS = (*DATA_ERRORS, KeyError, HeaderDataError, WrapStructError, MGHError)
+
+
+def read_nibabel(
+    path: Path, request: Request, notes: list[str]
+) -> tuple[NDArray, NDArray[np.float64]]:
+    """Return data and affine, 2-D or 3-D; InputError without a leading path."""
+    header_file, voxel_file = _files_of(path)
+    with _nibabel_heard() as words:
+        header, head = _header_of(header_file)
+    notes += [
+        f"nibabel repaired its header ({word}); check its voxel sizes and position"
+        for word in words
+    ]
+    shape = tuple(int(size) for size in header.get_data_shape())
+    notes += _notes_of_place(header, shape, head)
+    lengths = _units(header, notes)
+    affine = np.array(header.get_best_affine(), dtype=np.float64)
+    affine[:3] *= 1.0 if lengths is None else lengths[:, None]
+    notes += notes_of_size(shape, affine, lengths)
+    volume_index(shape[3:], request.volume)
+    bounds = request.box(shape[:3])
+    data = _voxels(voxel_file, header, shape, request.volume or 0, bounds, notes)
+    start = [first for first, _ in bounds]
+    affine = shifted_affine(affine, start + [0] * (3 - len(start))) if any(start) else affine
+    if data.ndim == 2:
+        return data, plane_affine(affine[:3, :2], affine[:3, 3])
+    return data, affine
+
+
+def nibabel_shape(path: Path) -> tuple[int, ...]:
+    """Return the lengths of all axes in the header."""
+    with _nibabel_heard():
+        header, _ = _header_of(_files_of(path)[0])
+    return tuple(int(size) for size in header.get_data_shape())
+
+
+def other_file(path: Path) -> list[Path]:
+    """Return the other file of a pair; empty for single files.
+
+    Raises
+    ------
+    InputError
+        Without a leading path: it is missing.
+    """
+    match = PAIR.fullmatch(path.name)
+    if match is None:
+        return []
+    stem, kind, packed = match[1], match[2].lower(), (match[3] or "").lower()
+    other = "img" if kind == "hdr" else "hdr"
+    # With the same packing first; of .IMG, .HDR.
+    for suffix in (f".{other}{packed}", f".{other}", f".{other}.gz"):
+        for name in (stem + suffix, stem + suffix.upper()):
+            if (file := path.with_name(name)).exists():
+                if (what := irregular(file)) is not None:
+                    raise InputError(f'its other file "{name}" is {what}; expected a regular file')
+                return [file]
+    has = "voxels" if other == "img" else "header, with its place and voxel sizes,"
+    raise InputError(
+        f"expected two files: its {has} should be in {stem}.{other} (or {stem}.{other}.gz) next "
+        "to it; copy both"
+    )
+
+
+NIFTI = Reader(
+    (".nii.gz", ".nii", ".mgz", ".mgh", ".hdr", ".img", ".hdr.gz", ".img.gz"),
+    read_nibabel,
+    shape=nibabel_shape,
+    other_files=other_file,
+    reads_crop=True,
+)
+
+
+def _files_of(path: Path) -> tuple[Path, Path]:
+    """Return the file with the header and the file with the voxels."""
+    files = [path, *other_file(path)]
+    if ".hdr" not in path.name.lower()[-7:]:
+        files.reverse()
+    return files[0], files[-1]
+
+
+def _opened(path: Path) -> Any:
+    return gzip.open(path) if path.name.lower().endswith(PACKED_SUFFIXES) else path.open("rb")
+
+
+def _header_of(path: Path) -> tuple[Any, bytes]:
+    """Return nibabel's header, checked and repaired, and the first bytes of the file."""
+    try:
+        with _opened(path) as stream:
+            head = stream.read(NIFTI_HEAD_BYTES)
+    except FILE_ERRORS as error:
+        raise _of_gzip(error) from error
+    suffix = path.name.lower().removesuffix(".gz")[-4:]
+    try:
+        for kind in HEADER_KINDS[suffix]:
+            if kind is not MGHHeader and not kind.may_contain_header(head):
+                continue
+            # Extensions are not read: only their length matters.
+            header = kind.from_fileobj(io.BytesIO(head[: kind.template_dtype.itemsize]))
+            if kind is not MGHHeader:
+                _check_nifti(header)
+            return header, head
+    except InputError:
+        raise
+    except HEADER_ERRORS as error:
+        raise InputError(f"{UNREADABLE_FILE} ({one_line(error)})") from error
+    if suffix == ".hdr" and head.startswith(ANALYZE_BYTES):
+        raise InputError(
+            "an Analyze 7.5 image, whose format does not tell left from right; convert it to "
+            "NIfTI with a program that knows its orientation"
+        )
+    raise InputError(UNREADABLE_FILE)
+
+
+def _check_nifti(header: Any) -> None:
+    is_cifti = int(header["intent_code"]) in CIFTI_INTENTS
+    if is_cifti and isinstance(header, nibabel.Nifti2Header):
+        raise InputError("expected an image on a voxel grid, got a Cifti2Image")
+    offset = float(header["vox_offset"])
+    if not 0.0 <= offset <= EXTENSION_BYTES:
+        raise InputError(f"{DAMAGED_FILE} (its voxels would begin at byte {offset:g})")
+
+
+@contextlib.contextmanager
+def _nibabel_heard() -> Iterator[list[str]]:
+    """Collect nibabel's log messages of this thread, which are then not printed."""
+    words: list[str] = []
+    thread = threading.get_ident()
+
+    def keep(record: logging.LogRecord) -> bool:
+        if record.thread != thread:
+            return True
+        if record.levelno >= logging.WARNING:
+            words.append(one_line(record.getMessage()))
+        return False
+
+    imageglobals.logger.addFilter(keep)
+    try:
+        yield words
+    finally:
+        imageglobals.logger.removeFilter(keep)
+
+
+def _notes_of_place(header: Any, shape: tuple[int, ...], head: bytes) -> list[str]:
+    """Return warnings for a header without orientation, which nibabel guesses."""
+    if isinstance(header, MGHHeader):
+        if any(head[MGH_FLAG]):
+            return []
+        return [
+            "has no orientation: its voxel sizes (1 mm), position and left/right are nibabel's "
+            "guess"
+        ]
+    notes = notes_of_nifti(header, shape)
+    if int(header["sform_code"]) or int(header["qform_code"]):
+        return notes
+    guess = "has no orientation: position and left/right are nibabel's guess"
+    return [f"{guess}; if they matter, convert it again with its sform or qform", *notes]
+
+
+def _units(header: Any, notes: list[str]) -> NDArray[np.float64] | None:
+    """Return the length of the file's unit, mm, for each axis; None if it states none."""
+    if isinstance(header, MGHHeader):
+        return None
+    try:
+        unit = header.get_xyzt_units()[0]
+    except KeyError:
+        notes.append(
+            f"its unit of length has the unknown code {header['xyzt_units'] % 8}: assuming mm"
+        )
+        return None
+    return mm_of_axes([unit.replace("unknown", "")] * 3, "xyzt_units", notes)
+
+
+def _voxels(
+    path: Path,
+    header: Any,
+    shape: tuple[int, ...],
+    volume: int,
+    bounds: list[tuple[int, int]],
+    notes: list[str],
+) -> NDArray:
+    """Return the scaled values of a box of a volume; InputError unless the file can hold all up to
+    this volume, before memory is allocated.
+    """
+    dtype, offset, size = (
+        header.get_data_dtype(),
+        int(header.get_data_offset()),
+        path.stat().st_size,
+    )
+    volume_bytes = math.prod(shape[:3]) * dtype.itemsize
+    whole = offset + math.prod(shape[3:]) * volume_bytes
+    begin = offset + volume * volume_bytes
+    end, is_packed = begin + volume_bytes, path.name.lower().endswith(PACKED_SUFFIXES)
+    too_short = InputError(
+        f"{DAMAGED_FILE} (its header declares {' x '.join(map(str, shape))} voxels, {end:.4g} "
+        f"bytes, but the file has {size})"
+    )
+    if min(shape) < 0 or end > size * (DEFLATE_RATIO if is_packed else 1):
+        raise too_short
+    # The planes of the box are read, or of a 2-D image its columns.
+    first, last = bounds[-1]
+    sides = (*shape[: len(bounds) - 1], last - first)
+    step = math.prod(sides[:-1]) * dtype.itemsize
+    check_room(sides if is_packed else [stop - start for start, stop in bounds], dtype.itemsize)
+    begin += first * step
+    if is_packed:
+        size, source = _unpacked(path, begin, begin + (last - first) * step, whole + TRAILING_BYTES)
+        begin = 0
+    else:
+        source = str(path.absolute())  # nibabel expands a leading ~ to the home folder
+    if size > whole + TRAILING_BYTES:  # its checksum would cover all of it
+        raise InputError(TOO_LONG.format(whole + TRAILING_BYTES))
+    if end > size:
+        raise too_short
+    if not isinstance(header, MGHHeader):  # MGH has tags there
+        notes += notes_of_rest(size - whole, shape, dtype.itemsize)
+    try:
+        slope, inter = header.get_slope_inter()
+        scale = (1.0 if slope is None else slope, 0.0 if inter is None else inter)
+        proxy = ArrayProxy(source, (sides, dtype, begin, *scale))
+        if sides == tuple(stop - start for start, stop in bounds):
+            return np.asanyarray(proxy)
+        within = tuple(slice(*ends) for ends in bounds[:-1])
+        n_planes = max(PLANES_BYTES // step, 1)
+        parts = [
+            np.asanyarray(proxy[..., k : k + n_planes])[within]
+            for k in range(0, last - first, n_planes)
+        ]
+        return np.concatenate(parts, axis=-1)
+    except MemoryError as error:
+        raise InputError("its voxels do not fit into memory; crop it to fewer") from error
+    except (*DATA_ERRORS, HeaderDataError) as error:
+        raise InputError(f"{DAMAGED_FILE} ({one_line(error)})") from error
+
+
+def _unpacked(path: Path, begin: int, end: int, most: int) -> tuple[int, io.BytesIO]:
+    """Unpack a gzip file to its end, in blocks; return its size and its bytes from `begin` to
+    `end`.
+
+    Nothing is kept of the rest, and nothing is unpacked beyond `most`.
+    """
+    n_bytes, part = 0, io.BytesIO()
+    try:
+        with gzip.open(path) as stream:
+            while n_bytes <= most and (block := stream.read(1 << 20)):
+                part.write(block[max(begin - n_bytes, 0) : max(end - n_bytes, 0)])
+                n_bytes += len(block)
+        return n_bytes, part
+    except FILE_ERRORS as error:
+        raise _of_gzip(error) from error
+
+
+def _of_gzip(error: Exception) -> InputError:
+    if "Not a gzipped file" in str(error):
+        return InputError(
+            "not a gzip file; if it is not compressed, remove .gz (or z) from its name"
+        )
+    return InputError(f"{DAMAGED_FILE} ({one_line(error)})")
