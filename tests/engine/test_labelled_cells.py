@@ -8,16 +8,16 @@ import tetopt
 from tetopt.contents.content import content
 from tetopt.energy.discretization import combined
 from tetopt.energy.sampling import channel_grid, from_ticks
-from tetopt.engine.complex import cell_squares, energies, interface_energy, node_stars, remeasure
+from tetopt.engine.complex import cell_squares, energies, node_stars, remeasure
 from tetopt.engine.density import Limits, _put_middle, best_splits, exchange, roomy, worth_of_split
 from tetopt.engine.flips import flip
 from tetopt.engine.interfaces import with_labels
+from tetopt.engine.labelling import label_voxels
 from tetopt.engine.loop import GRADED_K_D
 from tetopt.engine.repair import repair
-from tetopt.engine.smooth import attract, blocks, star_tension, sweep
+from tetopt.engine.smooth import attract, blocks, sweep
 from tetopt.engine.state import state_of, with_min_dihedral
 from tetopt.engine.surface import combined_ways, constraint_values
-from tetopt.errors import InputError
 from tetopt.measure.interfaces import label_interfaces
 
 
@@ -40,6 +40,12 @@ def quarters(n=20):
 CASES = {"balls": ball_in_ball(), "quarters": quarters()}
 
 
+def voxels_of(target):
+    """Information on the voxels of a content's labels."""
+    members = target.memberships
+    return label_voxels(members.partition, target.image.spacing, len(members.labels), members.parts)
+
+
 @pytest.fixture(scope="module")
 def labelled_state():
     """A state with labels, some moves on, of each case; a function, as tests change it."""
@@ -49,7 +55,7 @@ def labelled_state():
         mesh = tetopt.octree_mesh(target, nodes)
         grid = channel_grid(target, mesh.points)
         state = with_min_dihedral(state_of(target, mesh, grid, 0.85, is_graded=True), 12.0)
-        return with_labels(state, target, target.smooth, mesh), target, grid
+        return with_labels(state, target, target.smooth, mesh, voxels_of(target)), target, grid
 
     return made
 
@@ -160,7 +166,7 @@ def test_splits_are_the_best_of_all_edges(has_mask, has_labels):
     mesh = tetopt.octree_mesh(target, 200)
     state = state_of(target, mesh, channel_grid(target, mesh.points), 0.85, is_graded=True)
     if has_labels:
-        state = with_labels(state, target, target.smooth, mesh)
+        state = with_labels(state, target, target.smooth, mesh, voxels_of(target))
     N, stars = len(state.complex.ticks), node_stars(state)
     room, x = roomy(state, N, 0), np.empty((4, 3))
     splits = best_splits(
@@ -217,17 +223,13 @@ def test_nodes_do_not_meet_on_the_way_to_a_surface(labelled_state, name):
 
 
 def test_energy_falls_with_labels(labelled_state):
-    """Sweeps and flips never raise E, tension and voxels of other labels with it."""
+    """Sweeps and flips never raise E, voxels of other labels with it."""
     state, _, _ = labelled_state("balls")
     state = MOVES["attract"](state)
 
     def E():
         E_G, squares = energies(state)
-        return (
-            state.objective.geometry * E_G
-            + state.objective.image * squares
-            + interface_energy(state)
-        )
+        return state.objective.geometry * E_G + state.objective.image * squares
 
     last = E()
     for move in ("sweep", "flip", "sweep", "flip"):
@@ -248,30 +250,6 @@ def test_squares_count_voxels_of_other_labels(labelled_state):
         cell_squares(state), np.bincount(owner, cost, len(mesh.cells)), rtol=1e-9, atol=1e-6
     )
     assert cost.sum() > 0.0
-
-
-def test_interface_energy_is_the_area_between_labels(labelled_state):
-    state, target, grid = labelled_state("quarters")
-    mesh, _, _ = parts(state, target, grid)
-    shared, labels, value = (
-        tetopt.geometry.topology.facets(mesh.cells),
-        state.complex.labels,
-        target.smooth.own_value.astype(float) ** 2,
-    )
-    inner = shared.cells[(shared.cells >= 0).all(axis=1)]
-    total = 0.0
-    for one, other in inner[labels[inner[:, 0]] != labels[inner[:, 1]]]:
-        a, b, c = mesh.points[np.intersect1d(mesh.cells[one], mesh.cells[other])]
-        total += (
-            (value[labels[one]] + value[labels[other]])
-            * 0.5
-            * np.linalg.norm(np.cross(b - a, c - a))
-        )
-    assert interface_energy(state) == pytest.approx(state.objective.tension * total, rel=1e-12)
-    stars = node_stars(state)
-    each = sum(star_tension(state, stars, node) for node in range(len(mesh.points)))
-    # each facet has three nodes
-    assert each == pytest.approx(3.0 * interface_energy(state), rel=1e-12)
 
 
 @pytest.mark.kernel
@@ -347,7 +325,7 @@ def test_same_bits_on_any_number_of_threads():
 
 @pytest.mark.full
 def test_E_of_the_history_is_comparable_throughout():
-    """Eq. (4) in every row, also where cells have labels, whose tension moves lower as well."""
+    """Eq. (4) in every row, also where cells have labels, whose own values moves follow."""
     phantom = tetopt.load_phantom("sphere")
     what = tetopt.content(phantom.image(voxel_mm=4), phantom.label_image(voxel_mm=4))
     result = tetopt.mesh_image(what, 300, iterations=4)
@@ -392,7 +370,7 @@ def test_thick_slices_do_not_show():
     assert row.folded < 0.08
     assert row.area == pytest.approx(4.0 * np.pi * 11.5**2, rel=0.08)
     rough = tetopt.mesh_image(
-        content(thick, labels=thick, weights=[0.0], smooth_interfaces=0.0), 1200, iterations=8
+        content(thick, labels=thick, weights=[0.0], smooth_interfaces=False), 1200, iterations=8
     )
     assert rough.labels is None
     before = label_interfaces(thick, rough.mesh, tetopt.cell_labels(thick, rough.mesh))[1]
@@ -433,6 +411,7 @@ def test_collapses_keep_labels_as_small_as_a_cell(labelled_state):
         target,
         target.smooth,
         mesh,
+        voxels_of(target),
     )
     before = None
     for move in ("attract", "sweep", "flip", "exchange"):
@@ -466,9 +445,3 @@ def test_the_minimum_dihedral_angle_within_a_mask():
     mask = tetopt.Image((np.linalg.norm(at, axis=-1) < 5.2).astype(float))
     result = tetopt.mesh_image(content(image, labels=image, mask=mask, weights=[0.0]), 300)
     assert tetopt.quality(result.mesh.points, result.mesh.cells).min_dihedral >= 12.0
-
-
-@pytest.mark.parametrize("tension", [-0.1, 11.0, np.nan])
-def test_refused(tension):
-    with pytest.raises(InputError, match="smooth_interfaces: expected 0 to 10 voxels"):
-        content(CASES["balls"], labels=CASES["balls"], smooth_interfaces=tension)

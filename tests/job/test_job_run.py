@@ -49,7 +49,7 @@ def inputs(tmp_path_factory):
 KINDS = {
     "image": ("a.nii.gz", {}),
     "mask": ("a.nii.gz", {"mask": "m.nii.gz", "keep_components": True}),
-    "labels": ("a.nii.gz", {"labels": "l.nii.gz", "smooth_interfaces": 0.2}),
+    "labels": ("a.nii.gz", {"labels": "l.nii.gz", "free_volumes": True}),
     "contrasts": (["a.nii.gz", "b.nii.gz"], {"weights": [1.0, 0.5]}),
     "order 2": ("a.nii.gz", {"order": 2, "nodes": 300}),
     "start": ("a.nii.gz", {"start": "s.vtu", "nodes": None}),

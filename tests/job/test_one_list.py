@@ -45,7 +45,7 @@ def failing(*_):
 
 
 CASES = {
-    "labels": (["--labels", "l.nii.gz", *COARSE, "--smooth-interfaces", "0"], None),  # lost
+    "labels": (["--labels", "l.nii.gz", *COARSE, "--no-smooth-interfaces"], None),  # lost
     "contacts": (["--labels", "l.nii.gz", *COARSE], "label_contacts"),  # a measurement that fails
     "error": (["--target-error", "1e-4", "--size-min", "20", "--iterations", "1"], None),
 }

@@ -27,7 +27,7 @@ VALUES = {
     "background": "-5",
     "labels": Path("/l.nii"),
     "weights": "1,2",
-    "smooth_interfaces": 0.25,
+    "smooth_interfaces": False,
     "label_weight": 2.0,
     "volume": 1,
     "crop": "1:9,:,:",

@@ -35,7 +35,6 @@ PARAMETER_OPTIONS = {  # by parameters of the library's functions, the command l
             "shape_power",
             "target_error",
             "label_weight",
-            "smooth_interfaces",
             "n_t",
             "retessellate",
             "gradation",

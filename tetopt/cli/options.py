@@ -133,7 +133,7 @@ def from_records(command: Callable[..., int]) -> Callable[..., int]:
             name,
             inspect.Parameter.KEYWORD_ONLY,
             default=default,
-            annotation=_typed(name, kind, panel),
+            annotation=_typed(name, kind, default, panel),
         )
         for name, kind, default, panel in leaves
     ]
@@ -170,7 +170,7 @@ def _panel_of(record: type, name: str) -> str | None:
     return next((each.panel for each in bringing if hasattr(each, "panel")), None)
 
 
-def _typed(name: str, kind: Any, panel: str | None) -> Any:
+def _typed(name: str, kind: Any, default: Any, panel: str | None) -> Any:
     """Return the annotation for typer, with the option's help panel; arguments have a panel of
     their own.
     """
@@ -180,7 +180,9 @@ def _typed(name: str, kind: Any, panel: str | None) -> Any:
     about: dict[str, Any] = {"metavar": own.metavar, "help": with_hyphens(own.text)}
     if own.is_argument:
         return Annotated[get_args(kind)[0], typer.Argument(**about)]
-    names = [f"-{own.letter}"] * bool(own.letter) + [f"--{option_name(name, kind)}"]
+    long = option_name(name, kind)
+    long = f"--{long}/--no-{long}" if default is True else f"--{long}"
+    names = [f"-{own.letter}"] * bool(own.letter) + [long]
     # `of_option` has plainer words than typer for what is none
     if (number := _number_of(kind)) is not None:
         about |= {"parser": str, "callback": _converter(name, kind, number)}

@@ -215,8 +215,8 @@ def _source(
 ) -> Source:
     """Read the files that the mesh is measured on, with the weights stated in the mesh's file."""
     inputs = loaded.table("inputs")
-    tension, weight = (_number(inputs.get(name)) for name in ("smooth_interfaces", "label_weight"))
-    weights, filled = inputs.get("weights"), inputs.get("filled_holes")
+    weight, weights = _number(inputs.get("label_weight")), inputs.get("weights")
+    filled = inputs.get("filled_holes")
     own = _number(weights[0]) if isinstance(weights, list) and len(weights) == 1 else None
     options = SourceOptions(
         images=[image],
@@ -226,7 +226,7 @@ def _source(
         **{name: getattr(part, name) for name in vars(ImagePart())},
         weights=None if labels is None or own is None else repr(own),
         label_weight=None if labels is None else weight,
-        smooth_interfaces=None if labels is None else tension,
+        smooth_interfaces=labels is None or inputs.get("smooth_interfaces") != 0,
         keep_components=False,
         fill_holes=None if labels is None or not isinstance(filled, int) else str(filled),
     )
@@ -331,7 +331,7 @@ def _checked(judgement: Judgement) -> tuple[list[str], list[str]]:
         return problems, []
     if labels.ndim == 1 and ((np.rint(labels) == labels) & (labels >= 0)).all():
         touching = manifold_problems(mesh, labels)
-    is_smooth = (_number(judgement.loaded.table("inputs").get("smooth_interfaces")) or 0.0) > 0.0
+    is_smooth = judgement.loaded.table("inputs").get("smooth_interfaces")
     return (touching, []) if is_smooth else ([], touching)
 
 

@@ -34,8 +34,6 @@ RARITY_POWER = 0.5  # exponent of a label's fraction of the voxels by which its 
 SAME_PLACE_VOXELS = 1e-2  # voxel centres no farther apart coincide
 STEPS_PER_SIGMA = 256.0  # least number of integer steps in a contrast's standard deviation
 WEIGHT_RANGE = 1e-3, 1e3  # the least and largest weight other than 0
-MOST_TENSION = 10.0  # voxels; details of twice this radius would vanish
-SMOOTH_INTERFACES = 0.3  # voxels, the default tension: details up to twice this radius vanish
 # margin around a mask: the reach of surface smoothing and of cells on the surface
 MARGIN_VOXELS = 4
 # weight of a voxel on the wrong side of the region's surface, in variances
@@ -66,7 +64,6 @@ class SmoothLabels(NamedTuple):
     """Labels with smooth interfaces."""
 
     memberships: Memberships
-    tension: float  # voxels an interface would move to reduce its area
     own_channel: NDArray[np.int64]  # (K,) channel of each label
     own_value: NDArray[np.int32]  # (K,) value of its voxels in that channel
     keeps_volumes: bool  # True if labels thinner than cells keep their volume
@@ -260,7 +257,7 @@ def content(
     *,
     weights: Sequence[float] | None = None,
     label_weight: float = 1.0,
-    smooth_interfaces: float = SMOOTH_INTERFACES,
+    smooth_interfaces: bool = True,
     keep_components: bool = False,
     keep_volumes: bool = True,
 ) -> Content:
@@ -282,11 +279,10 @@ def content(
         variance counts as much as the first image's, whatever its scale.
     label_weight : float
         Weight of all labels together. Voxels of rare labels count more.
-    smooth_interfaces : float
-        Surface tension of interfaces: the distance, in voxels, that an interface would move to
-        reduce its area. Labels are smooth between voxels (`tetopt.contents.memberships`), which are
-        divided if slices are thick, and nodes between labels lie on their interfaces. With 0 labels
-        keep their stairs, and each cell gets the label of most of its voxels.
+    smooth_interfaces : bool
+        Labels are smooth between voxels (`tetopt.contents.memberships`), which are divided if
+        slices are thick, and nodes between labels lie on their interfaces. If False, labels keep
+        their stairs, and each cell gets the label of most of its voxels.
     keep_components : bool
         Keep connected components of the mesh that the mask does not have. By default small ones are
         dropped.
@@ -322,7 +318,7 @@ def content(
     """
     images = [images] if isinstance(images, Image) else list(images)
     weights = [1.0] * len(images) if weights is None else [float(w) for w in weights]
-    _check(images, {"labels": labels, "mask": mask}, weights, label_weight, smooth_interfaces)
+    _check(images, {"labels": labels, "mask": mask}, weights, label_weight)
     labels = None if labels is None else checked_labels("labels", labels, is_map=True)
     region, beyond, whole = None, None, images[0]
     if mask is not None:
@@ -351,7 +347,7 @@ def content(
     if labels is not None and label_weight > 0.0:
         factors, (present, rows) = supersampling(labels.spacing), numbered(labels)
         labels, n_rows = None, len(present)  # its memory is needed
-        if smooth_interfaces > 0.0:
+        if smooth_interfaces:
             members = memberships_of(present, rows, factors)
             rows = members.partition
             if max(factors) > 1:
@@ -385,9 +381,7 @@ def content(
         return result
     channel, value = len(contrasts) + codes.argmax(axis=0), whole_codes.max(axis=0)
     return result._replace(
-        smooth=SmoothLabels(
-            members, smooth_interfaces, channel.astype(np.int64), value, keep_volumes
-        )
+        smooth=SmoothLabels(members, channel.astype(np.int64), value, keep_volumes)
     )
 
 
@@ -525,22 +519,13 @@ def _part(image: Image, part: tuple[slice, ...]) -> Image:
     return image.box([s.start for s in part], [s.stop for s in part])
 
 
-def check_weights(
-    n_images: int, weights: list[float], label_weight: float, smooth_interfaces: float
-) -> None:
-    """Raise InputError for invalid weights of images and labels, or an invalid tension of
-    interfaces.
-    """
+def check_weights(n_images: int, weights: list[float], label_weight: float) -> None:
+    """Raise InputError for invalid weights of images and labels."""
     low, high = WEIGHT_RANGE
     if len(weights) != n_images or not all(w == 0.0 or low <= w <= high for w in weights):
         raise InputError(
             f"weights: expected one for each of {n_images} images, 0 or {low:g} to {high:g}, got "
             f"{weights}"
-        )
-    if not 0.0 <= smooth_interfaces <= MOST_TENSION:
-        raise InputError(
-            f"smooth_interfaces: expected 0 to {MOST_TENSION:g} voxels, got "
-            f"{smooth_interfaces:g}; 0.3 is usual"
         )
     if not (label_weight == 0.0 or low <= label_weight <= high):
         raise InputError(f"label_weight: expected 0 or {low:g} to {high:g}, got {label_weight}")
@@ -551,7 +536,6 @@ def _check(
     others: dict[str, Image | None],
     weights: list[float],
     label_weight: float,
-    smooth_interfaces: float,
 ) -> None:
     if not images:
         raise InputError("images: expected one or more, got none")
@@ -582,7 +566,7 @@ def _check(
             f"mask: expected values from 0 to 1, got {low:g} to {high:g}; threshold or rescale "
             "it first"
         )
-    check_weights(len(images), weights, label_weight, smooth_interfaces)
+    check_weights(len(images), weights, label_weight)
 
 
 def _one_hot(

@@ -34,7 +34,7 @@ from tetopt.system.slabs import over_slabs
 
 # per voxel, in addition to levels: its label, the nearest label, and temporaries
 PARTITION_BYTES = 40.0
-NO_ROOM = "crop the image, or set `smooth_interfaces` to 0"  # remedy in messages on memory
+NO_ROOM = "crop the image, or turn `smooth_interfaces` off"  # remedy in messages on memory
 LARGE_BOX = 1 << 20  # voxels of a label's box from which its level is computed on all threads
 AGREEMENT_ROUNDS = 8  # with none, ribs of a CT have .77 to .86 of their volume
 AGREEMENT_FRACTION = 0.02  # of a label's volume, whose lack or excess between labels is corrected

@@ -92,8 +92,6 @@ class Objective(NamedTuple):
     n_means: int
     own_column: Ints1  # (K,) column of a cell's sums for each label's channel
     own_value: Floats1  # (K,) the label's value there; 0 in the other channels of labels
-    # weight of the area between labels a and b, times own_value[a]^2 + own_value[b]^2, per mm^(n-1)
-    tension: float
 
 
 class Sides(NamedTuple):
@@ -625,12 +623,6 @@ def is_interface(complex_: Complex, cell: int, k: int) -> bool:
 
 
 @helper
-def pair_tension(objective: Objective, one: int, other: int) -> float:
-    """Energy per mm^(n-1) of interface between two labels."""
-    return objective.tension * (objective.own_value[one] ** 2 + objective.own_value[other] ** 2)
-
-
-@helper
 def facet_area(ticks: NDArray, a: int, b: int, c: int, objective: Objective) -> float:
     """Area of the facet (a, b, c), mm^2, or length of the segment (a, b) if c < 0, mm."""
     u = place(ticks, b, a, objective)
@@ -638,21 +630,6 @@ def facet_area(ticks: NDArray, a: int, b: int, c: int, objective: Objective) -> 
         return np.sqrt(dot(u, u))
     n = cross(u, place(ticks, c, a, objective))
     return 0.5 * np.sqrt(dot(n, n))
-
-
-@entry
-def interface_energy(state: State) -> float:
-    """Total energy of all facets between labels."""
-    mesh, total = state.complex, 0.0
-    if state.objective.tension > 0.0:
-        for cell in range(mesh.n_cells[0]):
-            for k in range(mesh.cells.shape[1]):
-                other = mesh.across[cell, k]
-                if other > cell and is_interface(mesh, cell, k):
-                    a, b, c = outward(mesh.cells, cell, k)
-                    weight = pair_tension(state.objective, mesh.labels[cell], mesh.labels[other])
-                    total += weight * facet_area(mesh.ticks, a, b, c, state.objective)
-    return total
 
 
 def energies(state: State, n_means: int | None = None) -> tuple[float, float]:

@@ -31,19 +31,16 @@ from tetopt.engine.complex import (
     corner_of,
     cosine_up_to_limit,
     energies,
-    facet_area,
     facet_of,
     grown,
     has_node,
     image_energy,
-    interface_energy,
     is_interface,
     load,
     load_cell,
     measure_facet,
     node_stars,
     outward,
-    pair_tension,
     place,
     put_flux,
     settle,
@@ -62,7 +59,6 @@ from tetopt.engine.smooth import (
     star_energy,
     star_misfit,
     star_shape,
-    star_tension,
     trial_of,
 )
 from tetopt.engine.surface import MOST_MEETING, faces_up, put_on_surface, star_faces_up, uphill_at
@@ -144,7 +140,7 @@ def exchange(state: State, n_nodes: int, most: int, limits: Limits) -> Exchanged
     stars, groups = node_stars(state), blocks(state.complex.ticks)
     state = roomy(state, n_before, 16 * (max(more, 0) + most))
     E_G, squares = energies(state)
-    E = state.objective.geometry * E_G + state.objective.image * squares + interface_energy(state)
+    E = state.objective.geometry * E_G + state.objective.image * squares
     # Splits pay where the error is large, collapses where it is small: half of the nodes are
     # evaluated for each, unless many nodes must be inserted or removed. This raises E_D by no
     # measurable amount, and saves half of the time.
@@ -602,8 +598,7 @@ def _best_split(a: int, moves: EdgeMoves, state: State, stars: NodeStars, limits
             bound[number] += (
                 np.inf if _may_fit(state, a, b) else _energy_of_edge(state, stars, a, b)
             )
-    # Unless it may fit a mask, no edge gains more than its energy; without a mask, less tension is
-    # not looked for.
+    # Unless it may fit a mask, no edge gains more than its energy.
     for _ in range(count):
         number = int(np.argmax(bound[:count]))
         if not bound[number] > best:
@@ -629,22 +624,12 @@ def _may_fit(state: State, a: int, b: int) -> bool:
 
 @helper
 def _energy_of_edge(state: State, stars: NodeStars, a: int, b: int) -> float:
-    """Energy of the cells around the edge (a, b) and, within a mask, of the facets between
-    labels at it.
-    """
+    """Energy of the cells around the edge (a, b)."""
     mesh, energy = state.complex, 0.0
     for r in range(stars.start[a], stars.start[a + 1]):
         cell = stars.cells[r]
-        if not has_node(mesh.cells, cell, b):
-            continue
-        energy += cell_energy(state, cell)
-        for k in range(mesh.cells.shape[1] if state.objective.surface > 0.0 else 0):
-            if mesh.cells[cell, k] not in (a, b) and is_interface(mesh, cell, k):
-                i, j, m = outward(mesh.cells, cell, k)
-                tension = pair_tension(
-                    state.objective, mesh.labels[cell], mesh.labels[mesh.across[cell, k]]
-                )
-                energy += 0.5 * tension * facet_area(mesh.ticks, i, j, m, state.objective)
+        if has_node(mesh.cells, cell, b):
+            energy += cell_energy(state, cell)
     return energy
 
 
@@ -708,8 +693,6 @@ def worth_of_split(
                 return -np.inf
             if least > -1.0 and cosine_up_to_limit(x, objective) < least:
                 return -np.inf
-        if objective.tension > 0.0 and state.complex.meeting[p, 1] >= 0:
-            shape += _rise_of_tension(state, cell, a, b, p)
     has_misfit = objective.surface > 0.0 and state.complex.is_frozen[p, 3]
     if old - shape <= least_gain and not has_misfit:
         return -np.inf
@@ -748,31 +731,6 @@ def worth_of_split(
                 return -np.inf
     worth = old - new - misfit
     return worth if worth > least_gain else -np.inf
-
-
-@helper
-def _rise_of_tension(state: State, cell: int, a: int, b: int, p: int) -> float:
-    """Half of the rise of the energy of a cell's facets between labels if the edge (a, b) is
-    split at p.
-    """
-    mesh, objective, rise = state.complex, state.objective, 0.0
-    for k in range(mesh.cells.shape[1]):
-        if mesh.cells[cell, k] in (a, b) or not is_interface(mesh, cell, k):
-            continue
-        c = -1
-        for m in range(mesh.cells.shape[1]):
-            if m != k and mesh.cells[cell, m] not in (a, b):
-                c = mesh.cells[cell, m]
-        more = facet_area(mesh.ticks, a, p, c, objective) + facet_area(
-            mesh.ticks, p, b, c, objective
-        )
-        more -= facet_area(mesh.ticks, a, b, c, objective)
-        rise += (
-            0.5
-            * pair_tension(objective, mesh.labels[cell], mesh.labels[mesh.across[cell, k]])
-            * more
-        )
-    return rise
 
 
 @unit
@@ -894,7 +852,7 @@ def _best_collapse(
         return
     n, trial = cells.shape[1], trial_of(state, stars, a)
     near, shapes = np.empty(MAX_NEIGHBOURS, dtype=np.int64), np.full(MAX_NEIGHBOURS, np.inf)
-    old, least, size = star_tension(state, stars, a), objective.angle_limit if n == 4 else -1.0, 0.0
+    old, least, size = 0.0, objective.angle_limit if n == 4 else -1.0, 0.0
     for r in range(stars.start[a], stars.start[a + 1]):
         old += cell_energy(state, stars.cells[r])
         load_cell(trial.x, t, cells, stars.cells[r], objective)

@@ -27,7 +27,6 @@ from tetopt.engine.complex import (
     NodeStars,
     State,
     copied,
-    interface_energy,
     node_stars,
     remeasure,
     without_cells,
@@ -51,7 +50,7 @@ from tetopt.engine.loop import (
 )
 from tetopt.engine.paper import optimize_paper
 from tetopt.engine.repair import cell_cosines, n_cells_below, repair
-from tetopt.engine.smooth import _attract, _gradients, attract, blocks, sweep
+from tetopt.engine.smooth import _attract, attract, blocks, sweep
 from tetopt.engine.state import angle_limit_of, content_energies, state_of, with_min_dihedral
 from tetopt.engine.surface import _fill_offsets, fill_offsets
 from tetopt.errors import InputError
@@ -340,7 +339,7 @@ def prepare_kernels(
     image = content.image
     has_labels = content.memberships is not None
     if method == "fast":
-        unused = {_gradients, _evaluate_triangles if image.ndim == 3 else _evaluate_cells}
+        unused = {_evaluate_triangles if image.ndim == 3 else _evaluate_cells}
         if not has_labels and content.region is None:  # 4 of 79 s of compiling
             unused |= {_attract, _fill_offsets}
         purposes = {
@@ -417,12 +416,9 @@ class Run:
         return int(self.state.complex.n_cells[0])
 
     def E(self) -> float:
-        """The combined energy that moves lower: Eq. (4), or with labels that of their own
-        values, and tension.
-        """
+        """The combined energy that moves lower: Eq. (4), or with labels that of their own values."""
         E_G, squares = content_energies(self.state, self.content)
-        objective = self.state.objective
-        return objective.geometry * E_G + objective.image * squares + interface_energy(self.state)
+        return self.state.objective.geometry * E_G + self.state.objective.image * squares
 
     def sweep(
         self,
@@ -681,9 +677,7 @@ class Run:
     def record(
         self, iteration: int, movement: float, is_changed: bool, seconds: float
     ) -> IterationRecord:
-        """The history's row for the current state; its E has no tension, and is comparable
-        across the whole run.
-        """
+        """The history's row for the current state; its E is comparable across the whole run."""
         if self.state.objective.image == 0.0:  # the moves have left the sums alone
             remeasure(self.state)
         E_G, squares = content_energies(self.state, self.content, self.content.n_channels)

@@ -28,14 +28,12 @@ from tetopt.engine.complex import (
     cell_cosine,
     cell_energy,
     corner_of,
-    facet_area,
     facet_of,
     grown,
     image_energy,
     is_interface,
     load,
     outward,
-    pair_tension,
     put_flux,
     settle,
     shape_of_triangle,
@@ -437,18 +435,6 @@ def _arc_of(work: Cavity, j: int) -> int:
     return work.arc[0] if 0 < work.arc[0] < j else 0
 
 
-@helper
-def _fall_of_tension(work: Cavity, state: State, a: int, b: int) -> float:
-    """Reduction of the energy of facets between labels by removing the edge (a, b)."""
-    t, ticks, objective = work.arc[0], state.complex.ticks, state.objective
-    if t == 0 or objective.tension == 0.0:
-        return 0.0
-    u, v, labels = work.ring[0], work.ring[t], state.complex.labels
-    fall = facet_area(ticks, a, b, u, objective) + facet_area(ticks, a, b, v, objective)
-    fall -= facet_area(ticks, u, v, a, objective) + facet_area(ticks, u, v, b, objective)
-    return pair_tension(objective, labels[work.around[0]], labels[work.around[t]]) * fall
-
-
 @unit
 def _worth_of_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: int) -> float:
     """Reduction of E by removing the edge (a, b), -inf if impossible; `work.apex` then holds the
@@ -463,7 +449,7 @@ def _worth_of_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: 
         return -np.inf
     if not turn_to_arcs(work, state.complex.labels, m, is_open):
         return -np.inf
-    old = _fall_of_tension(work, state, a, b)
+    old = 0.0
     for r in range(m - is_open):
         old += cell_energy(state, around[r])
     limit = old * (1.0 - LEAST_FLIP_FRACTION)

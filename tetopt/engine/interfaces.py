@@ -21,7 +21,6 @@ from tetopt.engine.labelling import (
     Contacts,
     Contents,
     LabelVoxels,
-    label_voxels,
     labelled,
     unfit_labels,
     unpinched,
@@ -43,33 +42,24 @@ SAMPLED_AT_ONCE = 20_000  # cells per thread
 
 
 def with_labels(
-    state: State,
-    content: Content,
-    smooth: SmoothLabels,
-    mesh: Mesh,
-    voxels: LabelVoxels | None = None,
+    state: State, content: Content, smooth: SmoothLabels, mesh: Mesh, voxels: LabelVoxels
 ) -> State:
     """The state with one of the content's labels for each cell, and an objective that penalises
     other labels' voxels.
 
-    `voxels` is the information on the labels' voxels (`label_voxels`), if known.
+    `voxels` is the information on the labels' voxels (`label_voxels`).
     """
-    members, tension, own_channel, own_value, keeps_volumes = smooth
-    voxels = voxels or label_voxels(
-        members.partition, content.image.spacing, len(members.labels), members.parts
-    )
+    members, own_channel, own_value, keeps_volumes = smooth
     n_cells, image = len(mesh.cells), content.image
     across = state.complex.across[:n_cells]
     contents = cell_contents(image, members, mesh, voxels)
     state.complex.labels[:n_cells] = labelled(
         mesh.points, mesh.cells, across, contents, voxels.components, keeps_volumes
     )
-    step = image.voxel_volume ** (1.0 / image.ndim)
     objective = state.objective._replace(
         n_means=int(content.n_contrasts),
         own_column=np.where(own_channel == 0, 1, 2 + own_channel),
         own_value=own_value.astype(np.float64),
-        tension=float(state.objective.image * tension * step / image.voxel_volume),
     )
     levels = members.levels.reshape(len(members.levels), *(1,) * (3 - image.ndim), *image.shape)
     state = state._replace(

@@ -30,13 +30,10 @@ from tetopt.engine.complex import (
     cell_value,
     cosine_up_to_limit,
     determinant_and_squares,
-    facet_area,
     has_node,
     image_energy,
-    is_interface,
     load_cell,
     outward,
-    pair_tension,
     place,
     put_flux,
     shape_of_cell,
@@ -169,15 +166,6 @@ def _block_stars(
                 count += 1
         first[block + 1] = count
     return first, cells
-
-
-def gradient(state: State, stars: NodeStars) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Derivatives of the weighted shape and image terms of E by each node's position, (N, 3)
-    each, per mm.
-    """
-    shape, image = np.zeros((len(state.complex.ticks), 3)), np.zeros((len(state.complex.ticks), 3))
-    run(_gradients, len(shape), Gradients(shape, image, state, stars))
-    return shape, image
 
 
 @unit
@@ -351,50 +339,6 @@ def _has_same_values(
 
 
 @unit
-def _add_tension_gradient(g: Floats1, state: State, stars: NodeStars, node: int) -> None:
-    """Add the derivative of the energy of interfaces around a node to g (3,), per mm."""
-    mesh, objective = state.complex, state.objective
-    for r in range(stars.start[node], stars.start[node + 1]):
-        cell = stars.cells[r]
-        for k in range(mesh.cells.shape[1]):
-            other = mesh.across[cell, k]
-            if k == stars.corner[r] or other < cell or not is_interface(mesh, cell, k):
-                continue
-            weight = pair_tension(objective, mesh.labels[cell], mesh.labels[other])
-            a, b, c = outward(mesh.cells, cell, k)
-            if c < 0:
-                way = place(mesh.ticks, a if b == node else b, node, objective)
-                way = scaled(-1.0 / np.sqrt(dot(way, way)), way)
-            else:
-                if b == node:
-                    a, b, c = b, c, a
-                elif c == node:
-                    a, b, c = c, a, b
-                u, v = place(mesh.ticks, b, a, objective), place(mesh.ticks, c, a, objective)
-                n = cross(u, v)
-                way = scaled(0.5 / np.sqrt(dot(n, n)), cross(n, minus(v, u)))
-            for d in range(3):
-                g[d] += weight * way[d]
-
-
-@unit
-def star_tension(state: State, stars: NodeStars, node: int) -> float:
-    """Energy of the interfaces around a node at the current ticks."""
-    mesh, total = state.complex, 0.0
-    if not (state.objective.tension > 0.0 and mesh.meeting[node, 1] >= 0):
-        return 0.0
-    for r in range(stars.start[node], stars.start[node + 1]):
-        cell = stars.cells[r]
-        for k in range(mesh.cells.shape[1]):
-            other = mesh.across[cell, k]
-            if k != stars.corner[r] and other > cell and is_interface(mesh, cell, k):
-                a, b, c = outward(mesh.cells, cell, k)
-                weight = pair_tension(state.objective, mesh.labels[cell], mesh.labels[other])
-                total += weight * facet_area(mesh.ticks, a, b, c, state.objective)
-    return total
-
-
-@unit
 def _add_shape_gradient(
     g: Floats1, H: Floats2, x: Floats2, state: State, stars: NodeStars, node: int
 ) -> tuple[float, float]:
@@ -443,23 +387,6 @@ def _volume_and_squares(x: NDArray, n_corners: int) -> tuple:
         return abs(determinant) / 6.0, S
     volume, E_G = volume_and_E_G(x, n_corners)
     return volume, E_G * (n_corners * (n_corners + 1)) / volume
-
-
-class Gradients(NamedTuple):
-    """Inputs and outputs of `gradient`."""
-
-    shape: Floats2  # (N, 3)
-    image: Floats2  # (N, 3)
-    state: State
-    stars: NodeStars
-
-
-@unit
-def _gradients(work: Gradients, node: int) -> None:
-    g, H = np.zeros(3), np.zeros((3, 3))
-    _add_shape_gradient(work.shape[node], H, np.empty((4, 3)), work.state, work.stars, node)
-    _add_image_gradient(g, H, work.state, work.stars, node)
-    put_row(work.image, node, _per_mm(g, work.state))
 
 
 class Trial(NamedTuple):
@@ -603,7 +530,6 @@ def star_energy(
     if energy == np.inf or state.objective.image == 0.0:
         return energy
     sums = np.empty((1, trial.fluxes.shape[2]))
-    energy += star_tension(state, stars, node)
     energy, misfit = star_image(sums, trial, energy, misfit, bound, node, state, stars)
     if has_misfit:
         energy += misfit
@@ -674,8 +600,6 @@ def _move(node: int, state: State, stars: NodeStars) -> float:
     x, normal, g, H = np.empty((4, 3)), np.zeros((7, 3)), np.zeros(3), np.zeros((3, 3))
     # A star with flat cells may stay as it is, but not get worse, hence its own `least`.
     nearest, least = _add_shape_gradient(g, H, x, state, stars, node)
-    if has_image and state.objective.tension > 0.0 and state.complex.meeting[node, 1] >= 0:
-        _add_tension_gradient(g, state, stars, node)
     _turn_to_index(g, H, state.objective.matrix)
     if has_image:
         _add_image_gradient(g, H, state, stars, node)
@@ -689,7 +613,7 @@ def _move(node: int, state: State, stars: NodeStars) -> float:
     square = dot(moved, moved)  # mm^2
     if not (square > 0.0 and slope < 0.0):
         return 0.0
-    energy, size = star_tension(state, stars, node), stars.start[node + 1] - stars.start[node]
+    energy, size = 0.0, stars.start[node + 1] - stars.start[node]
     for r in range(stars.start[node], stars.start[node + 1]):
         energy += cell_energy(state, stars.cells[r])
     search = Search(

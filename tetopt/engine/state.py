@@ -173,7 +173,6 @@ def objective_of(
         n_means=int(grid.n_channels),
         own_column=np.zeros(0, dtype=np.int64),
         own_value=np.zeros(0),
-        tension=0.0,
     )
 
 

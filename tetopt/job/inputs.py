@@ -24,7 +24,6 @@ from tetopt.contents.align import (
     resample_contrast,
     resample_mask,
 )
-from tetopt.contents.content import SMOOTH_INTERFACES
 from tetopt.contents.domain import INSIDE_FRACTION
 from tetopt.contents.labels import checked_labels
 from tetopt.contents.probabilities import resample_tissue
@@ -275,11 +274,10 @@ def number_of(name: str, text: str) -> float:
 
 
 class Balance(NamedTuple):
-    """Weights of images and labels, and tension of the surfaces between labels."""
+    """Weights of images and labels."""
 
     weights: list[float]
-    label_weight: float = 1.0
-    smooth_interfaces: float = SMOOTH_INTERFACES
+    label_weight: float
 
 
 def balance_of(options: SourceOptions) -> Balance:
@@ -287,10 +285,7 @@ def balance_of(options: SourceOptions) -> Balance:
     weights = [1.0] * len(options.images)
     if options.weights is not None:
         weights = [number_of("`weights`", part) for part in options.weights.split(",")]
-    names = ("label_weight", "smooth_interfaces")
-    return Balance(
-        weights, **{name: each for name in names if (each := getattr(options, name)) is not None}
-    )
+    return Balance(weights, 1.0 if options.label_weight is None else options.label_weight)
 
 
 def read_mesh(path: Path) -> MeshFile:

@@ -256,8 +256,9 @@ def _of_kind(name: str, kind: Any, value: Any) -> Any:
         return Path(",".join(str(_of_kind(name, own, each)) for each in value))
     if own is str and name == "weights" and isinstance(value, list | tuple):
         return ",".join(repr(_of_kind(name, float, each)).removesuffix(".0") for each in value)
-    if own is bool and isinstance(value, bool):
-        return value
+    # a number of voxels in files of earlier versions
+    if own is bool and (isinstance(value, bool) or (is_number and name == "smooth_interfaces")):
+        return value != 0
     choices = get_args(own)
     if get_origin(own) is Literal and value in choices:
         return value

@@ -247,13 +247,8 @@ class RegionOptions(LabelChoice):
         str | None, Option("W,...", "Weight of each IMAGE (default 1 each; 0: ignored).")
     ] = None
     smooth_interfaces: Annotated[
-        float | None,
-        Option(
-            "W",
-            "Smoothing of surfaces between labels, in voxels, up to 10 (default 0.3; 0 keeps "
-            "voxel steps).",
-        ),
-    ] = None
+        bool, Option(None, "Smooth the surfaces between labels, or keep their voxel steps.")
+    ] = True
     free_volumes: Annotated[
         bool,
         Option(

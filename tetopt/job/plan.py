@@ -254,15 +254,15 @@ def _check_source(job: JobOptions) -> None:
             "fill_holes",
             "label_names",
             "label_weight",
-            "smooth_interfaces",
         )
         for name in (*names, "cells_across", "label_size"):
             if getattr(job, name) is not None and not (
                 name == "label_names" and job.mask_label is not None
             ):
                 raise InputError(f"`{name}`: needs `labels`")
-        if job.free_volumes:
-            raise InputError("`free_volumes`: needs `labels`")
+        if job.free_volumes or not job.smooth_interfaces:
+            name = "free_volumes" if job.free_volumes else "smooth_interfaces"
+            raise InputError(f"`{name}`: needs `labels`")
     if job.merge is not None and named_file(job.merge) is None:
         groups_of(job.merge)
 

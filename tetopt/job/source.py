@@ -190,13 +190,14 @@ def read_source(
         labels,
         mask,
         **balance._asdict(),
+        smooth_interfaces=options.smooth_interfaces,
         keep_components=options.keep_components,
         keep_volumes=not options.free_volumes,
     )
     if max(factors) > 1:
         combined = combined._replace(repeats=factors)
     extras = {
-        "smooth_interfaces": None if labels is None else balance.smooth_interfaces,
+        "smooth_interfaces": None if labels is None else options.smooth_interfaces,
         "free_volumes": options.free_volumes or None,
         "merged": {str(old): new for old, new in numbers.items()} if numbers else None,
         "mask_label": options.mask_label,

@@ -22,8 +22,8 @@ def option_words(options: dict[str, Any]) -> list[str]:
     """Convert options of `given_options`, without arguments, to the words of a command."""
     words = []
     for name, value in options.items():
-        if value is True:
-            words.append(f"--{name}")
+        if isinstance(value, bool):
+            words.append(f"--{name}" if value else f"--no-{name}")
         else:
             words += [
                 f"--{name}={each}" for each in (value if isinstance(value, list) else [value])
