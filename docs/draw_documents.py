@@ -288,7 +288,8 @@ def shapes_figure() -> Figure:
     for number, (name, corners) in enumerate(cells.items()):
         points = np.array(corners)
         mesh = tetopt.Mesh(points, oriented(points, np.array([[0, 1, 2, 3]])))
-        assert bad_kinds(mesh.points, mesh.cells)[0] == name, f"the drawn {name} is none"
+        kind = bad_kinds(mesh.points, mesh.cells, rho(mesh.points, mesh.cells))[0]
+        assert kind == name, f"the drawn {name} is none"
         angles = dihedral_angles(mesh.points, mesh.cells)
         title = (
             f"{'regular' if name == 'good' else name}: rho {rho(mesh.points, mesh.cells)[0]:.3f}\n"

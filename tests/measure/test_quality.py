@@ -25,7 +25,8 @@ from meshes import (
 
 from tetopt import Image, lattice_mesh
 from tetopt.geometry.simplex import dihedral_angles, rho, squared_edges, volumes
-from tetopt.measure.quality import bad_kinds, quality, quality_errors, rho_histogram
+from tetopt.measure import quality as measure
+from tetopt.measure.quality import quality, quality_errors, rho_histogram
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -95,6 +96,10 @@ def test_histogram_is_fractions_over_0_to_1_over_n():
 
 
 # Kinds
+
+
+def bad_kinds(points, cells):
+    return measure.bad_kinds(points, cells, rho(points, cells))
 
 
 @pytest.mark.parametrize("kind", BAD_TETS)

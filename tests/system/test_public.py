@@ -16,7 +16,7 @@ MESH = tetopt.Mesh([[0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 4]], [[0, 1, 2, 3]])
 
 # Classes in the fields of public records that the package alone looks into: they are handed on as
 # they are.
-INNER = {"Continuation", "Memberships", "PhantomVoxels", "Region", "System"}
+INNER = {"Continuation", "Memberships", "Region", "System"}
 INNER |= {"JobOptions", "SmoothLabels", "Source", "Spread"}  # of runs and contents
 
 

@@ -5,13 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
-
-from tetopt import InputError, load_phantom, save_image
+from tetopt import load_phantom, save_image
 from tetopt.cli.console import print_line
 from tetopt.cli.options import ForceOption
 from tetopt.io.images import OUTPUT_SUFFIXES
-from tetopt.io.zarr_images import ZARR_SUFFIX, is_node, save_zarr
 from tetopt.job.options import Option
 from tetopt.system.files import checked_output
 
@@ -24,7 +21,7 @@ def phantom_command(
         Path,
         Option(
             "IMAGE.nii.gz",
-            "The image to write; X.zarr is written in chunks of 16-bit integers.",
+            "The image to write.",
             letter="o",
         ),
     ],
@@ -40,24 +37,12 @@ def phantom_command(
     """Write a phantom as an image of known shapes and intensities."""
     if labels is not None:
         labels = checked_output(labels, OUTPUT_SUFFIXES, force)
-    is_folder = output.name.lower().endswith(ZARR_SUFFIX)
-    output = checked_output(
-        output, (*OUTPUT_SUFFIXES, ZARR_SUFFIX), force, is_node if is_folder else None
-    )
+    output = checked_output(output, OUTPUT_SUFFIXES, force)
     phantom = load_phantom(name)
-    voxels = phantom.voxels(voxel_mm=voxel_mm, blur_mm=blur_mm, noise_sd=noise_sd, seed=seed)
-    if is_folder:
-        if phantom.ndim != 3:
-            raise InputError(
-                f"{output}: expected a 3-D phantom, got a 2-D one; write it as .nii.gz"
-            )
-        low, high = save_zarr(output, voxels.affine, voxels, np.int16)
-    else:
-        image = phantom.image(voxel_mm=voxel_mm, blur_mm=blur_mm, noise_sd=noise_sd, seed=seed)
-        low, high = image.data.min(), image.data.max()
-        save_image(output, image)
+    image = phantom.image(voxel_mm=voxel_mm, blur_mm=blur_mm, noise_sd=noise_sd, seed=seed)
+    save_image(output, image)
     if labels is not None:
         save_image(labels, phantom.label_image(voxel_mm=voxel_mm))
-    size = " x ".join(str(s) for s in voxels.shape)
+    size, (low, high) = " x ".join(map(str, image.shape)), image.range
     print_line(f"{output}: {phantom.name}, {size} voxels, {low:g} to {high:g}")
     return 0

@@ -56,7 +56,7 @@ from tetopt.system.incoming import toml_of
 
 # intensities, noise or blur, labels, and the data written; 17 were measured
 PHANTOM_VOXEL_BYTES = 30.0
-MAX_PHANTOM_VOXELS = 2**36  # 4096^3: 137 GB of 16 bits, box by box
+MAX_PHANTOM_VOXELS = 2**31  # 1290^3
 # sub-voxels along an axis: 262,144 per voxel in 3-D, which fit into one chunk of points
 MAX_SUPERSAMPLE = 64
 BLUR_SIGMAS = 4.0  # reach of a blur, in standard deviations: less than 1e-4 of it lies beyond
@@ -304,7 +304,7 @@ class Phantom:
         Raises
         ------
         InputError
-            An option out of range, more than ``2**36`` voxels, or more than fit into memory.
+            An option out of range, more than ``2**31`` voxels, or more than fit into memory.
 
         Examples
         --------
@@ -314,49 +314,6 @@ class Phantom:
         >>> noisy = phantom.image(voxel_mm=4, noise_sd=5, seed=1)
         >>> print(f"{(noisy.data - phantom.image(voxel_mm=4).data).std():.1f}")
         5.0
-        """
-        voxels = self.voxels(voxel_mm, blur_mm, noise_sd, seed, supersample)
-        self._check_whole(voxels.shape)
-        return Image(voxels[tuple(slice(None) for _ in voxels.shape)], voxels.affine)
-
-    def voxels(
-        self,
-        voxel_mm: ArrayLike | None = None,
-        blur_mm: float | None = None,
-        noise_sd: float | None = None,
-        seed: int | None = None,
-        supersample: int = 4,
-    ) -> PhantomVoxels:
-        """The voxels of `image`, rendered box by box on demand.
-
-        Parameters
-        ----------
-        voxel_mm : float or (n,) floats, optional
-            Voxel edges, as for `image`, like the other options.
-        blur_mm : float, optional
-            Blur, mm.
-        noise_sd : float, optional
-            Noise, in units of intensity.
-        seed : int, optional
-            Seed of the noise.
-        supersample : int
-            Sub-voxels along each axis.
-
-        Returns
-        -------
-        PhantomVoxels
-            An array whose boxes are rendered on demand.
-
-        Raises
-        ------
-        InputError
-            As for `image`, except for the number of voxels.
-
-        Examples
-        --------
-        >>> voxels = tetopt.load_phantom("sphere").voxels(voxel_mm=0.25)
-        >>> voxels.shape, float(voxels[128:129, 128:129, 128:129].item())
-        ((256, 256, 256), 100.0)
         """
         where = f"phantom {self.name!r}"
         blur = _number(self.blur_mm if blur_mm is None else blur_mm, f"{where}: blur_mm", 0.0)
@@ -369,7 +326,23 @@ class Phantom:
         sd = _number(self.noise_sd if noise_sd is None else noise_sd, f"{where}: noise_sd", 0.0)
         seed = _integer(self.seed if seed is None else seed, f"{where}: seed")
         supersample = _integer(supersample, f"{where}: supersample", 1, MAX_SUPERSAMPLE)
-        return PhantomVoxels(self, *self._grid(voxel_mm), blur, sd, seed, supersample)
+        shape, affine = self._grid(voxel_mm)
+        linear, n = affine[:-1, :-1], len(shape)
+        offsets = ((_index_block((supersample,) * n) + 0.5) / supersample - 0.5) @ linear.T
+        corners = _index_block((2,) * n) - 0.5
+        # The 1e-9 includes a voxel that just touches a surface, however distances are rounded.
+        reach = np.linalg.norm(corners @ linear.T, axis=1).max() * (1.0 + 1e-9)
+        values = np.empty(shape)
+        for part, centers in _voxel_centers(shape, affine):
+            values[part] = self._voxel_means(centers, offsets, reach).reshape(values[part].shape)
+        if blur > 0.0:
+            sigmas = blur / np.linalg.norm(linear, axis=0)
+            values = scipy.ndimage.gaussian_filter(
+                values, sigmas, mode="nearest", truncate=BLUR_SIGMAS
+            )
+        if sd > 0.0:
+            values += np.random.default_rng(seed).normal(0.0, sd, shape)
+        return Image(values, affine)
 
     def label_image(self, voxel_mm: ArrayLike | None = None) -> Image:
         """The label at every voxel's centre, on the same voxels as `image`.
@@ -396,9 +369,8 @@ class Phantom:
         552
         """
         shape, affine = self._grid(voxel_mm)
-        self._check_whole(shape)
         data = np.empty(shape, dtype=np.int64)
-        for part, centers in _voxel_centers((0,) * len(shape), shape, affine):
+        for part, centers in _voxel_centers(shape, affine):
             data[part] = self._labels()[self._top_shape(centers)].reshape(data[part].shape)
         return Image(data, affine)
 
@@ -443,7 +415,9 @@ class Phantom:
         return top
 
     def _grid(self, voxel_mm: ArrayLike | None) -> tuple[tuple[int, ...], NDArray[np.float64]]:
-        """Number of voxels along each axis and the affine, for voxels of about `voxel_mm`."""
+        """Number of voxels along each axis and the affine, for voxels of about `voxel_mm`; raise
+        InputError unless they and their temporaries fit into memory.
+        """
         where = f"phantom {self.name!r}"
         voxel = self.voxel_mm if voxel_mm is None else _voxel_edges(voxel_mm, self.size_mm, where)
         with np.errstate(over="ignore"):
@@ -465,14 +439,10 @@ class Phantom:
             Image(np.zeros((1,) * self.ndim), affine)
         except InputError as error:
             raise InputError(f"{where}: {error}") from error
-        return tuple(int(c) for c in counts), affine
-
-    def _check_whole(self, shape: tuple[int, ...]) -> None:
-        """Raise InputError unless the voxels and their temporaries fit into memory."""
-        what = f"phantom {self.name!r}: {' x '.join(map(str, shape))} voxels"
-        check_memory(
-            PHANTOM_VOXEL_BYTES * math.prod(shape), what, "use larger voxels, or write it as .zarr"
-        )
+        shape = tuple(int(c) for c in counts)
+        what = f"{where}: {' x '.join(map(str, shape))} voxels"
+        check_memory(PHANTOM_VOXEL_BYTES * math.prod(shape), what, "use larger voxels")
+        return shape, affine
 
     def _voxel_means(
         self, centers: NDArray[np.float64], offsets: NDArray[np.float64], reach: float
@@ -512,101 +482,6 @@ class Phantom:
             # bit.
             means[voxels] = values[:, 0] + (values - values[:, :1]).mean(axis=1)
         return means
-
-
-class PhantomVoxels:
-    """The voxels of a phantom as an array whose boxes are rendered on demand, by slices.
-
-    A box has the same values, to the last bit, whatever other boxes are read. Noise is one stream
-    of numbers in the order of the voxels: read boxes in the order of the first axis if possible;
-    they take memory for all planes that they lie on.
-
-    Parameters
-    ----------
-    phantom : Phantom
-    shape : tuple of int
-        Number of voxels along each axis.
-    affine : (n+1, n+1) float64
-        From index to world coordinates in mm.
-    blur_mm, noise_sd : float
-    seed, supersample : int
-        As for `Phantom.image`.
-    """
-
-    dtype = np.dtype(np.float64)
-
-    def __init__(
-        self,
-        phantom: Phantom,
-        shape: tuple[int, ...],
-        affine: NDArray[np.float64],
-        blur_mm: float,
-        noise_sd: float,
-        seed: int,
-        supersample: int,
-    ) -> None:
-        self.phantom, self.shape, self.affine = phantom, shape, affine
-        self.noise_sd, self.seed = noise_sd, seed
-        linear, n = affine[:-1, :-1], len(shape)
-        self._sigmas = blur_mm / np.linalg.norm(linear, axis=0)
-        sub_index = _index_block((supersample,) * n)
-        self._offsets = ((sub_index + 0.5) / supersample - 0.5) @ linear.T
-        corners = _index_block((2,) * n) - 0.5
-        # The 1e-9 includes a voxel that just touches a surface, however distances are rounded.
-        self._reach = np.linalg.norm(corners @ linear.T, axis=1).max() * (1.0 + 1e-9)
-        self._stream, self._next_plane = np.random.default_rng(seed), 0
-        self._planes, self._noise = (0, 0), np.empty(0)
-
-    def __getitem__(self, box: tuple[slice, ...]) -> NDArray[np.float64]:
-        """The voxels of a box of indices, float64."""
-        ranges = [each.indices(size)[:2] for each, size in zip(box, self.shape, strict=True)]
-        values = self._blurred([start for start, _ in ranges], [stop for _, stop in ranges])
-        if self.noise_sd > 0.0:
-            values += self._noise_of(*ranges[0])[
-                (slice(None), *(slice(*each) for each in ranges[1:]))
-            ]
-        return values
-
-    def _blurred(self, start: list[int], stop: list[int]) -> NDArray[np.float64]:
-        """A box without noise; for a blur, the box is rendered with the margin that it reaches."""
-        if not self._sigmas.any():
-            return self._painted(start, stop)
-        reach = [int(BLUR_SIGMAS * sigma + 0.5) for sigma in self._sigmas]
-        low = [max(a - r, 0) for a, r in zip(start, reach, strict=True)]
-        high = [min(b + r, size) for b, r, size in zip(stop, reach, self.shape, strict=True)]
-        values = scipy.ndimage.gaussian_filter(
-            self._painted(low, high), self._sigmas, mode="nearest", truncate=BLUR_SIGMAS
-        )
-        return values[
-            tuple(slice(a - at, b - at) for a, b, at in zip(start, stop, low, strict=True))
-        ].copy()
-
-    def _painted(self, start: list[int], stop: list[int]) -> NDArray[np.float64]:
-        values = np.empty([b - a for a, b in zip(start, stop, strict=True)])
-        for part, centers in _voxel_centers(start, stop, self.affine):
-            means = self.phantom._voxel_means(centers, self._offsets, self._reach)
-            values[part] = means.reshape(values[part].shape)
-        return values
-
-    def _noise_of(self, start: int, stop: int) -> NDArray[np.float64]:
-        """Noise of planes along the first axis; earlier numbers of the stream are drawn and
-        discarded.
-        """
-        if self._planes != (start, stop):
-            self._noise = np.empty(0)  # frees memory before the next is drawn
-            if start < self._next_plane:
-                self._stream, self._next_plane = np.random.default_rng(self.seed), 0
-            n_bytes = 8 * (stop - start) * math.prod(self.shape[1:])  # of float64
-            check_memory(
-                n_bytes,
-                f"phantom {self.phantom.name!r}: noise of {stop - start} planes",
-                "render fewer planes at a time",
-            )
-            for _ in range(self._next_plane, start):
-                self._stream.normal(0.0, self.noise_sd, self.shape[1:])
-            self._noise = self._stream.normal(0.0, self.noise_sd, (stop - start, *self.shape[1:]))
-            self._planes, self._next_plane = (start, stop), stop
-        return self._noise
 
 
 def phantom_folder() -> Path:
@@ -810,20 +685,20 @@ def _index_block(shape: Sequence[int]) -> NDArray[np.float64]:
 
 
 def _voxel_centers(
-    start: Sequence[int], stop: Sequence[int], affine: NDArray[np.float64]
+    shape: Sequence[int], affine: NDArray[np.float64]
 ) -> Iterator[tuple[tuple[slice, ...], NDArray[np.float64]]]:
-    """Iterate over parts of a box, as indices from its start, with the world centres (M, n) of
-    voxels in C order.
+    """Iterate over parts of a grid of voxels, with the world centres (M, n) of these in C order.
 
-    Centres are summed term by term, not by BLAS, whose rounding depends on the number of rows: a
-    voxel must be the same in every box.
+    Centres are summed term by term, not by BLAS, whose rounding depends on the number of rows.
     """
-    edge = round(POINTS_PER_CHUNK ** (1 / len(start)))
-    for corner in itertools.product(*(range(a, b, edge) for a, b in zip(start, stop, strict=True))):
-        ends = [min(at + edge, b) for at, b in zip(corner, stop, strict=True)]
+    edge = round(POINTS_PER_CHUNK ** (1 / len(shape)))
+    for corner in itertools.product(*(range(0, size, edge) for size in shape)):
+        ends = [min(at + edge, size) for at, size in zip(corner, shape, strict=True)]
         index = _index_block([b - a for a, b in zip(corner, ends, strict=True)]) + corner
-        part = tuple(slice(a - at, b - at) for a, b, at in zip(corner, ends, start, strict=True))
-        yield part, transformed(index, affine[:-1, :-1]) + affine[:-1, -1]
+        yield (
+            tuple(map(slice, corner, ends)),
+            transformed(index, affine[:-1, :-1]) + affine[:-1, -1],
+        )
 
 
 def _check_keys(

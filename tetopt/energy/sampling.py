@@ -135,7 +135,9 @@ def cell_moments(image: Image, mesh: Mesh) -> CellMoments:
 def cell_moments_and_ranges(
     image: Image, mesh: Mesh
 ) -> tuple[CellMoments, tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """`cell_moments` and `cell_ranges` in two thirds of the time."""
+    """`cell_moments`, and the least and greatest intensity in each cell, (M,) each; in a cell
+    without voxel centre the nearest voxel's.
+    """
     sampled = _sampled(image, mesh)
     return _moments(image, mesh, sampled), _ranges(image, mesh, sampled)
 
@@ -318,20 +320,6 @@ def _volume_of(
     """
     steps = np.zeros((*owner.shape[:2], owner.shape[2] + 1), dtype=np.int64)
     return steps, np.zeros(owner.shape, dtype=np.float32) if h is None else h
-
-
-def cell_ranges(image: Image, mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The least and the greatest intensity among the voxels whose centres lie in each cell, (M,)
-    float64 each.
-
-    In a cell without voxel centre both are the nearest voxel's value, as in `cell_moments`.
-
-    Raises
-    ------
-    InputError
-        As for `cell_moments`.
-    """
-    return _ranges(image, mesh, _sampled(image, mesh))
 
 
 def _ranges(
@@ -767,7 +755,7 @@ def triangle_flux(
     It is positive if the triangle, with its nodes as listed, faces up the last axis, and is written
     to out[p, q, :], where `place` is (p, q), with one entry more than `prefix` has. If `scatter` is
     an array of steps and a change, the change, signed like the flux, is added to the steps at each
-    crossing instead.
+    crossing instead. All is one function, as its loops share most of their numbers.
     """
     (node_a, node_b, node_c), (p, q) = nodes, place
     n_more = out.shape[2] - 3

@@ -78,8 +78,9 @@ def rho_histogram(
     return counts / len(cells), edges
 
 
-def bad_kinds(points: Points, cells: Cells) -> NDArray[np.str_]:
-    """The kind of each cell, (M,) str: "good" if n rho >= 0.3, else the kind of bad shape.
+def bad_kinds(points: Points, cells: Cells, shape: NDArray[np.float64]) -> NDArray[np.str_]:
+    """The kind of each cell of these `rho`, (M,) str: "good" if n rho >= 0.3, else the kind of bad
+    shape.
 
     Bad tetrahedra (after Cheng, Dey, Edelsbrunner, Facello and Teng 2000) are thin or flat,
     depending on the spread of the four nodes along its principal axes: thin if the middle spread is
@@ -95,10 +96,6 @@ def bad_kinds(points: Points, cells: Cells) -> NDArray[np.str_]:
 
     Triangles: ``needle`` has an edge below 1/4 of the longest, ``cap`` an angle near 180 degrees.
     """
-    return _kinds_of(points, cells, rho(points, cells))
-
-
-def _kinds_of(points: Points, cells: Cells, shape: NDArray[np.float64]) -> NDArray[np.str_]:
     kinds = np.full(len(cells), "good", dtype="<U6")
     is_bad = points.shape[1] * shape < BAD_SHAPE
     if points.shape[1] == 2:
@@ -270,7 +267,7 @@ def quality(points: Points, cells: Cells, midpoints: Points | None = None) -> Qu
         else curved_volumes(*quadratic(points, np.asarray(cells, dtype=np.int64), midpoints))
     )
     names = ("needle", "wedge", "cap", "spade", "sliver") if n == 3 else ("needle", "cap")
-    kinds = _kinds_of(points, cells, shape)
+    kinds = bad_kinds(points, cells, shape)
     return Quality(
         ndim=n,
         n_nodes=len(points),
