@@ -320,27 +320,16 @@ def content(
     weights = [1.0] * len(images) if weights is None else [float(w) for w in weights]
     _check(images, {"labels": labels, "mask": mask}, weights, label_weight)
     labels = None if labels is None else checked_labels("labels", labels, is_map=True)
-    region, beyond, whole = None, None, images[0]
-    if mask is not None:
-        beyond = continuation(mask, images[0].spacing)
-        region = region_of(_part(mask, beyond.part))
-        images = [continued(image, beyond) for image in images]
-        if labels is not None:
-            warn_of_absent("", labels, mask.data >= INSIDE_FRACTION, "mask")
-            labels = images[0] if labels is whole else continued(labels, beyond)
-    if labels is not None and labels.data.max() == BACKGROUND_LABEL:
-        where = "" if mask is None else " in the meshed region"
-        raise InputError(
-            f"labels: expected labels above 0{where}, got 0 in every voxel; is it the right file?"
-        )
+    whole = images[0]
+    images, labels, region, beyond = _within_mask(images, labels, mask)
+    result = Content(
+        images[0],
+        region=region,
+        continuation=beyond,
+        keeps_components=keep_components,
+        whole=whole,
+    )
     if len(images) == 1 and labels is None and weights[0] > 0.0:
-        result = Content(
-            images[0],
-            region=region,
-            continuation=beyond,
-            keeps_components=keep_components,
-            whole=whole,
-        )
         return result if region is None else result._replace(squared_spread=result.variance)
     members, n_rows = None, 0
     rows: NDArray[np.integer] = np.empty(0, dtype=np.int16)
@@ -365,16 +354,13 @@ def content(
         )
     values, whole_codes, scale = _whole_numbers(contrasts, images[0].shape, codes)
     unit = _variance(images[0].data, region) or 1.0
-    result = Content(
-        images[0],
-        values,
-        rows if n_rows > 0 else None,
-        whole_codes,
-        unit / scale**2,
-        region,
-        beyond,
-        keeps_components=keep_components,
-        whole=whole,
+    result = result._replace(
+        image=images[0],
+        contrasts=values,
+        rows=rows if n_rows > 0 else None,
+        codes=whole_codes,
+        unit=unit / scale**2,
+        region=region,
     )
     result = result._replace(squared_spread=result.variance)
     if members is None:
@@ -383,6 +369,28 @@ def content(
     return result._replace(
         smooth=SmoothLabels(members, channel.astype(np.int64), value, keep_volumes)
     )
+
+
+def _within_mask(
+    images: list[Image], labels: Image | None, mask: Image | None
+) -> tuple[list[Image], Image | None, Region | None, Continuation | None]:
+    """Images and labels continued beyond the mask, if there is one, its region and continuation;
+    raise InputError if no label is left.
+    """
+    region, beyond, whole = None, None, images[0]
+    if mask is not None:
+        beyond = continuation(mask, whole.spacing)
+        region = region_of(_part(mask, beyond.part))
+        images = [continued(image, beyond) for image in images]
+        if labels is not None:
+            warn_of_absent("", labels, mask.data >= INSIDE_FRACTION, "mask")
+            labels = images[0] if labels is whole else continued(labels, beyond)
+    if labels is not None and labels.data.max() == BACKGROUND_LABEL:
+        where = "" if mask is None else " in the meshed region"
+        raise InputError(
+            f"labels: expected labels above 0{where}, got 0 in every voxel; is it the right file?"
+        )
+    return images, labels, region, beyond
 
 
 def _finer_region(region: Region, factors: Sequence[int]) -> Region:

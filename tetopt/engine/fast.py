@@ -267,14 +267,7 @@ def followed(
         is_labelled = has_labels and gives_labels(iteration, course)
         if is_labelled:
             run.give_labels()
-        stars = None
-        if run.has_labels or run.state.sides.has_surface:
-            degrees = (
-                min(ATTRACTED_MIN_DIHEDRAL, min_dihedral)
-                if iteration <= course.n_early
-                else min_dihedral
-            )
-            stars = run.attract(degrees)
+        stars = attract_nodes(run, course, iteration)
         # 1. Move the nodes.
         is_early = nodes is not None and iteration <= course.n_early
         is_finished = run.sweep(is_over, EARLY_HOPE_FRACTION if is_early else HOPE_FRACTION, stars)
@@ -308,6 +301,14 @@ def followed(
         if is_last and fall < course.tolerance:  # interfaces that follow their surfaces may raise E
             return history, "converged" if abs(fall) < course.tolerance else "risen"
     return history, "iterations"
+
+
+def attract_nodes(run: Run, course: Course, iteration: int) -> NodeStars | None:
+    """Move nodes to their places at surfaces, if there are any, and return the stars."""
+    if not (run.has_labels or run.state.sides.has_surface):
+        return None
+    is_early = iteration <= course.n_early
+    return run.attract(min(ATTRACTED_MIN_DIHEDRAL if is_early else 180.0, course.min_dihedral))
 
 
 def gives_labels(iteration: int, course: Course) -> bool:

@@ -435,6 +435,19 @@ def _arc_of(work: Cavity, j: int) -> int:
     return work.arc[0] if 0 < work.arc[0] < j else 0
 
 
+@helper
+def _shape_of_ears(y: NDArray, m: int, limit: float, objective: Objective) -> float:
+    """Least shape energy of two ears of a polygon, triangles of three successive corners."""
+    low, lower = np.inf, np.inf
+    for k in range(m):
+        ear = _pair_shape(y, 2 + (k - 1) % m, 2 + k, 2 + (k + 1) % m, limit, objective)
+        if ear < lower:
+            low, lower = lower, ear
+        elif ear < low:
+            low = ear
+    return low + lower
+
+
 @unit
 def _worth_of_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: int) -> float:
     """Reduction of E by removing the edge (a, b), -inf if impossible; `work.apex` then holds the
@@ -458,19 +471,10 @@ def _worth_of_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: 
     load(y, 1, state.complex.ticks, b, a, state.objective)
     for r in range(m):
         load(y, 2 + r, state.complex.ticks, ring[r], a, state.objective)
-    # A triangulation's shape energy alone is a cheap lower bound, and so is that of its two ears,
-    # triangles of three successive corners: few edges pass them.
-    if m > 4:
-        low, lower = np.inf, np.inf  # the two cheapest ears
-        for k in range(m):
-            i, j = (k - 1) % m, (k + 1) % m
-            ear = _pair_shape(y, 2 + i, 2 + k, 2 + j, limit, state.objective)
-            if ear < lower:
-                low, lower = lower, ear
-            elif ear < low:
-                low = ear
-        if not low + lower < limit:
-            return -np.inf
+    # A triangulation's shape energy alone is a cheap lower bound, and so is that of its two ears:
+    # few edges pass them.
+    if m > 4 and not _shape_of_ears(y, m, limit, state.objective) < limit:
+        return -np.inf
     for i in range(m - 2):
         for k in range(i + 1, m - 1):
             for j in range(k + 1, m):
