@@ -11,7 +11,8 @@ from states import OBLIQUE, Engine, assumed_case, random_case
 from test_fast import dimensions, seeds
 
 import tetopt
-from tetopt.engine.complex import energies, node_stars
+from tetopt.energy.sampling import channel_grid
+from tetopt.engine.complex import energies, node_stars, remeasure
 from tetopt.engine.density import (
     EdgeMoves,
     Limits,
@@ -27,7 +28,9 @@ from tetopt.engine.density import (
 from tetopt.engine.flips import close_gaps
 from tetopt.engine.repair import cell_cosines
 from tetopt.engine.smooth import blocks
+from tetopt.engine.state import state_of
 from tetopt.geometry.simplex import volumes
+from tetopt.geometry.topology import boundary_facets
 from tetopt.start.carve import part_of
 
 
@@ -191,6 +194,30 @@ def test_edges_too_long_for_their_targets_are_split_first(n):
     middles = points[ends[is_one]].mean(axis=1)
     for point in engine.mesh.points[made.source < 0]:
         assert np.linalg.norm(middles - point, axis=1).min() < 1e-2  # ticks round them
+
+
+def test_pairs_of_collapses_on_a_mask_leave_its_surface_whole():
+    """With as many splits, and alone: the boundary stays one closed surface around a ball, marked
+    as such, and E changes as measured afresh.
+    """
+    at = np.stack(np.meshgrid(*[np.arange(20) - 9.5] * 3, indexing="ij"), axis=-1)
+    ball = tetopt.Image((np.linalg.norm(at, axis=-1) < 7.3).astype(float))
+    target = tetopt.content(ball, mask=ball)
+    mesh = tetopt.octree_mesh(target, 300)
+    state = state_of(target, mesh, channel_grid(target, mesh.points), 0.85, is_graded=True)
+    for fewer in (0, 40):
+        n_nodes = len(state.complex.ticks)
+        made = exchange(state, n_nodes - fewer, 30, no_limits(n_nodes))
+        assert made.n_collapsed - made.n_split == fewer
+        assert made.n_collapsed > 0
+        state, n_cells = made.state, int(made.state.complex.n_cells[0])
+        cells, sums = state.complex.cells[:n_cells], state.complex.sums[:n_cells].copy()
+        outer = boundary_facets(cells)
+        assert naive.euler(naive.faces_of(outer)) == 2
+        assert naive.euler(naive.faces_of(cells)) == 1
+        assert state.complex.is_frozen[np.unique(outer), 3].all()
+        remeasure(state)
+        np.testing.assert_allclose(state.complex.sums[:n_cells], sums, atol=1e-6 * sums.max())
 
 
 @pytest.mark.parametrize("is_bounded", [False, True])

@@ -89,7 +89,10 @@ def meeting_labels(state):
 
 
 def stated_labels(state):
-    return [set(row[row >= 0].tolist()) for row in state.complex.meeting]
+    """The labels stated for each node, which are in rising order."""
+    rows = [row[row >= 0].tolist() for row in state.complex.meeting]
+    assert rows == [sorted(row) for row in rows]
+    return [set(row) for row in rows]
 
 
 def swept(state):

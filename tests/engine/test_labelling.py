@@ -16,13 +16,17 @@ from tetopt.energy.sampling import cell_of_voxel
 from tetopt.engine import labelling
 from tetopt.engine.complex import fill_across
 from tetopt.engine.labelling import (
+    FINAL_PASSES,
+    LAST_PASSES,
     Contents,
+    Pass,
     components_of,
     keeps_topology,
+    label_cells,
     label_voxels,
-    labelled,
+    mend,
+    mend_labels,
     unfit_labels,
-    unpinched,
 )
 from tetopt.geometry.simplex import oriented, volumes
 from tetopt.geometry.topology import stars
@@ -49,18 +53,24 @@ class Labelling(NamedTuple):
     lost: list[int]  # labels with voxels but without cells
 
 
-def solved(points, cells, labels, n_labels=2, components=None, weight=None, counts=None):
-    """`labelled`, by default of cells that are full of one label each, and its defects."""
+@pytest.fixture
+def tension(monkeypatch):
+    """A function that sets the fraction of the local edge that is the tension."""
+    return lambda fraction: monkeypatch.setattr(labelling, "TENSION_FRACTION", fraction)
+
+
+def solved(points, cells, labels, n_labels=2, components=None, counts=None):
+    """`label_cells`, by default of cells that are full of one label each, and its defects."""
     counts = whole(labels, n_labels, volumes(points, cells)) if counts is None else counts
     components = [np.array([1])] * n_labels if components is None else components
     across = across_of(cells, len(points))
-    labels = labelled(points, cells, across, Contents(counts), components, False, weight)
+    labels = label_cells(points, cells, across, Contents(counts), components, False)
     return Labelling(
         labels,
         int((labels != counts.toarray().argmax(axis=1)).sum()),
         int(
             labelling._nonmanifold(
-                labelling._dual(points, cells, across, Contents(counts), weight), labels
+                labelling._dual(points, cells, across, Contents(counts)), labels
             )[1].sum()
         ),
         np.bincount(components_of(across, labels)[1], minlength=n_labels).tolist(),
@@ -126,7 +136,7 @@ def test_what_is_not_manifold_as_the_twin(n):
         points, cells = box(n, 20, seed) if seed else lattice(n, 2)
         labels = rng.integers(0, 2 + seed, len(cells))
         counts = whole(labels, 4, volumes(points, cells))
-        dual = labelling._dual(points, cells, across_of(cells, len(points)), Contents(counts), None)
+        dual = labelling._dual(points, cells, across_of(cells, len(points)), Contents(counts))
         faces, is_two = labelling._nonmanifold(dual, labels)
         bad = {
             frozenset(int(i) for i in face if i >= 0): two
@@ -148,7 +158,7 @@ def test_moves_lower_the_energy(n):
     points, cells = box(n, 40, 1)
     voxels = rng.random((len(cells), 3)) * volumes(points, cells)[:, None]
     dual = labelling._dual(
-        points, cells, across_of(cells, len(points)), Contents(csr_array(voxels)), 0.2
+        points, cells, across_of(cells, len(points)), Contents(csr_array(voxels))
     )
     labels = voxels.argmax(axis=1)
     voxels *= volumes(points, cells).sum() / voxels.sum()
@@ -174,24 +184,24 @@ def test_faults_that_are_skipped_are_none(monkeypatch, n):
     """The same labels whether or not sound nodes, and those where nothing changed, are skipped,
     for random content.
     """
-    mend, n_skipped = labelling._mend, 0
+    mend_places, n_skipped = labelling._mend_places, 0
 
     def without_marks(*arguments):
         nonlocal n_skipped
         *rest, marks, work = arguments
         n_skipped += np.count_nonzero(marks.is_sound)
         marks.is_due[:] = True
-        mend(*rest, marks._replace(is_sound=np.zeros_like(marks.is_sound)), work)
+        mend_places(*rest, marks._replace(is_sound=np.zeros_like(marks.is_sound)), work)
 
     for seed in range(8):
         rng = np.random.default_rng(seed)
         points, cells = box(n, 60, seed)
         counts = csr_array(rng.random((len(cells), 3)) ** 4 * volumes(points, cells)[:, None])
-        own = solved(points, cells, None, 3, counts=counts, weight=0.05)
+        own = solved(points, cells, None, 3, counts=counts)
         with monkeypatch.context() as patched:
-            patched.setattr(labelling, "_mend", without_marks)
+            patched.setattr(labelling, "_mend_places", without_marks)
             np.testing.assert_array_equal(
-                solved(points, cells, None, 3, counts=counts, weight=0.05).labels, own.labels
+                solved(points, cells, None, 3, counts=counts).labels, own.labels
             )
     assert n_skipped > 0
 
@@ -202,7 +212,7 @@ def test_a_bridge_is_the_cheapest():
     points, cells = box(3, 8, 4)
     voxels = np.random.default_rng(9).random((len(cells), 3)) * volumes(points, cells)[:, None]
     dual = labelling._dual(
-        points, cells, across_of(cells, len(points)), Contents(csr_array(voxels)), 0.1
+        points, cells, across_of(cells, len(points)), Contents(csr_array(voxels))
     )
     voxels *= volumes(points, cells).sum() / voxels.sum()
     labels = voxels.argmax(axis=1)
@@ -265,12 +275,13 @@ def test_a_ball_is_one_component_with_a_manifold_surface(seed):
     assert result.lost == []
 
 
-def test_tension_takes_half_of_a_label_at_most():
+def test_tension_takes_half_of_a_label_at_most(tension):
     """A ball smaller than three times the tension in radius would wither away; here it and its
     noise would.
     """
+    tension(3.0)
     mesh, image, counts = ball(11, 3.0, seed=0)
-    result = solved(mesh.points, mesh.cells, None, counts=counts, weight=5.0)
+    result = solved(mesh.points, mesh.cells, None, counts=counts)
     assert result.n_moved > 200
     assert volumes(mesh.points, mesh.cells[result.labels == 1]).sum() / image.data.sum() > 0.45
 
@@ -343,8 +354,9 @@ def test_what_hangs_together_in_the_voxels_is_bridged():
         assert (result.labels[is_small] == 1).mean() > 0.5
 
 
-def test_cubes_that_touch_at_an_edge_or_a_corner_are_linked_or_parted():
+def test_cubes_that_touch_at_an_edge_or_a_corner_are_linked_or_parted(tension):
     """A lattice of cubes, two of which have the label: what they share is no longer pinched."""
+    tension(1e-6)
     image = tetopt.Image(np.zeros((4, 4, 4)))
     mesh = tetopt.lattice_mesh(image, "five-tet", blocks=(4, 4, 4))
     cube = np.floor(mesh.points[mesh.cells].mean(axis=1) + 0.5).astype(int)
@@ -356,7 +368,6 @@ def test_cubes_that_touch_at_an_edge_or_a_corner_are_linked_or_parted():
             mesh.cells,
             labels,
             components=[np.array([60]), np.array([1, 1])],
-            weight=1e-6,
         )
         assert naive.nonmanifold(mesh.cells, result.labels) == {}
         assert result.n_nonmanifold == 0
@@ -370,21 +381,22 @@ def test_two_cells_mend_what_one_cell_or_a_fan_does_not(seed):
     labels = np.sin(middle @ rng.normal(size=3)) + np.sin(middle @ rng.normal(size=3) * 1.3) > 0.0
     labels, across = labels.astype(np.int64), across_of(cells, len(points))
     contents = Contents(whole(labels, 2, volumes(points, cells)))
-    by_one, dual = labels.copy(), labelling._dual(points, cells, across, contents, None)
-    labelling._mend_pairs(dual, by_one, np.array([[dual.size.min()] * 2, [np.inf] * 2]), labels < 0)
-    by_two = unpinched(
-        points, cells, across, contents, labels, np.full(2, volumes(points, cells).sum())
-    )
+    by_one, dual = labels.copy(), labelling._dual(points, cells, across, contents)
+    aim = np.full(2, dual.size.sum())
+    one_cell = FINAL_PASSES[0]._replace(has_pairs=False)
+    mend(dual, by_one, labels < 0, labelling._targets(dual, aim), one_cell)
+    by_two = mend_labels(points, cells, across, contents, labels, aim)
     assert len(naive.nonmanifold(cells, by_one)) > len(naive.nonmanifold(cells, by_two)) == 0
 
 
 @pytest.mark.parametrize(
     ("share", "n_voxels", "is_kept"), [(0.35, 1.0, True), (0.25, 1.0, False), (0.35, 0.6, False)]
 )
-def test_a_piece_of_a_label_gets_the_cell_that_it_fits(share, n_voxels, is_kept):
+def test_a_piece_of_a_label_gets_the_cell_that_it_fits(tension, share, n_voxels, is_kept):
     """One that fills a third of a cell, but not one that fills a quarter, or is far smaller than
     the cell.
     """
+    tension(1e-9)
     points, cells = lattice(3, 5)
     size, labels = volumes(points, cells), (points[cells].mean(axis=1)[:, 0] < 1.5).astype(np.int64)
     full = whole(labels, 2, size).toarray()
@@ -393,17 +405,67 @@ def test_a_piece_of_a_label_gets_the_cell_that_it_fits(share, n_voxels, is_kept)
     held = np.append(share, np.full(4, (n_voxels - share) / 4)) * size[piece]
     pieces = csr_array((held, (np.zeros(5, dtype=int), piece - np.arange(5))), (1, len(cells)))
     contents = Contents(csr_array(full), None, pieces, np.array([1]))
-    made = labelled(
-        points, cells, across_of(cells, len(points)), contents, [np.array([1])] * 2, weight=1e-9
-    )
+    rest = points, cells, across_of(cells, len(points))
+    made = label_cells(*rest, contents, [np.array([1])] * 2)
     assert (made[piece] == 1) == is_kept
     assert (made != labels).sum() == is_kept
     twice = Contents(csr_array(full), None, vstack([pieces, pieces]).tocsr(), np.array([1, 1]))
-    again = labelled(
-        points, cells, across_of(cells, len(points)), twice, [np.array([1])] * 2, weight=1e-9
-    )
+    again = label_cells(*rest, twice, [np.array([1])] * 2)
     assert again.tolist() == made.tolist()
     assert naive.nonmanifold(cells, made) == {}
+
+
+def random_labels(seed, n_labels, **contacts):
+    """A mesh whose cells are full of random labels: what `mend` needs, and the labels."""
+    points, cells = box(3, 24, seed)
+    labels = np.random.default_rng(seed).integers(0, n_labels, len(cells))
+    size = volumes(points, cells)
+    contents = Contents(whole(labels, n_labels, size), **contacts)
+    dual = labelling._dual(points, cells, across_of(cells, len(points)), contents)
+    return dual, labels, labelling._targets(dual, np.full(n_labels, size.sum()))
+
+
+def test_limits_of_a_pass():
+    """Fractions of the volume near the surface, but never less than a fit cell."""
+    targets = labelling.Targets(np.array([10.0, 1.0]), np.array([4.0, 1.0]), np.array([0.5, 0.2]))
+    assert targets.bounds(Pass(0.25, 0.5)).tolist() == [[9.0, 0.75], [12.0, 1.5]]
+    assert targets.bounds(Pass(0.9, 0.0))[0] == pytest.approx([6.4, 0.2])
+    assert targets.bounds(FINAL_PASSES[0])[0].tolist() == [0.5, 0.2]
+
+
+def test_a_narrow_pass_mends_two_labels_only():
+    """Places of three labels are left to a wide one."""
+    dual, labels, targets = random_labels(3, 3)
+    is_kept, narrow = np.zeros(len(labels), dtype=bool), FINAL_PASSES[0]
+    assert labelling._nonmanifold(dual, labels)[1].any()
+    mend(dual, labels, is_kept, targets, narrow)
+    before = labels.copy()
+    mend(dual, labels, is_kept, targets, narrow)
+    assert (labels == before).all()
+    mend(dual, labels, is_kept, targets, narrow._replace(is_wide=True))
+    assert (labels != before).any()
+
+
+def test_kept_cells_stay():
+    dual, labels, targets = random_labels(5, 2)
+    before, is_kept = labels.copy(), np.random.default_rng(0).random(len(labels)) < 0.7
+    mend(dual, labels, is_kept, targets, FINAL_PASSES[0])
+    assert (labels[is_kept] == before[is_kept]).all()
+    assert (labels != before).any()
+
+
+def test_false_contact_counts_but_in_the_last_pass(monkeypatch):
+    dual, labels, targets = random_labels(5, 2)
+    apart = labelling.Contacts(~np.eye(2, dtype=bool), np.zeros(len(labels), dtype=bool))
+    counts = []
+
+    def record(dual, *_):
+        counts.append(bool(dual.contacts.is_apart.any()))
+
+    monkeypatch.setattr(labelling, "_mend_places", record)
+    for limits in (*LAST_PASSES, *FINAL_PASSES):
+        mend(dual._replace(contacts=apart), labels, labels < 0, targets, limits)
+    assert counts == [True] * (len(counts) - 1) + [False]
 
 
 @pytest.mark.parametrize(("aim", "is_kept"), [(3.2, True), (3.5, False), (1e9, False)])
@@ -414,7 +476,7 @@ def test_a_label_with_next_to_nothing_of_its_volume_goes_from_finished_cells(aim
     labels[np.argmin(size)] = 1
     assert size.min() < 0.1 * size.mean()
     volume = np.array([size.sum(), aim * size.min()])
-    made = unpinched(
+    made = mend_labels(
         points,
         cells,
         across_of(cells, len(points)),
@@ -426,25 +488,27 @@ def test_a_label_with_next_to_nothing_of_its_volume_goes_from_finished_cells(aim
     assert unfit_labels(labels, size, volume).tolist() == [False, not is_kept]
 
 
-def test_a_label_of_one_cell_stays_and_one_without_is_lost():
+def test_a_label_of_one_cell_stays_and_one_without_is_lost(tension):
     """However much tension there is."""
+    tension(30.0)
     mesh, _, counts = ball()
     full = np.column_stack([counts.toarray(), np.zeros((len(mesh.cells), 2))])
     full[100] = [0.0, 0.0, full[100].sum(), 0.0]
     full[200, 3] = 0.1
-    result = solved(mesh.points, mesh.cells, None, 4, counts=csr_array(full), weight=50.0)
+    result = solved(mesh.points, mesh.cells, None, 4, counts=csr_array(full))
     assert (result.labels == 2).any()
     assert result.lost == [3]
 
 
-def test_no_label_goes_for_a_bridge():
+def test_no_label_goes_for_a_bridge(tension):
     """Three triangles in a row: the way between the outer ones is the only cell of another
     label, and stays so.
     """
+    tension(1e-9)
     points = np.array([[0.0, 0.0], [2.0, 0.0], [1.0, 1.5], [3.0, 1.5], [4.0, 0.0]])
     cells = np.array([[0, 1, 2], [1, 3, 2], [1, 4, 3]])
     counts = csr_array([[1.0, 0.0], [0.08, 0.1], [1.0, 0.0]])
-    result = solved(points, cells, None, counts=counts, components=[np.array([2])] * 2, weight=1e-9)
+    result = solved(points, cells, None, counts=counts, components=[np.array([2])] * 2)
     assert result.labels.tolist() == [0, 1, 0]
     assert result.lost == []
 

@@ -9,9 +9,10 @@ from test_labelling import across_of, lattice
 
 import tetopt
 from tetopt.contents.memberships import labels_at, memberships
+from tetopt.engine import labelling
 from tetopt.engine.fast import BAND_FRACTION, MOST_OFFSET_FRACTION, Run
 from tetopt.engine.interfaces import FEWEST_CENTRES, PART_CENTRES, SAMPLED_FRACTION, cell_contents
-from tetopt.engine.labelling import Contents, label_voxels, labelled
+from tetopt.engine.labelling import Contents, label_cells, label_voxels
 from tetopt.engine.surface import fill_offsets
 from tetopt.geometry.simplex import volumes
 from tetopt.measure.interfaces import label_interfaces
@@ -157,15 +158,16 @@ def slab(n, cubes):
 
 
 @pytest.mark.parametrize("n", [2, 3])
-def test_a_thin_label_keeps_its_volume(n):
+def test_a_thin_label_keeps_its_volume(monkeypatch, n):
     """A label that fills a third of the cells of a slab gets a third of these, or none without a
     bias.
     """
+    monkeypatch.setattr(labelling, "TENSION_FRACTION", 1e-3)
     points, cells, across, size, share = slab(n, 4)
     counts = csr_array(np.column_stack([(1.0 - share) * size, share * size]))
-    kept = labelled(points, cells, across, Contents(counts), NO_COMPONENTS[:2], weight=1e-3)
-    lost = labelled(
-        points, cells, across, Contents(counts), NO_COMPONENTS[:2], keeps_volumes=False, weight=1e-3
+    kept, lost = (
+        label_cells(points, cells, across, Contents(counts), NO_COMPONENTS[:2], keeps)
+        for keeps in (True, False)
     )
     aim = (share * size).sum()
     assert size[kept == 1].sum() == pytest.approx(aim, rel=0.35)
@@ -173,14 +175,15 @@ def test_a_thin_label_keeps_its_volume(n):
 
 
 @pytest.mark.parametrize("fullest", [0.15, 0.25, 0.35, 0.44])
-def test_a_slab_thinner_than_cells_keeps_its_volume(fullest):
+def test_a_slab_thinner_than_cells_keeps_its_volume(monkeypatch, fullest):
     """A label that fills up to a sixth, or nearly half, of each of its cells: not 1.7 times what
     it fills.
     """
+    monkeypatch.setattr(labelling, "TENSION_FRACTION", 1e-3)
     points, cells, across, size, share = slab(3, 6)
     share *= fullest / share.max()
     counts = csr_array(np.column_stack([(1.0 - share) * size, share * size]))
-    made = labelled(points, cells, across, Contents(counts), NO_COMPONENTS[:2], weight=1e-3)
+    made = label_cells(points, cells, across, Contents(counts), NO_COMPONENTS[:2])
     assert size[made == 1].sum() / (share * size).sum() == pytest.approx(1.0, abs=0.2)
 
 

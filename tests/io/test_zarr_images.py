@@ -122,9 +122,9 @@ def test_a_phantom_by_chunks_is_the_one_in_memory(tmp_path, monkeypatch):
         load_phantom("layered_oblique"),
         {"voxel_mm": [2, 2, 3], "blur_mm": 1.0, "noise_sd": 5.0},
     )
-    voxels, path = phantom.voxels(**options), tmp_path / "a.zarr"
-    low, high = save_zarr(path, voxels.affine, voxels, np.int16)
-    image, whole = load_image(path), phantom.image(**options)
+    whole, path = phantom.image(**options), tmp_path / "a.zarr"
+    low, high = save_zarr(path, whole.affine, whole.data, np.int16)
+    image = load_image(path)
     stored = image.data
     np.testing.assert_array_equal(stored, np.rint(whole.data))
     assert (low, high) == (stored.min(), stored.max())
@@ -225,7 +225,7 @@ def test_only_a_folder_of_zarr_is_replaced(tmp_path, monkeypatch, capfd):
         "expected a file to write, found an unrelated folder",
     )
     command_refused(capfd, [*command[:-1], "no/c.zarr"], "its folder does not exist")
-    command_refused(capfd, ["phantom", "disc_2d", "-o", "d.zarr"], "expected a 3-D phantom")
+    command_refused(capfd, ["phantom", "disc_2d", "-o", "d.zarr"], "expected a 3-D image for Zarr")
     assert sorted(each.name for each in tmp_path.iterdir()) == ["a.zarr", "b.zarr", "c.zarr"]
 
 

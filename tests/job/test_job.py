@@ -1,6 +1,7 @@
 """A job: every option once, checked when it is made, in JSON and back."""
 
 import inspect
+import json
 from dataclasses import fields
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import tetopt
 from tetopt import InputError, Job
 from tetopt.cli.app import main
 from tetopt.job.options import JobOptions, RunOptions, given_options, kinds_of, option_of
+from tetopt.job.texts import option_words
 
 FILES = {"images": "a.nii", "output": "a.vtu"}
 
@@ -35,6 +37,14 @@ def test_values_are_brought_to_the_kinds_of_their_options():
         4,
     )
     assert type(job.nodes) is type(job.iterations) is int
+
+
+@pytest.mark.parametrize(("value", "is_on"), [(True, True), (0.3, True), (0, False), (0.0, False)])
+def test_smooth_interfaces_were_a_number_of_voxels(value, is_on):
+    job = Job.from_json(json.dumps({**FILES, "labels": "l.nii", "smooth_interfaces": value}))
+    assert job.smooth_interfaces is is_on
+    assert given_options(job).get("smooth-interfaces", True) is is_on
+    assert option_words(given_options(job)).count("--no-smooth-interfaces") == (not is_on)
 
 
 @pytest.mark.parametrize(

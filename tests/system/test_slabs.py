@@ -110,3 +110,16 @@ def test_counts_are_summed_within_a_byte_per_element(many_slabs, n_counts):
     assert (total == 40).all()
     assert len(sizes) == 1 or sum(sizes) <= 4000
     assert n_counts > 20 or len(sizes) > 1
+
+
+def test_pairs_are_counted():
+    """As by numpy; negative numbers are outside, and rows without a pair stay empty."""
+    rng = np.random.default_rng(0)
+    rows, columns = rng.integers(-1, 6, (9, 8, 7)), rng.integers(-1, 4, (9, 8, 7)).astype(np.int16)
+    is_in = (rows >= 0) & (columns >= 0)
+    expected = np.zeros((8, 4))
+    np.add.at(expected, (rows[is_in], columns[is_in]), 1.0)
+    counts = slabs.count_pairs(rows, columns, (8, 4))
+    assert counts.toarray().tolist() == expected.tolist()
+    assert counts.has_sorted_indices
+    assert slabs.count_pairs(rows[:0], columns[:0], (2, 3)).nnz == 0

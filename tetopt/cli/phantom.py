@@ -9,6 +9,7 @@ from tetopt import load_phantom, save_image
 from tetopt.cli.console import print_line
 from tetopt.cli.options import ForceOption
 from tetopt.io.images import OUTPUT_SUFFIXES
+from tetopt.io.zarr_images import ZARR_SUFFIX, is_node
 from tetopt.job.options import Option
 from tetopt.system.files import checked_output
 
@@ -19,11 +20,7 @@ def phantom_command(
     ],
     output: Annotated[
         Path,
-        Option(
-            "IMAGE.nii.gz",
-            "The image to write.",
-            letter="o",
-        ),
+        Option("IMAGE.nii.gz", "The image to write, as NIfTI or a folder X.zarr.", letter="o"),
     ],
     voxel_mm: Annotated[float | None, Option("MM", "Voxel size instead of the phantom's.")] = None,
     blur_mm: Annotated[float | None, Option("MM", "Standard deviation of a Gaussian blur.")] = None,
@@ -37,7 +34,10 @@ def phantom_command(
     """Write a phantom as an image of known shapes and intensities."""
     if labels is not None:
         labels = checked_output(labels, OUTPUT_SUFFIXES, force)
-    output = checked_output(output, OUTPUT_SUFFIXES, force)
+    is_folder = output.name.lower().endswith(ZARR_SUFFIX)
+    output = checked_output(
+        output, (*OUTPUT_SUFFIXES, ZARR_SUFFIX), force, is_node if is_folder else None
+    )
     phantom = load_phantom(name)
     image = phantom.image(voxel_mm=voxel_mm, blur_mm=blur_mm, noise_sd=noise_sd, seed=seed)
     save_image(output, image)

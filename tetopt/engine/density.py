@@ -61,7 +61,15 @@ from tetopt.engine.smooth import (
     star_shape,
     trial_of,
 )
-from tetopt.engine.surface import MOST_MEETING, faces_up, put_on_surface, star_faces_up, uphill_at
+from tetopt.engine.surface import (
+    MOST_MEETING,
+    faces_up,
+    insert_label,
+    is_among,
+    put_on_surface,
+    star_faces_up,
+    uphill_at,
+)
 from tetopt.geometry.topology import compact
 from tetopt.geometry.vectors import dot, minus, put_row, row
 from tetopt.start.sizes import LONG_EDGE
@@ -426,19 +434,10 @@ def _put_middle(state: State, stars: NodeStars, a: int, b: int, p: int) -> bool:
     return True
 
 
-@helper
-def is_among(label: int, labels: NDArray) -> bool:
-    """True if a label is one of several."""
-    is_one = False
-    for other in labels:
-        is_one = is_one or other == label
-    return is_one
-
-
 @unit
 def labels_of_edge(meeting: Ints1, state: State, stars: NodeStars, a: int, b: int) -> int:
-    """Write the labels around an edge to `meeting` (4,) if there are 2 to 4, else -1; return
-    their number.
+    """Write the labels around an edge to `meeting` (4,), rising, if there are 2 to 4, else -1;
+    return their number.
     """
     count = 0
     for m in range(MOST_MEETING):
@@ -447,11 +446,7 @@ def labels_of_edge(meeting: Ints1, state: State, stars: NodeStars, a: int, b: in
         cell = stars.cells[r]
         if not has_node(state.complex.cells, cell, b):
             continue
-        label = state.complex.labels[cell]
-        if not is_among(label, meeting[: min(count, MOST_MEETING)]):
-            if count < MOST_MEETING:
-                meeting[count] = label
-            count += 1
+        count = insert_label(meeting, count, state.complex.labels[cell])
     if count == 1:
         meeting[0] = -1
     return count

@@ -417,7 +417,7 @@ class Run:
         return int(self.state.complex.n_cells[0])
 
     def E(self) -> float:
-        """The combined energy that moves lower: Eq. (4), or with labels that of their own values."""
+        """The combined energy that moves lower: Eq. (4), with labels that of their values."""
         E_G, squares = content_energies(self.state, self.content)
         return self.state.objective.geometry * E_G + self.state.objective.image * squares
 

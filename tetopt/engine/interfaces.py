@@ -6,9 +6,7 @@ The label of a cell follows from its voxels, tension and topology (`tetopt.engin
 from __future__ import annotations
 
 import itertools
-from typing import NamedTuple
 
-import numba
 import numpy as np
 import scipy
 from numpy.typing import NDArray
@@ -21,19 +19,18 @@ from tetopt.engine.labelling import (
     Contacts,
     Contents,
     LabelVoxels,
-    labelled,
+    label_cells,
+    mend_labels,
     unfit_labels,
-    unpinched,
 )
-from tetopt.engine.surface import MOST_MEETING
+from tetopt.engine.surface import MOST_MEETING, insert_label
 from tetopt.geometry.manifold import OUTSIDE_LABEL, pinches
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import facets
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.system.kernel_cache import njit
 from tetopt.system.kernels import entry, unit
-from tetopt.system.slabs import over_slabs
+from tetopt.system.slabs import count_pairs, over_slabs
 
 # of voxels that determine a cell's labels; in cells with fewer, levels are sampled
 FEWEST_CENTRES = 20
@@ -53,7 +50,7 @@ def with_labels(
     n_cells, image = len(mesh.cells), content.image
     across = state.complex.across[:n_cells]
     contents = cell_contents(image, members, mesh, voxels)
-    state.complex.labels[:n_cells] = labelled(
+    state.complex.labels[:n_cells] = label_cells(
         mesh.points, mesh.cells, across, contents, voxels.components, keeps_volumes
     )
     objective = state.objective._replace(
@@ -87,7 +84,7 @@ def mend_pinches(
         (places.labels[:, 0] != OUTSIDE_LABEL).any() for places in (of_ridges, of_nodes)
     ):
         contents = cell_contents(image, members, mesh, voxels)
-        labels[:] = unpinched(mesh.points, mesh.cells, across, contents, labels, aim)
+        labels[:] = mend_labels(mesh.points, mesh.cells, across, contents, labels, aim)
         _meet_everywhere(state, node_stars(state))
 
 
@@ -98,44 +95,19 @@ def cell_contents(image: Image, members: Memberships, mesh: Mesh, voxels: LabelV
     A cell of a thin sheet may contain one centre, or none. Levels are sampled at the centres of
     equal parts.
     """
-    n_cells, n_labels, inner = len(mesh.cells), len(members.labels), PART_CENTRES[image.ndim]
-    owner, partition = cell_of_voxel(image, mesh).ravel(), members.partition.ravel()
-
-    def count(first: int, stop: int) -> _Counted:
-        counted = _Counted(
-            first, stop, np.zeros(n_cells, dtype=np.int64), np.zeros(n_labels, dtype=np.int64)
-        )
-        _count_centres(counted.n_owned, counted.n_of, owner[first:stop], partition[first:stop])
-        return counted
-
-    counted = over_slabs(count, len(owner), len(owner), numba.get_num_threads())
-    n_owned, n_of = (np.sum(each, axis=0) for each in list(zip(*counted, strict=True))[2:])
-    is_sampled = n_owned < FEWEST_CENTRES
-    start = np.append(0, np.cumsum(np.where(is_sampled, len(inner), n_owned)))
-    entries = np.empty(start[-1], dtype=np.int32)
-    # Each slab's centres of a cell follow those of the slabs before.
-    places = np.cumsum([start[:-1], *(each.n_owned for each in counted[:-1])], axis=0)
-
-    def place(first: int, stop: int) -> None:
-        for each, at in zip(counted[first:stop], places[first:stop], strict=True):
-            _place_centres(
-                entries,
-                at,
-                owner[each.first : each.stop],
-                partition[each.first : each.stop],
-                is_sampled,
-            )
-
-    over_slabs(place, len(counted), len(owner))
+    shape, inner = (len(mesh.cells), len(members.labels)), PART_CENTRES[image.ndim]
+    owner = cell_of_voxel(image, mesh).ravel()
+    centres = count_pairs(owner, members.partition.ravel(), shape)
+    n_owned, is_sampled = centres.sum(axis=1), centres.sum(axis=1) < FEWEST_CENTRES
     sampled, index = np.flatnonzero(is_sampled), image.to_index(mesh.points)
 
-    def sample(first: int, stop: int) -> None:
-        part = sampled[first:stop]
-        entries[start[part, None] + np.arange(len(inner))] = labels_at(
-            members, index, mesh.cells[part], inner
-        )
+    def sample(first: int, stop: int) -> NDArray[np.int64]:
+        return labels_at(members, index, mesh.cells[sampled[first:stop]], inner)
 
-    over_slabs(sample, len(sampled), len(inner) * len(sampled), 1 + len(sampled) // SAMPLED_AT_ONCE)
+    most = 1 + len(sampled) // SAMPLED_AT_ONCE
+    there = over_slabs(sample, len(sampled), len(inner) * len(sampled), most)
+    of_sample = np.repeat(sampled, len(inner))
+    samples = count_pairs(of_sample, np.concatenate(there).ravel(), shape)
     # Not 1 per centre: among cells of about `FEWEST_CENTRES`, those with more centres than their
     # volume are counted.
     each = (
@@ -143,104 +115,24 @@ def cell_contents(image: Image, members: Memberships, mesh: Mesh, voxels: LabelV
         / image.voxel_volume
         / np.where(is_sampled, len(inner), n_owned)
     )
-    first = np.zeros(n_cells + 1, dtype=np.int64)
-    over_slabs(
-        lambda a, b: _count_kinds(first, entries, start, n_labels, (a, b)), n_cells, len(entries)
-    )
-    np.cumsum(first, out=first)
-    row, volume = np.empty(first[-1], dtype=np.int64), np.empty(first[-1])
-    over_slabs(
-        lambda a, b: _sum_kinds(row, volume, first, entries, start, each, n_labels, (a, b)),
-        n_cells,
-        len(entries),
-    )
-    counts = scipy.sparse.csr_array((volume, row, first), shape=(n_cells, n_labels))
+    counts = _diagonal(each) @ (_diagonal(~is_sampled) @ centres + samples)
     # Samples may miss a label of a voxel or two, so its centres count.
-    is_unseen = np.bincount(row, volume, n_labels) < SAMPLED_FRACTION * n_of
-    if is_unseen.any():
-        centre = np.flatnonzero(is_unseen[partition] & (owner >= 0))
-        centre = centre[is_sampled[owner[centre]]]
-        at = owner[centre], partition[centre]
-        counts = counts + scipy.sparse.csr_array((np.ones(len(centre)), at), shape=counts.shape)
-    is_place = np.zeros(n_cells + 1, dtype=bool)
+    is_unseen = counts.sum(axis=0) < SAMPLED_FRACTION * centres.sum(axis=0)
+    counts = counts + _diagonal(is_sampled) @ centres @ _diagonal(is_unseen)
+    counts.eliminate_zeros()
+    counts.sort_indices()
+    is_place = np.zeros(shape[0] + 1, dtype=bool)
     is_place[owner[voxels.places]] = True
     pieces, holder = voxels.pieces, owner[voxels.pieces.voxels]
     piece, cell = pieces.piece[holder >= 0], holder[holder >= 0]
     in_cells = scipy.sparse.csr_array(
-        (np.ones(len(cell)), (piece, cell)), shape=(len(pieces.label), n_cells)
+        (np.ones(len(cell)), (piece, cell)), shape=(len(pieces.label), shape[0])
     )
     return Contents(counts, Contacts(voxels.is_apart, is_place[:-1].copy()), in_cells, pieces.label)
 
 
-class _Counted(NamedTuple):
-    """Voxel centres in a slab of the voxels."""
-
-    first: int
-    stop: int
-    n_owned: NDArray[np.int64]  # (M,) in each cell
-    n_of: NDArray[np.int64]  # (K,) of each label in any cell
-
-
-@njit(cache=True, nogil=True)
-def _count_centres(n_owned: NDArray, n_of: NDArray, owner: NDArray, partition: NDArray) -> None:
-    """Count the voxel centres in each cell, and those of each label in any of them."""
-    for v in range(len(owner)):
-        if owner[v] >= 0:
-            n_owned[owner[v]] += 1
-            n_of[partition[v]] += 1
-
-
-@njit(cache=True, nogil=True)
-def _place_centres(
-    entries: NDArray, end: NDArray, owner: NDArray, partition: NDArray, is_sampled: NDArray
-) -> None:
-    for v in range(len(owner)):
-        cell = owner[v]
-        if cell >= 0 and not is_sampled[cell]:
-            entries[end[cell]] = partition[v]
-            end[cell] += 1
-
-
-@njit(cache=True, nogil=True)
-def _count_kinds(
-    first: NDArray, entries: NDArray, start: NDArray, n_labels: int, ends: tuple[int, int]
-) -> None:
-    """Count the labels present in each of some cells."""
-    last = np.full(n_labels, -1, dtype=np.int64)
-    for cell in range(*ends):
-        for i in range(start[cell], start[cell + 1]):
-            if last[entries[i]] != cell:
-                last[entries[i]] = cell
-                first[cell + 1] += 1
-
-
-@njit(cache=True, nogil=True)
-def _sum_kinds(
-    row: NDArray,
-    volume: NDArray,
-    first: NDArray,
-    entries: NDArray,
-    start: NDArray,
-    each: NDArray,
-    n_labels: int,
-    ends: tuple[int, int],
-) -> None:
-    total, last = np.zeros(n_labels), np.full(n_labels, -1, dtype=np.int64)
-    for cell in range(*ends):
-        end = first[cell]
-        for i in range(start[cell], start[cell + 1]):
-            label = entries[i]
-            if last[label] != cell:
-                last[label], total[label] = cell, 0.0
-                m = end
-                while m > first[cell] and row[m - 1] > label:  # in rising order
-                    row[m] = row[m - 1]
-                    m -= 1
-                row[m] = label
-                end += 1
-            total[label] += each[cell]
-        for m in range(first[cell], end):
-            volume[m] = total[row[m]]
+def _diagonal(values: NDArray) -> scipy.sparse.csr_array:
+    return scipy.sparse.diags_array(values.astype(np.float64), format="csr")
 
 
 def _samples(n: int, parts: int) -> NDArray[np.float64]:
@@ -272,16 +164,7 @@ def _meet(state: State, stars: NodeStars, node: int) -> None:
     for m in range(MOST_MEETING):
         meeting[m] = -1
     for r in range(stars.start[node], stars.start[node + 1]):
-        label, is_new = state.complex.labels[stars.cells[r]], True
-        for m in range(count):
-            is_new = is_new and meeting[m] != label
-        if is_new and count < MOST_MEETING:
-            m = count
-            while m > 0 and meeting[m - 1] > label:  # in rising order
-                meeting[m] = meeting[m - 1]
-                m -= 1
-            meeting[m] = label
-            count += 1
+        count = insert_label(meeting, count, state.complex.labels[stars.cells[r]])
     if count == 1:
         meeting[0] = -1
 

@@ -49,14 +49,7 @@ from tetopt.system.slabs import over_slabs, sum_over_slabs
 
 # of the local edge; with 0.1, white matter keeps .83, not .87, of its area (MNI152, 5,000)
 TENSION_FRACTION = 0.05
-# of a label's volume near its surface, the most that tension and mending may take, and that mending
-# may add: with a tenth and a fifth of the whole volume, Dice of white matter is .866, not .884
-# (MNI152, 5,000 nodes), and ribs of a CT have .57 of their volume, not .68
-LARGEST_LOSS, LARGEST_GAIN = 0.1, 0.05
 FRAGMENT_FRACTION = 0.1  # of a label's volume: larger components of cells are not given away
-# of a label's volume, at least and at most, at the end, while two labels have pinches: with the
-# last pair alone, a ball of 46 cells loses a third
-LAST_FRACTIONS = (0.9, 1.2), (0.65, 1.5), (0.05, 3.0)
 # of the volume of a label, or of a mean cell if that is less: with no more, it is dropped
 UNFIT_FRACTION = 0.3
 # least voxels of a component of voxels, relative to those of a component of cells, to justify the
@@ -90,6 +83,30 @@ MOST_FILLED = 1.5
 LEAST_GAIN = 1e-9  # of a cell's volume: smaller gains are rounding
 DOUBTFUL_STEPS = 8  # see `_count_steps`
 STAR_CELLS = 100  # work per node in a search for faults, in the unit of `over_slabs`
+
+
+class Pass(NamedTuple):
+    """Limits of one pass of mending."""
+
+    # of a label's volume near its surface, the most that its cells may lack and exceed
+    loss: float
+    gain: float
+    is_wide: bool = False  # True: also where three or more labels meet
+    has_pairs: bool = False  # True: two cells may change together
+    has_contacts: bool = True  # False: labels that are apart may touch
+
+
+# The first also limits what tension may take. With .1 and .2 of the whole volume in it, Dice of
+# white matter is .866, not .884 (MNI152, 5,000 nodes), and ribs of a CT have .57 of their volume,
+# not .68. With the last one of a labelling alone, a ball of 46 cells loses a third.
+CHEAP_PASS = Pass(0.1, 0.05, is_wide=True)
+LAST_PASSES = Pass(0.1, 0.2), Pass(0.35, 0.5), Pass(0.95, 2.0)
+ANY_VOLUME = 1e9  # of the volume near a surface: at any cost
+# of a finished mesh; false contact may forbid all moves that are left
+FINAL_PASSES = (
+    Pass(ANY_VOLUME, ANY_VOLUME, has_pairs=True),
+    Pass(ANY_VOLUME, ANY_VOLUME, has_pairs=True, has_contacts=False),
+)
 
 
 class Pieces(NamedTuple):
@@ -144,17 +161,29 @@ class Dual(NamedTuple):
     row: Ints1  # labels in it
     volume: Floats1  # of their voxels in it, mm^n
     contacts: Contacts
-    bias: Floats1  # (K,) bonus of each label, by volume; see `labelled`
+    bias: Floats1  # (K,) bonus of each label, by volume; see `label_cells`
 
 
-def labelled(
+class Targets(NamedTuple):
+    """Volumes of labels, (K,) mm^n."""
+
+    volume: Floats1  # of their voxels
+    near: Floats1  # of those near their surfaces
+    fit: Floats1  # below which cells are next to nothing of a label, and of a mean cell
+
+    def bounds(self, limits: Pass) -> NDArray[np.float64]:
+        """The least and largest volumes that a pass allows, (2, K)."""
+        least = np.maximum(self.volume - limits.loss * self.near, self.fit)
+        return np.stack([least, self.volume + limits.gain * self.near])
+
+
+def label_cells(
     points: NDArray[np.float64],
     cells: NDArray[np.int64],
     across: NDArray[np.int64],
     contents: Contents,
     components: list[NDArray],
     keeps_volumes: bool = True,
-    weight: float | None = None,
 ) -> NDArray[np.int64]:
     """Label each cell of a mesh close to its voxels, with short, manifold interfaces and without
     fragments.
@@ -182,80 +211,28 @@ def labelled(
         Give a bonus to labels that lack volume: a label that is thinner than cells has most of the
         voxels in few of them. The bonus is in proportion to the loss, so that the overlap that it
         costs is bounded (`MOST_BIAS`). Large components of voxels keep a cell, too.
-    weight : float, optional
-        Surface tension, mm; by default `TENSION_FRACTION` of the mean edge of the two cells at each
-        facet.
 
     Returns
     -------
     (M,) int64
         The label of each cell, as rows of the labels.
     """
-    dual = _dual(points, cells, across, contents, weight)
+    dual = _dual(points, cells, across, contents)
     voxel = float(dual.volume.sum() / contents.counts.sum())
-    aim = np.bincount(dual.row, dual.volume, len(dual.bias)).astype(np.float64)
-    bounds = _bounds(dual, aim)
-    if keeps_volumes:
-        _balance(dual, aim, bounds[0])
-    labels = _given(dual, aim, bounds, voxel, components)
-    _without_unfit(dual, labels, aim)
+    targets = _targets(dual, np.bincount(dual.row, dual.volume, len(dual.bias)))
+    labels = _settled_majority(dual, targets, voxel * contents.counts, keeps_volumes)
+    _mend_cheaply(dual, labels, targets, voxel, components)
+    _give_away_unfit(dual, labels, targets.volume)
     is_kept = np.zeros(len(labels), dtype=bool)
-    if keeps_volumes:
-        _keep_pieces(dual, labels, is_kept, contents, voxel)
-    for each in LAST_FRACTIONS:
-        _mend_pairs(dual, labels, np.multiply.outer(each, aim), is_kept)
+    if keeps_volumes and contents.pieces is not None:
+        rows = voxel * contents.pieces
+        _give_cells(dual, labels, is_kept, rows, contents.label_of_piece, PIECE_SHARE)
+    for limits in LAST_PASSES:
+        mend(dual, labels, is_kept, targets, limits)
     return labels
 
 
-def _bounds(dual: Dual, aim: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Least and largest volumes of labels, (2, K) mm^n, that tension and mending must keep to.
-
-    The volume near a label's surface is that of its voxels but for those in cells that, like all
-    cells beside them, have most of it.
-    """
-    labels, cell = _majority(dual), np.repeat(np.arange(len(dual.cells)), np.diff(dual.first))
-    beside = np.where(dual.across >= 0, labels[dual.across], labels[:, None])
-    is_inner = (beside == labels[:, None]).all(axis=1)[cell] & (dual.row == labels[cell])
-    near = aim - np.bincount(dual.row[is_inner], dual.volume[is_inner], len(aim))
-    return np.stack([aim - LARGEST_LOSS * near, aim + LARGEST_GAIN * near])
-
-
-def _given(
-    dual: Dual,
-    aim: NDArray[np.float64],
-    bounds: NDArray[np.float64],
-    voxel: float,
-    components: list[NDArray],
-) -> NDArray[np.int64]:
-    """Labels of cells, (M,), by the dual's bias: settled, and without fragments and pinches
-    where that is cheap.
-    """
-    labels = _majority(dual)
-    if dual.bias.any():
-        _keep_each(dual, labels, aim)
-    _settle(dual, labels, bounds[0], False)
-    is_bridge, marks = (
-        np.zeros(len(labels), dtype=bool),
-        _Marks(*np.ones((3, len(dual.scale)), dtype=bool)),
-    )
-    mended = np.full(len(labels), -1)
-    for _ in range(MENDING_ROUNDS):
-        before = labels.copy(), is_bridge.copy()
-        _without_fragments(dual, labels, is_bridge, aim, voxel, components)
-        # Where nothing changed since mending failed, it fails again.
-        marks.is_near[dual.cells[labels != mended]] = True
-        marks.is_due[dual.cells[marks.is_near[dual.cells].any(axis=1)]] = True
-        marks.is_near[:] = marks.is_due
-        _mend_near(dual, labels, is_bridge, bounds, marks)
-        mended = labels.copy()
-        _settle(dual, labels, bounds[0], True)
-        # what one step of a round changed, another undid
-        if all(map(np.array_equal, before, (labels, is_bridge))):
-            break
-    return labels
-
-
-def unpinched(
+def mend_labels(
     points: NDArray[np.float64],
     cells: NDArray[np.int64],
     across: NDArray[np.int64],
@@ -266,25 +243,122 @@ def unpinched(
     """Labels of cells, (M,), with the fewest changes that make interfaces of two labels manifold,
     at any cost.
 
-    Arguments as for `labelled`, and the volume `aim`, (K,) mm^n, of each label's voxels. Labels
+    Arguments as for `label_cells`, and the volume `aim`, (K,) mm^n, of each label's voxels. Labels
     that moves have left without a fit cell are dropped; no other becomes unfit. Pinches that cannot
     be mended remain.
     """
-    labels, dual = labels.copy(), _dual(points, cells, across, contents, None)
-    bounds = np.stack(
-        [np.maximum(_least_fit(dual.size, aim), dual.size.min()), np.full(len(aim), np.inf)]
-    )
-    nowhere = _no_contacts(len(cells), len(aim))
-    _without_unfit(dual, labels, aim)
-    for each in (dual.contacts, nowhere):  # false contact may forbid all moves that are left
-        _mend_pairs(
-            dual._replace(contacts=each),
-            labels,
-            bounds,
-            np.zeros(len(labels), dtype=bool),
-            has_pairs=True,
-        )
+    labels, dual = labels.copy(), _dual(points, cells, across, contents)
+    _give_away_unfit(dual, labels, aim)
+    for limits in FINAL_PASSES:
+        mend(dual, labels, np.zeros(len(labels), dtype=bool), _targets(dual, aim), limits)
     return labels
+
+
+def mend(
+    dual: Dual,
+    labels: NDArray[np.int64],
+    is_kept: NDArray[np.bool_],
+    targets: Targets,
+    limits: Pass,
+    marks: _Marks | None = None,
+) -> None:
+    """Mend places that are not manifold and have a node marked near, by default all, and those near
+    changes, if that lowers the energy.
+
+    Cells of `is_kept`, (M,), stay, and labels keep within the limits of their volumes. Afterwards
+    no node is marked near; those with a fault there or at an edge, or near a change, are not marked
+    sound; and those are due where mending may succeed later.
+    """
+    if not limits.has_contacts:
+        dual = dual._replace(contacts=_no_contacts(len(labels), len(dual.bias)))
+    marks = marks or _Marks(*np.ones((3, len(dual.scale)), dtype=bool))
+    volume, (least, most) = _label_volumes(dual, labels), targets.bounds(limits)
+    room = np.stack([volume - least, most - volume])
+    while marks.is_near.any():
+        faces, is_two = _nonmanifold(dual, labels, marks.is_near)
+        marks.is_sound[marks.is_near] = True
+        marks.is_sound[faces[faces >= 0]] = False
+        marks.is_due[marks.is_near] = False  # all places at these nodes are tried
+        marks.is_near[:] = False
+        faces = faces if limits.is_wide else faces[is_two]
+        _mend_places(dual, labels, room, is_kept, faces, limits.has_pairs, marks, _work(dual))
+
+
+def _targets(dual: Dual, aim: NDArray[np.float64]) -> Targets:
+    """`Targets` of labels with the volume `aim`, (K,) mm^n.
+
+    The volume near a label's surface is that of its voxels but for those in cells that, like all
+    cells beside them, have most of it.
+    """
+    labels, cell = _majority(dual), np.repeat(np.arange(len(dual.cells)), np.diff(dual.first))
+    beside = np.where(dual.across >= 0, labels[dual.across], labels[:, None])
+    is_inner = (beside == labels[:, None]).all(axis=1)[cell] & (dual.row == labels[cell])
+    inner = np.bincount(dual.row[is_inner], dual.volume[is_inner], len(aim))
+    fit = np.maximum(_least_fit(dual.size, aim), dual.size.min())
+    return Targets(np.asarray(aim, dtype=np.float64), aim - inner, fit)
+
+
+def _label_volumes(dual: Dual, labels: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Volume of each label's cells, (K,) mm^n."""
+    return np.bincount(labels, dual.size, len(dual.bias))
+
+
+def _settled_majority(
+    dual: Dual, targets: Targets, voxels: scipy.sparse.csr_array, keeps_volumes: bool
+) -> NDArray[np.int64]:
+    """Labels of most of each cell's voxels, (M,), settled; `voxels` (M, K) in mm^n.
+
+    If volumes are kept, labels get the bias that gives them nearly their volumes: in proportion to
+    the fraction that their cells lack, in steps that are halved if they go too far; and a cell each
+    where one fits. Tension leaves each label the least volume of `CHEAP_PASS`.
+    """
+    aim, least = targets.volume, targets.bounds(CHEAP_PASS)[0]
+    longest, before = np.full(len(aim), FIRST_BALANCE_STEP), np.zeros(len(aim))
+    of_labels, least_wrong = voxels.T.tocsr(), np.inf
+    for _ in range(BALANCE_ROUNDS if keeps_volumes else 1):
+        labels = _majority(dual)
+        if keeps_volumes:
+            nothing = np.zeros(len(labels), dtype=bool)
+            _give_cells(dual, labels, nothing, of_labels, np.arange(len(aim)), LEAST_SHARE)
+        _settle(dual, labels, least, False)
+        volume = _label_volumes(dual, labels)
+        wrong = float(np.abs(volume - aim).sum())
+        if wrong < least_wrong:
+            least_wrong, best, bias_of_best = wrong, labels, dual.bias.copy()
+        loss = 1.0 - volume / np.where(aim > 0.0, aim, np.inf)
+        bias = np.maximum(np.clip(BIAS_PER_LOSS * loss, 0.0, MOST_BIAS), loss - SPARED_LOSS)
+        step = bias * (aim > 0.0) - dual.bias
+        longest = np.where(step * before < 0.0, 0.5 * longest, longest)
+        before = np.clip(step, -longest, longest)
+        dual.bias[:] += before
+    dual.bias[:] = bias_of_best
+    return best
+
+
+def _mend_cheaply(
+    dual: Dual,
+    labels: NDArray[np.int64],
+    targets: Targets,
+    voxel: float,
+    components: list[NDArray],
+) -> None:
+    """Remove fragments, and pinches where that is cheap, and settle; `voxel` in mm^n."""
+    is_bridge, mended = np.zeros(len(labels), dtype=bool), np.full(len(labels), -1)
+    marks = _Marks(*np.ones((3, len(dual.scale)), dtype=bool))
+    least = targets.bounds(CHEAP_PASS)[0]
+    for _ in range(MENDING_ROUNDS):
+        before = labels.copy(), is_bridge.copy()
+        _without_fragments(dual, labels, is_bridge, targets.volume, voxel, components)
+        # Where nothing changed since mending failed, it fails again.
+        marks.is_near[dual.cells[labels != mended]] = True
+        marks.is_due[dual.cells[marks.is_near[dual.cells].any(axis=1)]] = True
+        marks.is_near[:] = marks.is_due
+        mend(dual, labels, is_bridge, targets, CHEAP_PASS, marks)
+        mended = labels.copy()
+        _settle(dual, labels, least, True)
+        # what one step of a round changed, another undid
+        if all(map(np.array_equal, before, (labels, is_bridge))):
+            break
 
 
 def unfit_labels(
@@ -301,51 +375,33 @@ def _least_fit(size: NDArray[np.float64], aim: NDArray[np.float64]) -> NDArray[n
     return UNFIT_FRACTION * np.minimum(aim, size.mean())
 
 
-def _without_unfit(dual: Dual, labels: NDArray[np.int64], aim: NDArray[np.float64]) -> None:
+def _give_away_unfit(dual: Dual, labels: NDArray[np.int64], aim: NDArray[np.float64]) -> None:
     _give_away(dual, labels, unfit_labels(labels, dual.size, aim)[labels])
 
 
-def _keep_each(dual: Dual, labels: NDArray[np.int64], aim: NDArray[np.float64]) -> None:
-    """Give each label without cells the cell with most of it, unless that is too large or has
-    far more of others.
-    """
-    cell = np.repeat(np.arange(len(labels)), np.diff(dual.first))
-    n_of, most = np.bincount(labels, minlength=len(aim)), MOST_FILLED * aim
-    for label in np.setdiff1d(dual.row, labels):
-        place = np.flatnonzero(dual.row == label)
-        place = place[np.argmax(dual.volume[place])]
-        best = cell[place]
-        is_fit = (
-            dual.volume[place] > LEAST_SHARE * dual.size[best] and dual.size[best] <= most[label]
-        )
-        if is_fit and n_of[labels[best]] > 1:
-            n_of[labels[best]] -= 1
-            labels[best] = label
-
-
-def _keep_pieces(
+def _give_cells(
     dual: Dual,
     labels: NDArray[np.int64],
     is_kept: NDArray[np.bool_],
-    contents: Contents,
-    voxel: float,
+    rows: scipy.sparse.csr_array,
+    label_of_row: NDArray[np.int64],
+    least_share: float,
 ) -> None:
-    """Give each piece without a cell of its label the cell that it fits best, if one does; `voxel`
-    in mm^n.
+    """Give each of some parts of labels without a cell of its label the cell that it fits best, if
+    one does.
 
-    Cells with which interfaces remain manifold go first. These cells are marked in `is_kept`, (M,),
-    as mending would give most others away again.
+    `rows`, (R, M) mm^n, is what cells have of each part: at least a share of the cell. Cells with
+    which interfaces remain manifold go first. These cells are marked in `is_kept`, (M,), as mending
+    would give most others away again.
     """
-    if (pieces := contents.pieces) is None:
-        return
     n_of = np.bincount(labels, minlength=len(dual.bias))
-    for piece, label in enumerate(contents.label_of_piece):
-        own = slice(pieces.indptr[piece], pieces.indptr[piece + 1])
-        cells, volume = pieces.indices[own], voxel * pieces.data[own]
+    for row, label in enumerate(label_of_row):
+        own = slice(rows.indptr[row], rows.indptr[row + 1])
+        cells, volume = rows.indices[own], rows.data[own]
         if (labels[cells] == label).any():
             continue
         size = dual.size[cells]
-        is_fit = (volume >= PIECE_SHARE * size) & (size <= MOST_FILLED * volume.sum())
+        is_fit = (volume >= least_share * size) & (size <= MOST_FILLED * volume.sum())
         is_fit &= (n_of[labels[cells]] > 1) & ~is_kept[cells]
         if not is_fit.any():
             continue
@@ -364,36 +420,6 @@ def _is_manifold(dual: Dual, labels: NDArray[np.int64], cell: int, label: int) -
     tried, is_near = labels.copy(), np.zeros(len(dual.scale), dtype=bool)
     tried[cell], is_near[dual.cells[cell]] = label, True
     return not _nonmanifold(dual, tried, is_near)[1].any()
-
-
-def _balance(dual: Dual, aim: NDArray[np.float64], least: NDArray[np.float64]) -> None:
-    """Set the bias of each label in proportion to the fraction of its volume `aim`, (K,) mm^n, that
-    its cells lack.
-
-    Steps towards it are halved if they go too far. The bias that gave labels nearly their volumes
-    is kept. Tension leaves each label its `least` volume.
-    """
-    longest, before, least_wrong, best = (
-        np.full(len(aim), FIRST_BALANCE_STEP),
-        np.zeros(len(aim)),
-        np.inf,
-        dual.bias,
-    )
-    for _ in range(BALANCE_ROUNDS):
-        labels = _majority(dual)
-        _settle(dual, labels, least, False)
-        volume = np.bincount(labels, dual.size, len(aim))
-        wrong = float(np.abs(volume - aim).sum())
-        if wrong < least_wrong:
-            least_wrong, best = wrong, dual.bias.copy()
-        loss = 1.0 - volume / np.where(aim > 0.0, aim, np.inf)
-        bias = np.maximum(np.clip(BIAS_PER_LOSS * loss, 0.0, MOST_BIAS), loss - SPARED_LOSS) * (
-            aim > 0.0
-        )
-        longest = np.where((bias - dual.bias) * before < 0.0, 0.5 * longest, longest)
-        before = np.clip(bias - dual.bias, -longest, longest)
-        dual.bias[:] += before
-    dual.bias[:] = best
 
 
 def _components(
@@ -493,23 +519,19 @@ def _dual(
     cells: NDArray[np.int64],
     across: NDArray[np.int64],
     contents: Contents,
-    weight: float | None,
 ) -> Dual:
     counts = contents.counts
     assert (np.diff(counts.indptr) > 0).all(), (
-        "labelled: a cell without voxels has no fraction of any label"
+        "label_cells: a cell without voxels has no fraction of any label"
     )
     n, n_labels = points.shape[1], counts.shape[1]
     size, around = np.abs(volumes(points, cells)), stars(cells, len(points))
     scale = np.add.reduceat(np.append(size[around.cells], 0.0), around.start[:-1]) / np.maximum(
         np.diff(around.start), 1
     )
-    tension = np.full(across.shape, weight)
-    if weight is None:
-        # The edge of a regular cell of that volume, so that thin cells do not make a surface
-        # expensive.
-        edge = regular_edge(size, n)
-        tension = TENSION_FRACTION * 0.5 * (edge[:, None] + edge[across])
+    # The edge of a regular cell of that volume, so that thin cells do not make a surface expensive.
+    edge = regular_edge(size, n)
+    tension = TENSION_FRACTION * 0.5 * (edge[:, None] + edge[across])
     tension = np.where(across >= 0, tension * facet_areas(points, cells), 0.0)
     voxel = size.sum() / counts.sum()
     return Dual(
@@ -962,55 +984,6 @@ def _nonmanifold(
     return np.ascontiguousarray(faces[:, :2]), faces[:, 2] == 2
 
 
-def _mend_near(
-    dual: Dual,
-    labels: NDArray[np.int64],
-    is_bridge: NDArray[np.bool_],
-    bounds: NDArray[np.float64],
-    marks: _Marks,
-) -> None:
-    """Mend places that are not manifold and have a node marked near, if that lowers the energy, and
-    those near changes.
-
-    Bridges stay, and labels keep within the `bounds` of their volumes, (2, K). Afterwards no node
-    is marked near; those with a fault there or at an edge, or near a change, are no longer marked
-    sound; and those remain due where mending may succeed.
-    """
-    room = _room(dual, labels, bounds)
-    while marks.is_near.any():
-        faces = _nonmanifold(dual, labels, marks.is_near)[0]
-        marks.is_sound[marks.is_near] = True
-        marks.is_sound[faces[faces >= 0]] = False
-        marks.is_due[marks.is_near] = False  # all places at these nodes are tried
-        marks.is_near[:] = False
-        _mend(dual, labels, room, is_bridge, faces, False, marks, _work(dual))
-
-
-def _room(
-    dual: Dual, labels: NDArray[np.int64], bounds: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Volumes that labels may lose and gain, (2, K), within the `bounds` of theirs."""
-    volume = np.bincount(labels, dual.size, bounds.shape[1])
-    return np.stack([volume - bounds[0], bounds[1] - volume])
-
-
-def _mend_pairs(
-    dual: Dual,
-    labels: NDArray[np.int64],
-    bounds: NDArray[np.float64],
-    is_bridge: NDArray[np.bool_],
-    has_pairs: bool = False,
-) -> None:
-    """Mend the remaining places between two labels, but for bridges; `has_pairs` as of `_mend`."""
-    marks = _Marks(*np.zeros((3, len(dual.scale)), dtype=bool))
-    for _ in range(MENDING_ROUNDS):
-        faces, is_two = _nonmanifold(dual, labels)
-        before, room = labels.copy(), _room(dual, labels, bounds)
-        _mend(dual, labels, room, is_bridge, faces[is_two], has_pairs, marks, _work(dual))
-        if np.array_equal(before, labels):
-            break
-
-
 @entry
 def _find_nonmanifold(
     faces: Ints2,
@@ -1260,11 +1233,11 @@ def _rest_fans(n_fans: int, own: int, is_open: bool, work: _Work) -> int:
 
 
 @entry
-def _mend(
+def _mend_places(
     dual: Dual,
     labels: Ints1,
     room: Floats2,
-    is_bridge: Bools1,
+    is_kept: Bools1,
     faces: Ints2,
     has_pairs: bool,
     marks: _Marks,
@@ -1289,7 +1262,7 @@ def _mend(
             if i >= 2 * count and best_from >= 0:
                 break
             size = _group(dual, labels, a, b, star[:count], i, group)
-            if size == 0 or is_bridge[group[:size]].any():
+            if size == 0 or is_kept[group[:size]].any():
                 continue
             volume = dual.size[group[:size]].sum()
             if room[0, labels[group[0]]] < volume:

@@ -27,6 +27,31 @@ LEVELS_RISE = 2.0  # of one label's level over another's, per voxel across their
 FLAT_RISE = 1e-12  # least rise of a level along the way up that allows division
 
 
+@helper
+def is_among(label: int, labels: NDArray) -> bool:
+    """True if a label is one of several."""
+    is_one = False
+    for other in labels:
+        is_one = is_one or other == label
+    return is_one
+
+
+@helper
+def insert_label(labels: NDArray, count: int, label: int) -> int:
+    """Insert a label that is not yet among the first `count` of a row, in rising order, if there
+    is room; return the number of labels.
+    """
+    if is_among(label, labels[: min(count, MOST_MEETING)]):
+        return count
+    if count < MOST_MEETING:
+        m = count
+        while m > 0 and labels[m - 1] > label:
+            labels[m] = labels[m - 1]
+            m -= 1
+        labels[m] = label
+    return count + 1
+
+
 @entry
 def level_at(level: Singles3, i: float, j: float, k: float) -> float:
     """The level at an index position, linear along each axis between voxel centres."""

@@ -23,7 +23,7 @@ def option_words(options: dict[str, Any]) -> list[str]:
     words = []
     for name, value in options.items():
         if isinstance(value, bool):
-            words.append(f"--{name}" if value else f"--no-{name}")
+            words.append(f"--{name if value else 'no-' + name}")
         else:
             words += [
                 f"--{name}={each}" for each in (value if isinstance(value, list) else [value])

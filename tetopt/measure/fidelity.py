@@ -39,7 +39,7 @@ from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
 from tetopt.system.arrays import unmasked
 from tetopt.system.kernel_cache import njit
-from tetopt.system.slabs import over_slabs, sum_over_slabs
+from tetopt.system.slabs import count_pairs, over_slabs, sum_over_slabs
 
 POINTS_PER_CELL = 24  # points per cell for comparison with the voxels
 CHUNK_CELLS = 4096  # compared at a time, as voxels near one another stay in a processor's cache
@@ -679,12 +679,11 @@ def _most_frequent(
     """The most frequent row of the voxels of each cell, the smallest of equally frequent ones,
     or `otherwise` (M,).
     """
-    of_cell, most = otherwise.copy(), np.zeros_like(otherwise)
-    for row, box in enumerate(scipy.ndimage.find_objects(rows + 1)):
-        if box is not None:
-            counts = np.bincount(owner[box][rows[box] == row] + 1, minlength=len(most) + 1)[1:]
-            is_more = counts > most
-            of_cell[is_more], most[is_more] = row, counts[is_more]
+    counts = count_pairs(owner, rows, (len(otherwise), int(rows.max(initial=0)) + 1))
+    cell = np.repeat(np.arange(len(otherwise)), np.diff(counts.indptr))
+    order = np.lexsort((-counts.indices, counts.data, cell))  # the last of a cell is its row
+    of_cell = otherwise.copy()
+    of_cell[cell[order]] = counts.indices[order]
     return of_cell
 
 
