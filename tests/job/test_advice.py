@@ -16,20 +16,28 @@ from tetopt.job.advice import (
     of_empty,
     of_result,
     of_sizes,
+    required_of,
     sentences,
     tell,
     tell_label_sizes,
-    unmet,
 )
+from tetopt.job.advice import unmet as unmet_of
 from tetopt.job.events import listened
 from tetopt.measure.fidelity import LabelFidelity, MaskFidelity
 from tetopt.measure.interfaces import LabelInterface
-from tetopt.measure.judge import LABEL_REMEDY, PIECES_REMEDY
+from tetopt.measure.judge import LABEL_REMEDY, PIECES_REMEDY, judge
 from tetopt.start.label_sizes import sizes_by_label
 from tetopt.start.sizes import EdgeRatios, Sizes
 
 NEAR = MaskFidelity(9, 9.0, 9.0, 0.99, 0.1, 0.3, 0.1, 0.3, 0.1, 0.3, 0.1, 0.3, 1, 1, 2, 2)
 MESH = tetopt.Mesh([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], [[0, 1, 2]])
+
+
+def unmet(violated, measured, word="mask"):
+    """Yield what is unmet, with the verdict on the measured labels."""
+    rows = {name: each for name, each in measured.items() if name == "labels"}
+    of_labels = judge(rows, required_of(word, measured.get("label_names", {})))
+    return unmet_of({**violated, **of_labels}, measured, word)
 
 
 def told(*problems):
@@ -75,7 +83,7 @@ def test_a_mask_that_the_mesh_does_not_show(said, change, words):
 
 
 def test_what_background_leaves_is_no_mask(said):
-    violated = {"mask": "the mesh and the mask overlap with a Dice of only 0.5"}
+    violated = {"mask": "the mesh and the foreground overlap with a Dice of only 0.5"}
     far = {
         "mask": NEAR._replace(distance_p95=8.0, components=3, mesh_euler=99),
         "dropped_components": 2,
