@@ -5,13 +5,13 @@ for it.
 import html
 import inspect
 import os
+import pydoc
+import re
 import sys
 from importlib.metadata import version as installed_version
 from pathlib import Path
 
 import numpydoc.xref
-
-import tetopt
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE / "_extensions"))
@@ -44,8 +44,12 @@ default_role = "py:obj"  # names in docstrings are links where they are public
 templates_path = ["_templates"]
 numpydoc_show_class_members = False
 numpydoc_xref_param_type = True
+# Records that functions return stand with their modules on the page.
+API_PAGE = (Path(__file__).parent / "reference" / "api" / "index.md").read_text(encoding="utf-8")
 numpydoc_xref_aliases = {
-    name: f"tetopt.{name}" for name in tetopt.__all__ if inspect.isclass(getattr(tetopt, name))
+    name.rpartition(".")[2]: f"tetopt.{name}"
+    for name in re.findall(r"^   ~?([\w.]+)$", API_PAGE, re.M)
+    if inspect.isclass(pydoc.locate(f"tetopt.{name}"))
 }
 numpydoc_xref_ignore = "all"  # words of types that are not ours
 numpydoc.xref.DEFAULT_LINKS.clear()  # to Python's own pages, which are not fetched

@@ -186,7 +186,7 @@ class LostComponent(NamedTuple):
 
     Examples
     --------
-    >>> tetopt.LostComponent(60, (12.0, 4.5, 7.0)).voxels
+    >>> LostComponent(60, (12.0, 4.5, 7.0)).voxels
     60
     """
 

@@ -46,7 +46,7 @@ class Event(NamedTuple):
 
     Examples
     --------
-    >>> tetopt.Event("note", "the image is also the label image: only the labels are used").kind
+    >>> Event("note", "the image is also the label image: only the labels are used").kind
     'note'
     """
 

@@ -71,7 +71,7 @@ class Thickness(NamedTuple):
 
     Examples
     --------
-    >>> tetopt.Thickness(1.0, 1.5, 2.5).p50
+    >>> Thickness(1.0, 1.5, 2.5).p50
     1.5
     """
 

@@ -73,7 +73,7 @@ class LabelSize(NamedTuple):
 
         Examples
         --------
-        >>> tetopt.LabelSize(1.5).at(np.array([1.0, 4.0]))
+        >>> LabelSize(1.5).at(np.array([1.0, 4.0]))
         array([1.5, 1.5])
         """
         size = (
