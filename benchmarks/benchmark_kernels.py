@@ -28,12 +28,12 @@ from tetopt.contents.content import plain
 from tetopt.energy.sampling import from_ticks, moment_sums, sampling_grid, to_ticks
 from tetopt.engine.fast import Run, prepare_kernels
 from tetopt.engine.flips import flip
-from tetopt.geometry.simplex import oriented, rho, volumes
+from tetopt.geometry.simplex import orient_cells, rho, volumes
 from tetopt.geometry.topology import facets
 from tetopt.io.mni import mni_path
 from tetopt.report.summary import versions
 from tetopt.start.delaunay import delaunay
-from tetopt.system.files import checked_output, save_json
+from tetopt.system.files import check_output, save_json
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -49,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--force", action="store_true", help="replace an existing file")
     options = parser.parse_args(argv)
     try:
-        output = checked_output(options.output, (".json",), options.force)
+        output = check_output(options.output, (".json",), options.force)
         path = mni_path("t1") if options.image is None else options.image
         image = tetopt.load_image(path)
     except tetopt.InputError as error:
@@ -98,7 +98,7 @@ def sampling(image: tetopt.Image, nodes: int) -> dict[str, Any]:
     inside = (index > -0.5 + 1e-9) & (index < np.array(image.shape) - 0.5 - 1e-9)
     shaken = image.to_world(index + inside * np.random.default_rng(0).normal(0.0, 0.3, index.shape))
     tessellation = Delaunay(shaken)
-    cells = oriented(shaken, tessellation.simplices)
+    cells = orient_cells(shaken, tessellation.simplices)
     cells = cells[volumes(shaken, cells) > 1e-9]
     # as tetopt's own meshes are: neighbours near each other
     cells = cells[np.lexsort(np.sort(cells, axis=1).T[::-1])]

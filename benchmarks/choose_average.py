@@ -27,11 +27,11 @@ from tetopt.energy.sampling import nearest_values
 from tetopt.fem.elasticity import box_faces, compression, push_of
 from tetopt.fem.reference import compare
 from tetopt.geometry.quadratic import gauss_rule, quadratic
-from tetopt.job.events import listened
+from tetopt.job.events import listen_with
 from tetopt.model.averages import element_young, parse_average
-from tetopt.study.compare import Standard, default_mapping, prepared
+from tetopt.study.compare import Standard, default_mapping, prepare_references
 from tetopt.study.compare_report import Settings
-from tetopt.system.files import checked_output, save_json
+from tetopt.system.files import check_output, save_json
 
 POINTS = "points"
 AVERAGES = (
@@ -90,13 +90,13 @@ def _run(options: argparse.Namespace) -> int:
     for word in options.averages:
         if word != POINTS:
             parse_average(word)
-    path = checked_output(options.output, (".json",), options.force)
+    path = check_output(options.output, (".json",), options.force)
     settings = Settings(nodes=0, reference_dofs=options.dofs)
     rows: list[dict[str, Any]] = []
     for name, image, labels in cases(options.phantoms, options.images):
         mapping, _ = default_mapping(image)
-        with listened(lambda event, name=name: print(f"{name}: {event.text}", flush=True)):
-            standard = prepared(image, labels, mapping, settings)
+        with listen_with(lambda event, name=name: print(f"{name}: {event.text}", flush=True)):
+            standard = prepare_references(image, labels, mapping, settings)
         for order in options.orders:
             for mode in options.modes:
                 mesh = _mesh(image, mode, options.nodes, order)

@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 
 import tetopt
-from tetopt.fem.reference import averaged
-from tetopt.job.events import listened
-from tetopt.measure.segmentation import thresholded
-from tetopt.study.compare import default_mapping, measured, prepared
+from tetopt.fem.reference import average_voxels
+from tetopt.job.events import listen_with
+from tetopt.measure.segmentation import threshold_image
+from tetopt.study.compare import default_mapping, measure_mesh, prepare_references
 from tetopt.study.compare_report import Settings, Simulation
-from tetopt.system.files import checked_output, save_json
+from tetopt.system.files import check_output, save_json
 
 PHANTOM_NAMES = ("sphere", "two_spheres", "ellipsoids_brain")
 SHOWN_ERRORS = ("strain_energy", "displacement", "interface_strain")
@@ -59,18 +59,18 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    path = checked_output(options.output, (".json",), options.force)
+    path = check_output(options.output, (".json",), options.force)
     settings = Settings(nodes=0, reference_dofs=options.dofs, average="mean")
     rows = []
     for name, image, labels in cases(options.phantoms, options.images):
         mapping, _ = default_mapping(image)
-        with listened(lambda event, name=name: print(f"{name}: {event.text}", flush=True)):
-            standard = prepared(image, labels, mapping, settings)
+        with listen_with(lambda event, name=name: print(f"{name}: {event.text}", flush=True)):
+            standard = prepare_references(image, labels, mapping, settings)
         for nodes in options.nodes:
             initial = tetopt.lattice_mesh(image, nodes=nodes)
             for k_D in options.k_d:
                 mesh = tetopt.optimize(image, initial, k_D=k_D).mesh
-                numbers = measured(standard, mesh, settings.percent)
+                numbers = measure_mesh(standard, mesh, settings.percent)
                 rows.append(
                     {"image": name, "nodes": len(mesh.points), "k_D": k_D, "measured": numbers}
                 )
@@ -100,8 +100,8 @@ def cases(
                 1, np.rint(np.array(image.shape) * np.minimum(1, image.spacing / 2))
             )
         )
-        coarse = averaged(image, shape)
-        cases.append((path.name, coarse, thresholded(coarse, 4)))
+        coarse = average_voxels(image, shape)
+        cases.append((path.name, coarse, threshold_image(coarse, 4)))
     return cases
 
 

@@ -22,11 +22,11 @@ from choose_k_d import PHANTOM_NAMES, SHOWN_ERRORS, cases, error_of
 
 import tetopt
 from tetopt.fem.reference import at_centres
-from tetopt.job.events import listened
+from tetopt.job.events import listen_with
 from tetopt.start.sizes import COARSEST_RATIO
-from tetopt.study.compare import Standard, default_mapping, measured, prepared
+from tetopt.study.compare import Standard, default_mapping, measure_mesh, prepare_references
 from tetopt.study.compare_report import Settings
-from tetopt.system.files import checked_output, save_json
+from tetopt.system.files import check_output, save_json
 
 STANDARD_NU = "0.3"
 
@@ -60,17 +60,17 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    path = checked_output(options.output, (".json",), options.force)
+    path = check_output(options.output, (".json",), options.force)
     settings = Settings(
         nodes=0, reference_dofs=options.dofs, nus=(float(STANDARD_NU),), average="mean"
     )
     rows = []
     for name, image, labels in cases(options.phantoms, options.images):
         mapping, _ = default_mapping(image)
-        with listened(lambda event, name=name: print(f"{name}: {event.text}", flush=True)):
-            standard = prepared(image, labels, mapping, settings)
+        with listen_with(lambda event, name=name: print(f"{name}: {event.text}", flush=True)):
+            standard = prepare_references(image, labels, mapping, settings)
         for kind, mesh in _meshes(image, standard, options.nodes, options.largest):
-            numbers = measured(standard, mesh, settings.percent)
+            numbers = measure_mesh(standard, mesh, settings.percent)
             rows.append({"image": name, "mesh": kind, "measured": numbers})
             print(_line(rows[-1]), flush=True)
     save_json(path, {"rows": rows})

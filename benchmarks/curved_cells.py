@@ -19,7 +19,7 @@ import numpy as np
 import tetopt
 from tetopt.geometry.quadratic import curved_rule, quadratic, shape_slopes, shape_values
 from tetopt.geometry.topology import facets
-from tetopt.system.files import checked_output, save_json
+from tetopt.system.files import check_output, save_json
 
 RADIUS, HALF = 20.0, 32  # of the sphere, mm; and half of its image, voxels of 1 mm
 NODES, NODES_OF_LABELS = (3_000, 8_000), 5_000  # in all
@@ -81,7 +81,7 @@ def main(argv: list[str] | None = None) -> None:
         "-o", "--output", type=Path, required=True, help="JSON file for every number"
     )
     options = parser.parse_args(argv)
-    output = checked_output(options.output, (".json",), True)
+    output = check_output(options.output, (".json",), True)
     rows, kinds = dict[str, object](), {"straight": False, "curved": True}
     for nodes in NODES:
         mesh, label = meshed(sphere(), nodes)

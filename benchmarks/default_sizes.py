@@ -28,9 +28,9 @@ from tetopt.fem.elasticity import box_faces, compression, elements_of, push_of
 from tetopt.fem.reference import _displacements, _places, compare
 from tetopt.geometry.topology import facets
 from tetopt.model.averages import element_young, young_image
-from tetopt.study.compare import default_mapping, prepared
+from tetopt.study.compare import default_mapping, prepare_references
 from tetopt.study.compare_report import Settings
-from tetopt.system.files import checked_output, save_json
+from tetopt.system.files import check_output, save_json
 
 UNIFORM, NUS, FINER = "uniform", (0.3, 0.45), 4
 # a mesh, order and nu; the error of displacement
@@ -40,7 +40,7 @@ Judge = Callable[[tetopt.Mesh, int, float], float]
 def boxed(image: tetopt.Image, labels: tetopt.Image) -> Judge:
     """Compression of the box, beside that of voxels."""
     settings = Settings(nodes=0, reference_dofs=300_000, nus=NUS)
-    standard = prepared(image, labels, default_mapping(image)[0], settings)
+    standard = prepare_references(image, labels, default_mapping(image)[0], settings)
 
     def error(mesh: tetopt.Mesh, order: int, nu: float) -> float:
         bottom, top = box_faces(image, mesh)
@@ -139,7 +139,7 @@ def main() -> None:
     )
     options = parser.parse_args()
     ratios = (*options.ratios, UNIFORM)
-    path, rows = checked_output(options.output, (".json",), True), list[dict[str, Any]]()
+    path, rows = check_output(options.output, (".json",), True), list[dict[str, Any]]()
     for name, content, nodes, judge in subjects(options):
         for order in options.orders:
             for ratio in ratios:

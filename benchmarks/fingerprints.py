@@ -29,7 +29,7 @@ import numpy as np
 import tetopt
 from tetopt.io.mni import mni_path, mni_tissue
 from tetopt.report.summary import versions
-from tetopt.system.files import checked_output, save_json
+from tetopt.system.files import check_output, save_json
 
 # The words after `tetopt mesh`, by the name of the run; T1, GM, TISSUE, BRAIN, ... are files made
 # below.
@@ -83,7 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--force", action="store_true", help="replace an existing file")
     options = parser.parse_args(argv)
     try:
-        output = checked_output(options.output, (".json",), options.force)
+        output = check_output(options.output, (".json",), options.force)
         earlier = {} if options.against is None else json.loads(options.against.read_text())["runs"]
         with tempfile.TemporaryDirectory() as folder:
             rows = dict(fingerprints(Path(folder), options.only))

@@ -34,7 +34,7 @@ from tetopt.model.labels import NO_TABLE
 from tetopt.report.colours import grey_limits, label_colours, legend_patches
 from tetopt.report.figures import LETTER_INCHES, save_figure
 from tetopt.report.scene import Draw, View, cutaway, put_scene, view_of
-from tetopt.system.files import checked_output
+from tetopt.system.files import check_output
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -56,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--force", action="store_true", help="replace an existing output")
     options = parser.parse_args(argv)
     try:
-        path = checked_output(options.output, (".png",), options.force)
+        path = check_output(options.output, (".png",), options.force)
         labels, loaded = (
             None if options.labels is None else load_image(options.labels),
             load_mesh(options.mesh),

@@ -25,13 +25,13 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from numpy.typing import NDArray
 
 import tetopt
-from tetopt.energy.discretization import combined
+from tetopt.energy.discretization import combine_energies
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.geometry.quadratic import quadratic
-from tetopt.geometry.simplex import dihedral_angles, oriented, rho
+from tetopt.geometry.simplex import dihedral_angles, orient_cells, rho
 from tetopt.measure.quality import bad_kinds
 from tetopt.report.figures import CURVE_COLOURS, MESH_LINE, save_figure
-from tetopt.system.files import checked_output, save_bytes
+from tetopt.system.files import check_output, save_bytes
 
 # as many as the bytes allow, of PNGs whose pixels are numbers of colours
 PALETTE_COLOURS = (256, 128, 64, 32)
@@ -68,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         if options.shrink is not None:
             paths = [
-                checked_output(options.output / path.name, (".png",), options.force)
+                check_output(options.output / path.name, (".png",), options.force)
                 for path in options.shrink
             ]
             for source, path in zip(options.shrink, paths, strict=True):
@@ -76,7 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         else:
             names = options.only or list(PICTURES)
             paths = [
-                checked_output(options.output / f"{name}.png", (".png",), options.force)
+                check_output(options.output / f"{name}.png", (".png",), options.force)
                 for name in names
             ]
             for name, path in zip(names, paths, strict=True):
@@ -287,7 +287,7 @@ def shapes_figure() -> Figure:
     figure = Figure(figsize=(9.0, 4.6), layout="constrained")
     for number, (name, corners) in enumerate(cells.items()):
         points = np.array(corners)
-        mesh = tetopt.Mesh(points, oriented(points, np.array([[0, 1, 2, 3]])))
+        mesh = tetopt.Mesh(points, orient_cells(points, np.array([[0, 1, 2, 3]])))
         kind = bad_kinds(mesh.points, mesh.cells, rho(mesh.points, mesh.cells))[0]
         assert kind == name, f"the drawn {name} is none"
         angles = dihedral_angles(mesh.points, mesh.cells)
@@ -418,7 +418,7 @@ def _star(corners: NDArray[np.float64], node: NDArray[np.float64]) -> tetopt.Mes
 def _star_energy(image: tetopt.Image, star: tetopt.Mesh, first: tetopt.Mesh) -> float:
     """Eq. (4) of a star, k_D = 0.5, over what it was before the move."""
     E_G, E_G0 = (tetopt.E_G(mesh.points, mesh.cells) for mesh in (star, first))
-    return combined(E_G, tetopt.E_D(image, star), E_G0, tetopt.E_D(image, first), 0.5)
+    return combine_energies(E_G, tetopt.E_D(image, star), E_G0, tetopt.E_D(image, first), 0.5)
 
 
 def _signed_area(

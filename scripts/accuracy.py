@@ -25,10 +25,10 @@ from numpy.typing import NDArray
 
 import tetopt
 from tetopt.io.mni import mni_path
-from tetopt.measure.segmentation import thresholded
+from tetopt.measure.segmentation import threshold_image
 from tetopt.study import tetwild
 from tetopt.study.pipelines import PIPELINES, PipelineInput
-from tetopt.system.files import checked_output, save_json
+from tetopt.system.files import check_output, save_json
 
 NODES = 5_000
 # of tetopt on the head, until its Dice suffices
@@ -53,7 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--head", type=Path, help="labels of a whole head")
     parser.add_argument("--force", action="store_true", help="replace an existing file")
     options = parser.parse_args(argv)
-    output = checked_output(options.output, (".json",), options.force)
+    output = check_output(options.output, (".json",), options.force)
     path = mni_path("t1") if options.image is None else options.image
     rows: dict[str, Any] = {"image": path.name, "error": same_error(path, options.cgal)}
     if options.head is not None:
@@ -136,7 +136,7 @@ def _pytetwild(image: tetopt.Image) -> Mesher:
 
 def _cgal(program: str, image: tetopt.Image, folder: Path) -> Mesher:
     """Return CGAL as a mesher of the image's classes, with one cell size."""
-    labels = thresholded(image, 4)
+    labels = threshold_image(image, 4)
 
     def mesher(nodes: float) -> tuple[tetopt.Mesh, float]:
         command, _ = cgal_command(program, labels, round(nodes), folder)

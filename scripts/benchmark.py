@@ -28,7 +28,7 @@ import tetopt
 from tetopt.io.mni import mni_path, mni_tissue
 from tetopt.report.summary import versions
 from tetopt.start.label_sizes import parse_label_sizes
-from tetopt.system.files import checked_output, save_json
+from tetopt.system.files import check_output, save_json
 
 HEAD_NODES = 130_000
 # by tissue and thickness
@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--force", action="store_true", help="replace an existing file")
     options = parser.parse_args(argv)
     try:
-        output = checked_output(options.output, (".json",), options.force)
+        output = check_output(options.output, (".json",), options.force)
         path = mni_path("t1") if options.image is None else options.image
         tetopt.load_image(path)
     except tetopt.InputError as error:

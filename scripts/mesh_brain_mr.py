@@ -23,7 +23,7 @@ from tetopt.io.images import sha256
 from tetopt.report.figures import save_run_figures
 from tetopt.report.scene import save_scenes, structure_before_slices
 from tetopt.report.summary import run_summary
-from tetopt.system.files import checked_output, save_json, written_whole
+from tetopt.system.files import check_output, save_json, written_whole
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -68,7 +68,7 @@ def _run(options: argparse.Namespace) -> int:
         "structure.png",
     )
     mesh_path, json_path, *figures, surface_path, picture_path = (
-        checked_output(folder / name, (Path(name).suffix,), options.force) for name in names
+        check_output(folder / name, (Path(name).suffix,), options.force) for name in names
     )
     result = tetopt.mesh_image(
         image,

@@ -206,7 +206,7 @@ def read_here():
         if window is not None:
             vtk.vtkOutputWindow.SetInstance(window)
         stream.seek(0)
-        return apart._received(stream), 0
+        return apart._receive_answer(stream), 0
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(apart, "_of_child", answered)

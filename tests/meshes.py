@@ -14,7 +14,7 @@ from scipy.spatial import Delaunay
 
 from tetopt.geometry.check import scaled_jacobians
 from tetopt.geometry.quadratic import numbered_edges
-from tetopt.geometry.simplex import oriented, volumes
+from tetopt.geometry.simplex import orient_cells, volumes
 from tetopt.mesh import Mesh
 
 # Single triangles
@@ -148,7 +148,7 @@ BAD_TETS = {"sliver": sliver, "cap": cap, "spade": spade, "wedge": wedge, "needl
 def single(points):
     """The mesh of one cell on its n+1 points, positively oriented."""
     points = np.asarray(points, dtype=np.float64)
-    return points, oriented(points, np.arange(len(points))[None])
+    return points, orient_cells(points, np.arange(len(points))[None])
 
 
 # By dimension: single cells, and everything conforming
@@ -221,7 +221,7 @@ def split_box(rng, shape, n_nodes, step=0.5):
             cells = [part for cell in cells for part in _split(cell, node)]
     number = {p: k for k, p in enumerate(points)}
     points = np.array(points) / scale
-    return points, oriented(points, np.array([[number[p] for p in cell] for cell in cells]))
+    return points, orient_cells(points, np.array([[number[p] for p in cell] for cell in cells]))
 
 
 @lru_cache(10_000)  # most cells are asked for again at the next node
@@ -252,7 +252,7 @@ def delaunay_box(rng, shape, n_nodes):
     points = np.unique(np.vstack([box_corners(shape), nodes]), axis=0)
     cells = Delaunay(points).simplices
     cells = cells[np.abs(volumes(points, cells)) > 1e-12]  # Qhull's flat cells on the walls
-    return points, oriented(points, cells)
+    return points, orient_cells(points, cells)
 
 
 def with_bent_edges(mesh, fraction):

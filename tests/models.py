@@ -14,7 +14,7 @@ from tetopt.geometry.quadratic import cell_edges, quadratic
 from tetopt.geometry.simplex import volumes
 from tetopt.model.labels import TABLE_TEXT, LabelTable, table_words
 from tetopt.model.loads import parse_loads
-from tetopt.model.materials import binned, materials
+from tetopt.model.materials import bin_moduli, materials
 from tetopt.model.model import Model
 from tetopt.model.sets import (
     Sets,
@@ -72,7 +72,7 @@ def sample_model(n=3, bins=3):
     )
     table = materials(1.0 + fields["mean"] / 7.0, np.where(labels == 1, 0.3, 0.45), len(mesh.cells))
     if bins is not None:
-        table = binned(table, volumes(mesh.points, mesh.cells), bins)
+        table = bin_moduli(table, volumes(mesh.points, mesh.cells), bins)
     loads = parse_loads(["compress:5%"], mesh, sets)
     return Model(mesh, fields, sets, table, loads, about=dict(ABOUT))
 

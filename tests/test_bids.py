@@ -7,7 +7,7 @@ import tetopt
 from tetopt import InputError
 from tetopt.bids import cohort_words, main
 from tetopt.cohort.layout import begin
-from tetopt.system.work_directory import locked
+from tetopt.system.work_directory import lock_directory
 
 PLACES = ["/data", "/out", "participant"]
 
@@ -80,7 +80,7 @@ def test_runs_beside_others_and_the_group_after_them(tmp_path, capsys, scheduler
         tetopt.save_image(raw / f"sub-{label}" / "anat" / f"sub-{label}_T1w.nii", sample_image(3))
     (raw / "dataset_description.json").write_text('{"Name": "x", "BIDSVersion": "1.8.0"}')
     begin(out)
-    with locked(out / ".work", ["sub-02"]):
+    with lock_directory(out / ".work", ["sub-02"]):
         options = ["--nodes", "60", "--iterations", "0", "--scheduler", scheduler]
         assert main([str(raw), str(out), "participant", "--participant_label", "02", *options]) == 2
         assert "sub-02: another run is writing there" in capsys.readouterr().err

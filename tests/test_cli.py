@@ -50,8 +50,8 @@ from tetopt import (
 from tetopt.cli.app import COMMANDS, help_line, loaded_command
 from tetopt.cli.console import show_error, show_event
 from tetopt.geometry.simplex import volumes
-from tetopt.job.advice import agreed, sentences, tell, unmet
-from tetopt.job.events import listened
+from tetopt.job.advice import order_problems, sentences, tell, unmet_requirements
+from tetopt.job.events import listen_with
 from tetopt.measure.judge import ERROR_RATE
 from tetopt.measure.segmentation import dice, segment
 from tetopt.report.summary import mesh_hash
@@ -394,8 +394,8 @@ def test_what_is_violated_is_told_in_the_commands_options(capsys):
         "min_dihedral": "2 of 9 cells; allow a lower `k_D`, or a lower `min_dihedral`",
         "box": "k_D.nii lies beyond",
     }
-    with listened(show_event):
-        problems = agreed(unmet(violated, {}))
+    with listen_with(show_event):
+        problems = order_problems(unmet_requirements(violated, {}))
         assert sentences(problems) == violated
         tell(problems)
     said = capsys.readouterr().err

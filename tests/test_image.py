@@ -8,7 +8,7 @@ from meshes import random_affine
 from numpy.testing import assert_allclose, assert_array_equal
 
 from tetopt import Image, InputError
-from tetopt.image import transformed
+from tetopt.image import transform_vectors
 
 seeds = st.integers(0, 2**32 - 1)
 dimensions = st.sampled_from([2, 3])
@@ -65,10 +65,10 @@ def test_transformed_is_a_matrix_product_row_by_row(seed, n):
     """
     rng = np.random.default_rng(seed)
     matrix, vectors = rng.normal(size=(n, n)), rng.normal(size=(37, n))
-    product = transformed(vectors, matrix)
+    product = transform_vectors(vectors, matrix)
     assert_allclose(product, vectors @ matrix.T, rtol=1e-12, atol=1e-14)
     for vector, row in zip(vectors, product, strict=True):
-        assert_array_equal(transformed(vector, matrix), row)
+        assert_array_equal(transform_vectors(vector, matrix), row)
 
 
 # What is kept

@@ -25,7 +25,7 @@ from tetopt.system.kernels import (
     entry,
     helper,
     own,
-    packed,
+    pack_record,
     run,
     unit,
 )
@@ -127,7 +127,7 @@ def test_kernels_read_records():
 )
 def test_a_record_of_other_arrays_is_refused(values):
     with pytest.raises(TypeError, match=r"Part\.values: expected array\(float64, 2d, C\), got"):
-        packed(part(1)._replace(values=values))
+        pack_record(part(1)._replace(values=values))
 
 
 @compiled_only
@@ -135,9 +135,9 @@ def test_another_record_is_refused():
     """Kernels would read its memory as that of the one they are for."""
     room = Room(np.zeros((1, 1, 1)))
     with pytest.raises(TypeError, match=r"Whole\.part: expected .*Part"):
-        packed(whole()._replace(part=room))
+        pack_record(whole()._replace(part=room))
     with pytest.raises(TypeError, match=r"Whole\.others: expected .*Part"):
-        packed(whole()._replace(others=[room]))
+        pack_record(whole()._replace(others=[room]))
     with pytest.raises(TypeError, match=r"fill: expected .*Whole.*, got .*Room"):
         run(fill, 3, room)
 
@@ -158,7 +158,7 @@ def test_a_key_of_another_version_is_read(monkeypatch):
 @compiled_only
 def test_a_record_keeps_what_it_points_to():
     """Its arrays may have no other owner."""
-    laid_out = packed(whole())
+    laid_out = pack_record(whole())
     fresh = [np.full((7, 3), -1.0) for _ in range(1000)]  # over what was freed, if it was
     assert all_sums(laid_out, 7) == all_sums(whole(), 7)
     assert len(fresh) == 1000
@@ -253,11 +253,15 @@ def test_processes_share_what_is_to_be_compiled(tmp_path):
 def test_the_cache_knows_all_sources(monkeypatch):
     """numba's own key is the code of one function; here what it closes over is of all kernels."""
     before, symbol = (
-        kernels._versioned(row_sum.function).__closure__[0].cell_contents,
+        kernels._version_function(row_sum.function).__closure__[0].cell_contents,
         row_sum.symbol,
     )
     monkeypatch.setattr(kernels, "checksum", lambda: "other")
-    assert before != "other" == kernels._versioned(row_sum.function).__closure__[0].cell_contents
+    assert (
+        before
+        != "other"
+        == kernels._version_function(row_sum.function).__closure__[0].cell_contents
+    )
     assert symbol.endswith(before)
 
 

@@ -128,7 +128,7 @@ def test_a_crop_is_read_without_the_other_voxels(name, tmp_path, monkeypatch):
         file.header.set_slope_inter(0.5, -3.0)
     nibabel.save(file, tmp_path / name)
     bounds = [(2, 7), (None, 5), (1, None)]
-    whole = tetopt.io.images.cropped(tetopt.load_image(tmp_path / name, volume=1), bounds)
+    whole = tetopt.io.images.crop_image(tetopt.load_image(tmp_path / name, volume=1), bounds)
     for planes in (1, 2**28):
         monkeypatch.setattr(tetopt.io.nifti, "PLANES_BYTES", planes)
         part = tetopt.load_image(tmp_path / name, volume=1, crop=bounds)

@@ -24,8 +24,8 @@ from tetopt.engine.loop import IterationRecord, MeshingResult
 from tetopt.engine.meshing import process_bytes
 from tetopt.fem.elasticity import stiffness
 from tetopt.fem.reference import reference
-from tetopt.job.events import listened, progress, started
-from tetopt.job.meshing import left_words, watched
+from tetopt.job.events import listen_with, progress, start_stage
+from tetopt.job.meshing import left_words, watch_run
 from tetopt.start.memory import (
     BOUND_MARGIN,
     CHANNEL_BYTES,
@@ -253,12 +253,12 @@ def test_compiling_and_long_iterations_are_told(monkeypatch):
         callback(rows[1])
         return MeshingResult(LATTICE, rows, "iterations", LATTICE)
 
-    with closing(cli_run.Display(lambda: None)) as display, listened(display):
-        started("kernels")
+    with closing(cli_run.Display(lambda: None)) as display, listen_with(display):
+        start_stage("kernels")
         make(progress)
         lines.clear()
-        started("optimise", "optimising", 1)
-        watched(optimized, LATTICE, 1, None, display.is_over)
+        start_stage("optimise", "optimising", 1)
+        watch_run(optimized, LATTICE, 1, None, display.is_over)
     memory = r"\d+(\.\d+)? [GM]B"
     assert len(lines) == 3
     assert re.fullmatch(rf"iteration   0/1  E 1\.0000  E_G 1.* cells  3\.0 s, ({memory})", lines[0])

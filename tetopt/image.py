@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tetopt.errors import InputError
 from tetopt.interop import notebook
-from tetopt.system.arrays import unmasked
+from tetopt.system.arrays import plain_array
 
 # determinant of the axes' directions, below which they do not span the space
 SINGULAR_DETERMINANT = 1e-6
@@ -65,10 +65,8 @@ class Image:
     affine: NDArray[np.float64]
 
     def __init__(self, data: ArrayLike, affine: ArrayLike | None = None) -> None:
-        checked = _checked_data(data)
-        affine = checked_affine(
-            np.eye(checked.ndim + 1) if affine is None else affine, checked.ndim
-        )
+        checked = _check_data(data)
+        affine = check_affine(np.eye(checked.ndim + 1) if affine is None else affine, checked.ndim)
         vars(self).update(data=checked, affine=affine)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -167,7 +165,7 @@ class Image:
         array([1., 2., 3.])
         """
         shifted = np.asarray(points, dtype=np.float64) - self.affine[:-1, -1]
-        return transformed(
+        return transform_vectors(
             shifted, np.asarray(np.linalg.inv(self.affine[:-1, :-1]), dtype=np.float64)
         )
 
@@ -216,7 +214,9 @@ class Image:
         return notebook.card_html("Image", rows, notebook.slice_html(self.data, self.affine))
 
 
-def transformed(vectors: NDArray[np.float64], matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+def transform_vectors(
+    vectors: NDArray[np.float64], matrix: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Multiply each of the vectors (..., n) by `matrix` (n, n), term by term in the order of the
     columns.
 
@@ -230,7 +230,9 @@ def transformed(vectors: NDArray[np.float64], matrix: NDArray[np.float64]) -> ND
 
 
 def _to_world(affine: NDArray[np.float64], index: ArrayLike) -> NDArray[np.float64]:
-    return transformed(np.asarray(index, dtype=np.float64), affine[:-1, :-1]) + affine[:-1, -1]
+    return (
+        transform_vectors(np.asarray(index, dtype=np.float64), affine[:-1, :-1]) + affine[:-1, -1]
+    )
 
 
 def shifted_affine(affine: NDArray[np.float64], start: Sequence[int]) -> NDArray[np.float64]:
@@ -240,12 +242,12 @@ def shifted_affine(affine: NDArray[np.float64], start: Sequence[int]) -> NDArray
     return shifted
 
 
-def _checked_data(data: ArrayLike) -> NDArray[np.floating]:
+def _check_data(data: ArrayLike) -> NDArray[np.floating]:
     """Return a read-only float32 or float64 C-ordered copy of `data`; raise InputError if it
     cannot be an image.
     """
     try:
-        data = unmasked("image data", data)
+        data = plain_array("image data", data)
     except InputError:
         raise
     except (TypeError, ValueError) as error:  # rows of different lengths, or a nibabel image
@@ -309,12 +311,12 @@ def _as_lossless_float(data: NDArray) -> NDArray[np.floating]:
     return np.array(data, dtype=np.float64, order="C")
 
 
-def checked_affine(affine: ArrayLike, n: int) -> NDArray[np.float64]:
+def check_affine(affine: ArrayLike, n: int) -> NDArray[np.float64]:
     """Return a read-only copy of the affine; raise InputError unless it is (n+1, n+1), finite,
     homogeneous, regular.
     """
     try:
-        affine = np.array(unmasked("affine", affine), dtype=np.float64)
+        affine = np.array(plain_array("affine", affine), dtype=np.float64)
     except InputError:
         raise
     except (TypeError, ValueError) as error:

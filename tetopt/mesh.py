@@ -15,7 +15,7 @@ from tetopt.geometry.quadratic import curved_volumes, numbered_edges, quadratic,
 from tetopt.geometry.simplex import volumes
 from tetopt.interop import conversions, notebook
 from tetopt.interop.conversions import MESHIO_KINDS, VTK_KINDS, Fields
-from tetopt.system.arrays import simplex_arrays, unmasked
+from tetopt.system.arrays import plain_array, simplex_arrays
 
 if TYPE_CHECKING:
     import meshio
@@ -45,7 +45,7 @@ class Mesh:
     ------
     InputError
         Wrong shapes, non-finite points, masked values, no cells, indices out of range, or flat or
-        inverted cells (`tetopt.geometry.simplex.oriented` turns inverted ones).
+        inverted cells (`tetopt.geometry.simplex.orient_cells` turns inverted ones).
 
     See Also
     --------
@@ -84,7 +84,7 @@ class Mesh:
         object.__setattr__(
             self,
             "midpoints",
-            None if midpoints is None else _checked_midpoints(midpoints, cells, n),
+            None if midpoints is None else _check_midpoints(midpoints, cells, n),
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -424,11 +424,9 @@ class Mesh:
         return conversions.to_trimesh(self.points, boundary_facets(self.cells))
 
 
-def _checked_midpoints(
-    midpoints: ArrayLike, cells: NDArray[np.int64], n: int
-) -> NDArray[np.float64]:
+def _check_midpoints(midpoints: ArrayLike, cells: NDArray[np.int64], n: int) -> NDArray[np.float64]:
     try:
-        places = np.array(unmasked("mesh midpoints", midpoints), dtype=np.float64, order="C")
+        places = np.array(plain_array("mesh midpoints", midpoints), dtype=np.float64, order="C")
     except InputError:
         raise
     except (TypeError, ValueError) as error:

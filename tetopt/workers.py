@@ -19,7 +19,7 @@ from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 from tetopt.errors import InputError
-from tetopt.io.text import counted
+from tetopt.io.text import count_text
 from tetopt.system.budget import available_bytes, memory_words
 from tetopt.system.extras import install_hint
 from tetopt.system.interpreter import THREADS_NAME, safe_path
@@ -71,9 +71,8 @@ class Workers(NamedTuple):
 
     def words(self) -> str:
         """Describe the workers in one line."""
-        return (
-            f"{counted(self.slots(), 'task')} at a time, each of {counted(self.threads, 'thread')}"
-        )
+        tasks, threads = count_text(self.slots(), "task"), count_text(self.threads, "thread")
+        return f"{tasks} at a time, each of {threads}"
 
 
 def check_workers(count: int | None, scheduler: str | None) -> None:

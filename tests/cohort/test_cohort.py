@@ -29,7 +29,7 @@ from tetopt.cohort.options import CohortOptions
 from tetopt.cohort.state import SubjectState
 from tetopt.cohort.subjects import read_table
 from tetopt.job.options import RunOptions
-from tetopt.system.work_directory import locked
+from tetopt.system.work_directory import lock_directory
 
 pytestmark = pytest.mark.usefixtures("read_here")
 
@@ -150,7 +150,7 @@ def test_a_failure_is_forgotten_where_the_mesh_is_what_is_asked_for(small, monke
     """Options that fail, and then those again of the mesh that is there: it is done, though
     nothing is run.
     """
-    monkeypatch.setattr(cohort_plan, "requested", lambda *_: {"sha256": "1"})
+    monkeypatch.setattr(cohort_plan, "job_request", lambda *_: {"sha256": "1"})
     begin(small / "out")
     save_run(
         small / "out",
@@ -346,7 +346,7 @@ def test_what_is_chosen(only_failed, keys):
         cohort_plan.PlannedSubject(None, key, None, SubjectState(each, ""))
         for key, each in states.items()
     ]
-    assert [each.key for each in cohort_plan.chosen(entries, only_failed)] == keys
+    assert [each.key for each in cohort_plan.choose_subjects(entries, only_failed)] == keys
 
 
 def test_the_same_fault_of_many_subjects_is_said_once(small, capsys):
@@ -374,7 +374,7 @@ def test_a_second_run_is_refused_before_it_plans(small, capsys, monkeypatch):
         raise AssertionError("planned")
 
     monkeypatch.setattr(cohort_module, "subjects_of", fail)
-    with locked(small / "out" / ".work"):
+    with lock_directory(small / "out" / ".work"):
         assert "another run is writing there" in refused(small, capsys)[0]
 
 
@@ -445,9 +445,9 @@ def test_what_another_run_has_done_meanwhile_is_not_done_again(small, monkeypatc
         yield
 
     keys = []
-    monkeypatch.setattr(cohort_module, "locked", locked)
-    monkeypatch.setattr(cohort_plan, "requested", lambda *_: {"sha256": "1"})
-    monkeypatch.setattr(cohort_module, "estimated", lambda _: {})
+    monkeypatch.setattr(cohort_module, "lock_directory", locked)
+    monkeypatch.setattr(cohort_plan, "job_request", lambda *_: {"sha256": "1"})
+    monkeypatch.setattr(cohort_module, "estimate_memory", lambda _: {})
     monkeypatch.setattr(
         cohort_module, "_run", lambda _, to_run: keys.extend(entry.key for entry in to_run)
     )

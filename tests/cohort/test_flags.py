@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from cohorts import run_of, save_cohort
 
-from tetopt.cohort.flags import FEW_SUBJECTS, deviations, flags_of, limit, unjudged
+from tetopt.cohort.flags import FEW_SUBJECTS, comparisons_left_out, deviations, flags_of, limit
 from tetopt.cohort.numbers import Row, collect, with_numbers
 
 OBLIQUE = np.diag([1.0, 1.0, 1.2, 1.0])
@@ -91,10 +91,10 @@ def test_a_mixed_cohort_says_that_it_is_not_judged():
         row_of(k, run_of(rng, affine=np.diag([sign, sign, 1.2, 1.0])))
         for k, sign in enumerate(signs)
     ]
-    [words] = unjudged(rows)
+    [words] = comparisons_left_out(rows)
     assert re.match("The 9 3-D meshes are too mixed to judge by orientation: ", words)
-    assert unjudged([rows[0], *rows[:4], *rows[:4]]) == []
-    assert [each[:21] for each in unjudged([rows[0], rows[-1]])] == [
+    assert comparisons_left_out([rows[0], *rows[:4], *rows[:4]]) == []
+    assert [each[:21] for each in comparisons_left_out([rows[0], rows[-1]])] == [
         "2 3-D meshes are too ",
         "The 2 3-D meshes are ",
     ]

@@ -96,7 +96,7 @@ def test_a_subjects_folder_that_is_a_link_is_read_and_not_replaced(out, capfd, m
     with monkeypatch.context() as patch:  # what is asked for is what is there
         patch.setattr(
             cohort_plan,
-            "requested",
+            "job_request",
             lambda *_: json.loads(numbers_path(out, KEY).read_text())["request"],
         )
         assert exit_code(*words(out)) == 0

@@ -15,7 +15,7 @@ from tetopt.cohort.numbers import (
     column_names,
     description,
     field_text,
-    flattened,
+    flatten_run,
     oblique_degrees,
     orientation_code,
     save_table,
@@ -105,7 +105,7 @@ def test_numbers_have_names_with_dots():
     }
     run |= {"contrasts": [{"image": "a", "weight": 2.0}] * 6}
     run["labels"][1]["lost_components"] = [{"voxels": 50, "place": [0.0, 1.0, 2.0]}] * 6
-    columns = flattened(run)
+    columns = flatten_run(run)
     assert [value for name, value in columns.items() if "lost_components" in name] == [6]
     assert columns["grid.orientation"] == "RAS"
     assert columns["grid.spacing_mm"] == "1 x 1 x 1.2"
@@ -183,7 +183,7 @@ def test_no_text_is_a_formula():
 def test_every_column_is_described():
     assert [
         name
-        for name in flattened(run_of(RNG))
+        for name in flatten_run(run_of(RNG))
         if description(name)["Description"].endswith("of run.json")
     ] == []
     assert description("options.k_D") == {"Description": "Option k_D"}

@@ -16,7 +16,7 @@ from tetopt.cohort.run import SubjectTask, run_all, run_subject
 from tetopt.errors import InputError
 from tetopt.job.events import Event
 from tetopt.job.options import JobOptions
-from tetopt.job.plan import changed
+from tetopt.job.plan import changed_options
 from tetopt.workers import WorkerEnded
 
 pytestmark = pytest.mark.usefixtures("read_here")
@@ -36,7 +36,7 @@ def task_in(out, image):
 
 
 def with_options(task, **options):
-    return task._replace(job=changed(task.job, **options))
+    return task._replace(job=changed_options(task.job, **options))
 
 
 @pytest.fixture

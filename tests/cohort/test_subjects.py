@@ -7,9 +7,9 @@ import pytest
 from tetopt.cohort.subjects import (
     Problems,
     Subject,
-    doubled,
     key,
     matching,
+    name_problems,
     read_table,
     write_table,
 )
@@ -115,15 +115,15 @@ def test_all_lines_that_are_wrong_are_said(tmp_path):
 
 def test_names_that_come_to_the_same_are_said():
     rows = [subject("a-1"), subject("a1"), subject("--"), subject("b"), subject("b", "x")]
-    words = list(doubled(rows))
+    words = list(name_problems(rows))
     assert [line.partition(":")[0] for line in words] == ["row a1", "row --", "row b"]
     assert "sub-a1 is also used by row a-1" in words[0]
     assert "sub-b_ses-x has a session, but sub-b (row b) has none" in words[2]
 
 
 def test_names_that_no_file_can_have_are_refused():
-    assert list(doubled([subject("n" * 196)])) == []
-    (line,) = doubled([subject("n" * 100, "s" * 100)])
+    assert list(name_problems([subject("n" * 196)])) == []
+    (line,) = name_problems([subject("n" * 100, "s" * 100)])
     assert "has 209 characters" in line
 
 

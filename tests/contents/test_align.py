@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import tetopt
 from tetopt.contents.align import (
     background_level,
-    divided,
+    divide_voxels,
     divisions,
     foreground_mask,
     resample_contrast,
@@ -500,7 +500,7 @@ def test_voxels_divided_to_the_size_of_labels_keep_all_of_them(shift):
     )
     image = tetopt.Image(image.data, image.affine @ _translation(-4.5, -4.5, -4.5))
     assert divisions(image, [labels]) == (4, 4, 4)
-    moved = resample_labels(labels, divided(image, (4, 4, 4)), "l")
+    moved = resample_labels(labels, divide_voxels(image, (4, 4, 4)), "l")
     for label in (0, 1, 2, 3):
         counts = [scipy.ndimage.label(each.data == label)[1] for each in (labels, moved)]
         assert counts == [1, 1]
@@ -524,7 +524,7 @@ def test_voxels_are_divided_only_where_others_are_finer():
     turned = np.eye(4)[[2, 0, 1, 3]] @ np.diag([1.0, 0.5, 0.25, 1.0])
     assert divisions(image, [other(turned)]) == (4, 1, 10)
     data = np.arange(120.0).reshape(4, 5, 6)
-    parts = divided(tetopt.Image(data, image.affine), (1, 2, 5))
+    parts = divide_voxels(tetopt.Image(data, image.affine), (1, 2, 5))
     assert parts.volume == pytest.approx(image.volume)
     for place in ((0, 0, 0), (3, 4, 5), (1, 2, 3)):
         i, j, k = place

@@ -4,7 +4,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from shapes import OBLIQUE, channels, grid, shaped
 
 import tetopt
-from tetopt.contents.content import content, continued, plain
+from tetopt.contents.content import content, continue_image, plain
 from tetopt.contents.noise import noise_level
 from tetopt.energy.sampling import cell_of_voxel, channel_grid, moment_sums, to_ticks
 from tetopt.start.sums import channels_of
@@ -154,9 +154,9 @@ def test_beyond_a_mask_the_nearest_value_inside_counts():
     far = tetopt.Image(np.where(mask.data > 0, image.data, -1e6), image.affine)
     target = content(far, mask=mask)
     assert target.image.data.min() > -1e3
-    whole = continued(far, mask)
+    whole = continue_image(far, mask)
     assert_array_equal(whole.data, target.image.data)
-    assert_array_equal(continued(far, target.continuation).data, whole.data)
+    assert_array_equal(continue_image(far, target.continuation).data, whole.data)
     # The same place in the world, and the same voxels inside.
     index = image.to_index(target.image.to_world(grid(target.image.shape)))
     start = np.rint(index[0, 0, 0]).astype(int)
@@ -178,7 +178,7 @@ def test_nearest_is_by_mm():
     mask[0, 2] = mask[1, 5] = 1.0
     data[0, 2], data[1, 5] = 7.0, 8.0
     affine = np.diag([10.0, 1.0, 1.0])
-    assert continued(tetopt.Image(data, affine), tetopt.Image(mask, affine)).data[1, 2] == 8.0
+    assert continue_image(tetopt.Image(data, affine), tetopt.Image(mask, affine)).data[1, 2] == 8.0
 
 
 def test_noise_within_a_mask():

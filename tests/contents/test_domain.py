@@ -5,11 +5,11 @@ from scipy.ndimage import binary_opening, map_coordinates
 from shapes import OBLIQUE, distance, grid, shaped
 
 import tetopt
-from tetopt.contents.domain import Region, _opened, levels, region_of
+from tetopt.contents.domain import Region, _open_mask, levels, region_of
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import boundary_facets
 from tetopt.measure.fidelity import mask_fidelity
-from tetopt.start.clip import clipped, lattice_within, lost_fraction, onto_surface
+from tetopt.start.clip import clip_cells, lattice_within, lost_fraction, onto_surface
 
 
 def test_a_sphere_has_no_stairs():
@@ -92,7 +92,7 @@ def test_all_inside_has_no_surface():
     image = tetopt.Image(np.ones((6, 7, 8)))
     region = region_of(image)
     mesh = tetopt.lattice_mesh(image, nodes=100)
-    assert clipped(mesh, image, region).cells.tolist() == mesh.cells.tolist()
+    assert clip_cells(mesh, image, region).cells.tolist() == mesh.cells.tolist()
 
 
 def test_levels_are_linear_between_centres():
@@ -123,7 +123,7 @@ def test_the_way_onto_the_surface_is_the_shortest_in_mm(n):
 
 def test_nodes_on_the_box_stay_on_it():
     image, mask = shaped("touching")
-    mesh = clipped(tetopt.lattice_mesh(image, nodes=900), image, region_of(mask))
+    mesh = clip_cells(tetopt.lattice_mesh(image, nodes=900), image, region_of(mask))
     index = image.to_index(mesh.points)
     assert (index >= -0.5).all()
     assert (index[:, 0] == -0.5).sum() > 20
@@ -208,7 +208,7 @@ def test_too_thin_for_its_cells():
         tetopt.InputError,
         match="thinner than the cells, so no cell is left inside; increase the number",
     ):
-        clipped(moved, image, region_of(image))
+        clip_cells(moved, image, region_of(image))
 
 
 @pytest.mark.parametrize("shape", [(13, 15, 11), (20, 31), (9, 1, 12)])
@@ -216,4 +216,4 @@ def test_voxels_in_cubes_of_two_are_scipys(shape):
     rng = np.random.default_rng(0)
     for fraction in (0.7, 0.9, 0.97):
         inside = rng.random(shape) < fraction
-        assert_array_equal(_opened(inside), binary_opening(inside, np.ones((2,) * len(shape))))
+        assert_array_equal(_open_mask(inside), binary_opening(inside, np.ones((2,) * len(shape))))

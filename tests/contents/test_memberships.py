@@ -13,7 +13,7 @@ from tetopt.contents.memberships import (
     finer_affine,
     labels_at,
     memberships,
-    numbered,
+    number_labels,
     supersampling,
 )
 from tetopt.contents.smoothing import FARTHEST_DISTANCE, raw_level
@@ -74,7 +74,7 @@ def test_every_voxel_keeps_its_label():
 @pytest.mark.parametrize("n_labels", [180, 181])
 def test_numbers_of_labels_leave_room_for_those_of_pairs(n_labels):
     labels = np.arange(200).reshape(10, 20) % n_labels * 3
-    values, rows = numbered(tetopt.Image(labels))
+    values, rows = number_labels(tetopt.Image(labels))
     assert_array_equal(values[rows], labels)
     pairs = (n_labels + 1) * rows + n_labels
     assert_array_equal(pairs, (n_labels + 1) * rows.astype(np.int64) + n_labels)

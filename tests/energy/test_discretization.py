@@ -19,8 +19,8 @@ from tetopt import (
     lattice_mesh,
     load_phantom,
 )
-from tetopt.energy.discretization import cell_E_D, combined, unexplained
-from tetopt.geometry.simplex import oriented, volumes
+from tetopt.energy.discretization import cell_E_D, combine_energies, unexplained_variance
+from tetopt.geometry.simplex import orient_cells, volumes
 
 kernel = pytest.mark.kernel
 
@@ -36,7 +36,7 @@ def random_case(seed, n):
     make = split_box if rng.random() < 0.5 else delaunay_box
     index, cells = make(rng, shape, int(rng.integers(0, 8)))
     points = image.to_world(index)
-    return image, Mesh(points, oriented(points, cells))
+    return image, Mesh(points, orient_cells(points, cells))
 
 
 # Constant images
@@ -235,15 +235,15 @@ def test_unexplained_is_what_cells_leave_of_the_variance_of_their_voxels():
     within = image.data[naive.cell_of_voxel(image, mesh) >= 0].astype(np.float64)
     expected = E_D(image, mesh) / (within.var() * within.size)
     assert 0.1 < expected < 0.9
-    assert unexplained(content(image), mesh) == pytest.approx(expected, rel=1e-9)
-    assert unexplained(content(Image(np.ones((6, 5, 4)))), mesh) is None
+    assert unexplained_variance(content(image), mesh) == pytest.approx(expected, rel=1e-9)
+    assert unexplained_variance(content(Image(np.ones((6, 5, 4)))), mesh) is None
 
 
 @kernel
 def test_unexplained_of_two_equal_contrasts_is_that_of_one():
     image, mesh = part_of_noise()
-    one = unexplained(content(image), mesh)
-    assert unexplained(content([image, image]), mesh) == pytest.approx(one, rel=1e-3)
+    one = unexplained_variance(content(image), mesh)
+    assert unexplained_variance(content([image, image]), mesh) == pytest.approx(one, rel=1e-3)
 
 
 def part_of_noise():
@@ -257,12 +257,12 @@ def part_of_noise():
 
 
 def test_combined_is_normalised_by_the_initial_mesh():
-    assert combined(3.0, 5.0, 3.0, 5.0, 0.3) == pytest.approx(1)
-    assert combined(6.0, 5.0, 3.0, 10.0, 0.25) == pytest.approx(0.75 * 2 + 0.25 * 0.5)
-    assert combined(6.0, 5.0, 3.0, 10.0, 0.0) == 2
-    assert combined(6.0, 5.0, 3.0, 10.0, 1.0) == 0.5
+    assert combine_energies(3.0, 5.0, 3.0, 5.0, 0.3) == pytest.approx(1)
+    assert combine_energies(6.0, 5.0, 3.0, 10.0, 0.25) == pytest.approx(0.75 * 2 + 0.25 * 0.5)
+    assert combine_energies(6.0, 5.0, 3.0, 10.0, 0.0) == 2
+    assert combine_energies(6.0, 5.0, 3.0, 10.0, 1.0) == 0.5
 
 
 def test_combined_leaves_out_the_image_of_a_constant_one():
-    assert combined(6.0, 0.0, 3.0, 0.0, 0.25) == 1.5
-    assert combined(3.0, 0.0, 3.0, 0.0, 0.25) == 0.75
+    assert combine_energies(6.0, 0.0, 3.0, 0.0, 0.25) == 1.5
+    assert combine_energies(3.0, 0.0, 3.0, 0.0, 0.25) == 0.75

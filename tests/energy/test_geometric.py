@@ -22,7 +22,7 @@ from meshes import (
 
 from tetopt import E_G
 from tetopt.energy.geometric import cell_E_G, volume_and_E_G
-from tetopt.geometry.simplex import oriented, volumes
+from tetopt.geometry.simplex import orient_cells, volumes
 
 pytestmark = pytest.mark.kernel
 
@@ -122,7 +122,7 @@ def corners_of(points, cell):
 def test_volume_and_E_G_of_one_cell(seed, n):
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(8, n)) * np.exp(rng.uniform(-3, 3)) + rng.uniform(-100, 100, n)
-    cells = oriented(points, np.array([rng.permutation(8)[: n + 1] for _ in range(5)]))
+    cells = orient_cells(points, np.array([rng.permutation(8)[: n + 1] for _ in range(5)]))
     for cell, v, energy in zip(cells, volumes(points, cells), cell_E_G(points, cells), strict=True):
         measured = volume_and_E_G(corners_of(points, cell), n + 1)
         assert measured == pytest.approx((v, energy), rel=1e-8)

@@ -24,7 +24,7 @@ from tetopt.energy.sampling import (
     sampling_grid,
     to_ticks,
 )
-from tetopt.geometry.simplex import oriented
+from tetopt.geometry.simplex import orient_cells
 
 pytestmark = pytest.mark.kernel
 
@@ -42,7 +42,7 @@ def random_image(rng, shape, affine=None):
 def placed(image, index, cells):
     """The mesh of nodes given in index coordinates, whatever the affine's hand."""
     points = image.to_world(index)
-    return Mesh(points, oriented(points, cells))
+    return Mesh(points, orient_cells(points, cells))
 
 
 def random_case(seed, n, *, is_snapped):
@@ -416,7 +416,8 @@ def test_the_world_s_frame_does_not_matter(seed, n):
     moved = Image(image.data, motion @ image.affine)
     points = mesh.points @ motion[:n, :n].T + motion[:n, n]
     assert_array_equal(
-        cell_of_voxel(moved, Mesh(points, oriented(points, mesh.cells))), cell_of_voxel(image, mesh)
+        cell_of_voxel(moved, Mesh(points, orient_cells(points, mesh.cells))),
+        cell_of_voxel(image, mesh),
     )
 
 

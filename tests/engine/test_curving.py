@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import tetopt
-from tetopt.engine.curving import LEAST_JACOBIAN, MOST_BENT, curved
+from tetopt.engine.curving import LEAST_JACOBIAN, MOST_BENT, curve_mesh
 from tetopt.fem.elasticity import gauss_volumes
 from tetopt.geometry.quadratic import (
     curved_rule,
@@ -93,7 +93,7 @@ def test_only_edges_on_the_interface_are_curved(sphere):
 def test_edges_of_cells_that_would_fold_go_part_of_the_way(sphere, monkeypatch):
     result, content = sphere
     monkeypatch.setattr("tetopt.engine.curving.LEAST_JACOBIAN", 0.8)
-    mesh, curving = curved(straight(result.mesh), content, result.labels)
+    mesh, curving = curve_mesh(straight(result.mesh), content, result.labels)
     assert curving.n_part_way > 50
     assert curving.n_straight >= result.curving.n_straight
     assert curving.n_on_level < result.curving.n_on_level
@@ -109,11 +109,11 @@ def test_edges_whose_ends_are_off_the_level_stay_straight(monkeypatch):
     content = tetopt.content(labels, labels)
     lattice = tetopt.lattice_mesh(labels, nodes=400)
     of_cell = tetopt.cell_labels(labels, lattice)
-    mesh, curving = curved(lattice, content, of_cell)
+    mesh, curving = curve_mesh(lattice, content, of_cell)
     assert mesh is lattice
     assert curving == (curving.n_edges, 0, 0, curving.n_edges, 0.0, 1.0)
     monkeypatch.setattr("tetopt.engine.curving.ENDS_VOXELS", 99.0)
-    assert curved(lattice, content, of_cell)[1].n_straight < 0.5 * curving.n_edges
+    assert curve_mesh(lattice, content, of_cell)[1].n_straight < 0.5 * curving.n_edges
 
 
 def test_edges_on_a_side_of_a_sheared_box_stay_there():

@@ -30,7 +30,7 @@ from tetopt.engine.fast import Run
 from tetopt.engine.repair import n_cells_below
 from tetopt.engine.smooth import _add_image_gradient, _add_shape_gradient
 from tetopt.engine.state import angle_limit_of
-from tetopt.geometry.simplex import dihedral_angles, oriented
+from tetopt.geometry.simplex import dihedral_angles, orient_cells
 from tetopt.geometry.topology import boundary_facets
 
 seeds = st.integers(0, 2**32 - 1)
@@ -291,7 +291,7 @@ def test_flips_at_k_D_0_tend_to_delaunay(n):
     engine = Engine(image, tetopt.Mesh(points, cells), 0.0, 1.0)
     begin = energies(engine.state)[0]
     assert engine.flip(passes=500) > 0
-    best = oriented(points, Delaunay(points).simplices)
+    best = orient_cells(points, Delaunay(points).simplices)
     v = np.abs(np.linalg.det(points[best][:, 1:] - points[best][:, :1]))
     best = best[v > 1e-9]
     least, now = float(cell_E_G(points, best).sum()), energies(engine.state)[0]

@@ -6,7 +6,7 @@ import pytest
 
 import tetopt
 from tetopt.contents.content import content
-from tetopt.energy.discretization import combined
+from tetopt.energy.discretization import combine_energies
 from tetopt.energy.sampling import channel_grid, from_ticks
 from tetopt.engine.complex import cell_squares, energies, node_stars, remeasure
 from tetopt.engine.density import Limits, _put_middle, best_splits, exchange, roomy, worth_of_split
@@ -336,7 +336,7 @@ def test_E_of_the_history_is_comparable_throughout():
     assert result.labels is not None
     for row in result.history:
         assert row.E == pytest.approx(
-            combined(row.E_G, row.E_D, first.E_G, first.E_D, GRADED_K_D), rel=1e-9
+            combine_energies(row.E_G, row.E_D, first.E_G, first.E_D, GRADED_K_D), rel=1e-9
         )
 
 

@@ -28,7 +28,7 @@ from tetopt.engine.labelling import (
     mend_labels,
     unfit_labels,
 )
-from tetopt.geometry.simplex import oriented, volumes
+from tetopt.geometry.simplex import orient_cells, volumes
 from tetopt.geometry.topology import stars
 
 
@@ -86,7 +86,7 @@ def lattice(n, cubes):
 
 def box(n, count, seed):
     points, cells = delaunay_box(np.random.default_rng(seed), (6, 5, 7)[:n], count)
-    return points, oriented(points, cells)
+    return points, orient_cells(points, cells)
 
 
 @pytest.mark.parametrize("n", [2, 3])

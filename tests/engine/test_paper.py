@@ -14,7 +14,7 @@ import tetopt
 from tetopt.energy.sampling import sampling_grid, to_ticks
 from tetopt.engine.loop import frozen_axes, side_ticks
 from tetopt.engine.paper import default_n_t, optimize_paper
-from tetopt.geometry.simplex import oriented, rho, volumes
+from tetopt.geometry.simplex import orient_cells, rho, volumes
 from tetopt.geometry.topology import boundary_facets, facets, stars
 from tetopt.start.delaunay import delaunay
 
@@ -117,7 +117,7 @@ def test_lloyd_moves_to_the_weighted_circumcentre():
     corner = np.array(np.meshgrid([-0.5, 7.5], [-0.5, 7.5], [-0.5, 7.5])).reshape(3, -1).T
     points = np.vstack([corner, [2.0, 3.1, 4.7]])
     cells = Delaunay(points).simplices
-    cells = oriented(points, cells[np.abs(volumes(points, cells)) > 1e-9])
+    cells = orient_cells(points, cells[np.abs(volumes(points, cells)) > 1e-9])
     star = cells[stars(cells, 9).cells[stars(cells, 9).start[8] :]]
     v = volumes(points, star)
     expected = (v[:, None] * naive.circumcentres(points, star)).sum(0) / v.sum()

@@ -11,7 +11,7 @@ from shapes import OBLIQUE, channels, distance, grid, shaped
 import tetopt
 from tetopt.contents.content import content
 from tetopt.contents.domain import levels
-from tetopt.energy.discretization import unexplained
+from tetopt.energy.discretization import unexplained_variance
 from tetopt.energy.sampling import cell_of_voxel, channel_grid, moment_sums, overlap_of, to_ticks
 from tetopt.engine.complex import build
 from tetopt.engine.fast import MOST_OFFSET_FRACTION, Run
@@ -355,7 +355,7 @@ def test_an_error_wanted_within_a_mask():
     result = tetopt.mesh_image(target, target_error=0.2, iterations=6)
     # of the variance of the voxels in cells, which quality reports, too
     assert 0.1 < result.fraction <= 0.2
-    assert result.fraction == unexplained(target, result.mesh)
+    assert result.fraction == unexplained_variance(target, result.mesh)
 
 
 # The surface's kernels.

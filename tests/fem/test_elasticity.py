@@ -21,15 +21,15 @@ from tetopt.fem import elasticity
 from tetopt.fem.elasticity import (
     box_faces,
     compression,
-    constrained,
+    constrain_nodes,
     multigrid,
-    solved,
+    solve_system,
     stiffness,
     strains,
 )
 from tetopt.fem.rigidity import check_held, rigid_modes
 from tetopt.geometry.quadratic import quadratic
-from tetopt.geometry.simplex import oriented, volumes
+from tetopt.geometry.simplex import orient_cells, volumes
 from tetopt.geometry.topology import boundary_facets, facets
 from tetopt.start.carve import part_of
 
@@ -235,8 +235,8 @@ def test_patch(name):
     assert (~is_boundary[:, 0]).sum() >= 5
     slope, shift = rng.normal(size=(n, n)), rng.normal(size=n)
     field = mesh.points @ slope.T + shift
-    system = constrained(mesh, 7.0, nu, is_boundary, np.where(is_boundary, field, np.nan))
-    u = solved(system)
+    system = constrain_nodes(mesh, 7.0, nu, is_boundary, np.where(is_boundary, field, np.nan))
+    u = solve_system(system)
     assert_allclose(u, field, atol=1e-11 * np.abs(field).max())
     assert_array_equal(u[is_boundary], field[is_boundary])
     strain = 0.5 * (slope + slope.T)
@@ -301,7 +301,7 @@ def test_block_in_a_rigid_frame(n):
     wall = (mesh.points < 1e-9) | (mesh.points > 2.0 - 1e-9)
     field = np.zeros_like(mesh.points)
     field[:, -1] = -0.01 * mesh.points[:, -1]
-    u = solved(constrained(mesh, 3.0, nu, wall, field))
+    u = solve_system(constrain_nodes(mesh, 3.0, nu, wall, field))
     assert_allclose(u, field, atol=1e-13)
     modulus = 3.0 / (1.0 - nu**2) if n == 2 else 3.0 * (1.0 - nu) / ((1.0 + nu) * (1.0 - 2.0 * nu))
     assert cell_energies(mesh, 3.0, nu, u).sum() == pytest.approx(
@@ -396,7 +396,7 @@ def refined(mesh, young):
     pairs = np.sort(mesh.cells[:, ends], axis=-1).reshape(-1, 2)
     keys, number = np.unique(pairs @ [n_nodes, 1], return_inverse=True)
     points = 0.5 * (mesh.points[keys // n_nodes] + mesh.points[keys % n_nodes])
-    fine = Mesh(points, oriented(points, number.reshape(-1, mesh.ndim + 1)))
+    fine = Mesh(points, orient_cells(points, number.reshape(-1, mesh.ndim + 1)))
     assert_allclose(
         volumes(fine.points, fine.cells).reshape(len(young), -1),
         np.repeat(volumes(mesh.points, mesh.cells)[:, None] / len(ends), len(ends), axis=1),
@@ -721,7 +721,7 @@ def test_messages_of_meshes_that_are_not_held():
     assert words.startswith("mesh: 8 nodes belong to no cell, the first [4, 5, 6, 7, 8]")
     nothing = np.zeros((4, 2))
     assert "it can move freely" in message_of(
-        lambda: constrained(PLATE, 1.0, 0.3, nothing > 1, nothing)
+        lambda: constrain_nodes(PLATE, 1.0, 0.3, nothing > 1, nothing)
     )
     # One fixed and one pushed node, smooth plates: it turns until they are apart by the way.
     options |= {"fixed_nodes": [2], "pushed_nodes": [1], "is_bonded": False}
@@ -734,7 +734,7 @@ def test_messages_of_constrained():
     is_held, values = np.zeros((4, 2), dtype=bool), np.zeros((4, 2))
     is_held[:2] = True
     values[3] = np.nan  # not prescribed, so it does not count
-    constrained(PLATE, 1.0, 0.3, is_held, values)
+    constrain_nodes(PLATE, 1.0, 0.3, is_held, values)
     values[1, 0] = np.inf
     for chosen, prescribed, words in (
         (is_held, values, "prescribed: displacements must be finite, but node 1 has [inf, 0.0]"),
@@ -742,7 +742,7 @@ def test_messages_of_constrained():
         (is_held, values[:3], "prescribed: expected shape (4, 2), one row per node, got (3, 2)"),
     ):
         assert words in message_of(
-            lambda *given: constrained(PLATE, 1.0, 0.3, *given), chosen, prescribed
+            lambda *given: constrain_nodes(PLATE, 1.0, 0.3, *given), chosen, prescribed
         )
 
 

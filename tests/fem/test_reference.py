@@ -19,14 +19,14 @@ from tetopt.fem.reference import (
     OwnError,
     Reference,
     at_centres,
-    averaged,
+    average_voxels,
     compare,
-    interpolated,
+    interpolate_nodes,
     near_interface,
     nearest,
     reference,
     reference_shape,
-    refined,
+    refine_voxels,
 )
 from tetopt.geometry.quadratic import quadratic
 from tetopt.model.averages import cell_young
@@ -194,22 +194,24 @@ def test_averaged_keeps_box_and_mean():
     """Cut voxels count by the part of them; a linear image stays linear; the box stays the same."""
     rng = np.random.default_rng(1)
     image = tetopt.Image(rng.normal(size=(7, 10, 9)), affine_of(SHEARED, 2.0))
-    coarse = averaged(image, (3, 10, 4))
+    coarse = average_voxels(image, (3, 10, 4))
     assert coarse.shape == (3, 10, 4)
     assert coarse.data.mean() == pytest.approx(image.data.mean(), rel=1e-12)
     for corner in product((0, 1), repeat=3):
         ends = [np.where(corner, np.array(i.shape) - 0.5, -0.5) for i in (image, coarse)]
         assert_allclose(image.to_world(ends[0]), coarse.to_world(ends[1]), atol=1e-12)
     by_hand = (image.data[0] + image.data[1] + image.data[2] / 3.0) / (7.0 / 3.0)
-    assert_allclose(averaged(image, (3, 10, 9)).data[0], by_hand, rtol=1e-12)
-    assert_array_equal(averaged(image, image.shape).data, image.data)
+    assert_allclose(average_voxels(image, (3, 10, 9)).data[0], by_hand, rtol=1e-12)
+    assert_array_equal(average_voxels(image, image.shape).data, image.data)
 
 
 @pytest.mark.parametrize("shape", [(7, 10, 9), (5, 1, 6)])
 def test_averaged_against_exact_fractions(shape):
     image = tetopt.Image(np.random.default_rng(6).normal(size=shape))
     for new in (tuple((s + 1) // 2 for s in shape), tuple(max(1, s - 2) for s in shape)):
-        assert_allclose(averaged(image, new).data, naive.block_means(image.data, new), atol=1e-13)
+        assert_allclose(
+            average_voxels(image, new).data, naive.block_means(image.data, new), atol=1e-13
+        )
 
 
 @pytest.mark.parametrize(("old", "new"), [((3, 5, 4), (7, 10, 4)), ((2, 1), (4, 3))])
@@ -220,7 +222,7 @@ def test_interpolated_against_dense_interpolation(old, new):
     dense = np.einsum(
         f"{','.join(map(''.join, zip(*axes, strict=True)))},{axes[1]}d->{axes[0]}d", *P, u
     )
-    assert_allclose(interpolated(u, new), dense, atol=1e-14)
+    assert_allclose(interpolate_nodes(u, new), dense, atol=1e-14)
 
 
 def test_reference_shape_is_as_fine_as_allowed():
@@ -249,7 +251,7 @@ def test_refined_is_the_same_field():
     image = tetopt.Image(
         np.random.default_rng(3).uniform(size=(5, 4, 3)), random_affine(np.random.default_rng(4), 3)
     )
-    fine = refined(image, (11, 4, 8))
+    fine = refine_voxels(image, (11, 4, 8))
     assert fine.shape == (10, 4, 9)
     assert fine.data.mean() == pytest.approx(image.data.mean(), rel=1e-12)
     index = np.stack(
@@ -257,7 +259,7 @@ def test_refined_is_the_same_field():
     ).reshape(-1, 3)
     of = np.rint(image.to_index(fine.to_world(index.astype(float)))).astype(int)
     assert_array_equal(fine.data.ravel(), image.data[tuple(of.T)])
-    assert_array_equal(refined(image, image.shape).data, image.data)
+    assert_array_equal(refine_voxels(image, image.shape).data, image.data)
 
 
 @pytest.mark.full
@@ -268,7 +270,7 @@ def test_own_error_is_that_of_half_the_resolution():
     rng = np.random.default_rng(10)
     image = tetopt.Image(rng.uniform(1.0, 10.0, (8, 7, 10)), affine_of(SHEARED, 1.0))
     exact = reference(image, 0.3)
-    coarse = reference(averaged(image, (4, 3, 5)), 0.3)
+    coarse = reference(average_voxels(image, (4, 3, 5)), 0.3)
     P = [naive.interpolation(*pair) for pair in ((8, 4), (7, 3), (10, 5))]
     difference = np.einsum("ai,bj,ck,ijkd->abcd", *P, coarse.u) - exact.u
     even = reference(tetopt.Image(np.ones(image.shape), image.affine), 0.3).u

@@ -20,15 +20,15 @@ from tetopt.fem import solution as module
 from tetopt.fem.conditioning import conditioning
 from tetopt.fem.elasticity import (
     compression,
-    constrained,
+    constrain_nodes,
     gauss_strains,
     multigrid,
-    solved,
+    solve_system,
     strains,
 )
 from tetopt.fem.solution import node_means, solution_fields, solve, von_mises
 from tetopt.geometry.quadratic import quadratic
-from tetopt.geometry.simplex import oriented, volumes
+from tetopt.geometry.simplex import orient_cells, volumes
 from tetopt.model.build import build_model
 from tetopt.model.loads import Load, facet_weights
 from tetopt.model.model import element_facets, in_units
@@ -322,8 +322,8 @@ def test_patch_with_moduli_and_ratios_of_one_kind(n, order):
     points, cells = (mesh.points, mesh.cells) if order == 1 else quadratic(mesh.points, mesh.cells)
     on_boundary = np.zeros(points.shape, dtype=bool)
     on_boundary[np.unique(element_facets(cells, sets.facets["boundary"]))] = True
-    system = constrained(mesh, 3.0, 0.45, on_boundary, points @ slope.T, order=order)
-    u = solved(system)
+    system = constrain_nodes(mesh, 3.0, 0.45, on_boundary, points @ slope.T, order=order)
+    u = solve_system(system)
     assert_allclose(u, points @ slope.T, atol=1e-11)
     assert (~on_boundary[:, 0]).sum() > 5
     force = (system.K @ u.ravel()).reshape(u.shape)
@@ -620,7 +620,7 @@ def test_forces_that_do_not_balance_are_an_error(monkeypatch):
     model = model_with(
         mesh, sets, ["hold:inferior", "traction:superior:0,0,0.5"], 1, young=4.0, nu=0.3
     )
-    plain = module.constrained
+    plain = module.constrain_nodes
 
     def with_leak(*arguments, **options):
         system = plain(*arguments, **options)
@@ -629,7 +629,7 @@ def test_forces_that_do_not_balance_are_an_error(monkeypatch):
             K=system.K + leak, K_ff=system.K_ff + leak[system.free][:, system.free]
         )
 
-    monkeypatch.setattr(module, "constrained", with_leak)
+    monkeypatch.setattr(module, "constrain_nodes", with_leak)
     with pytest.raises(
         RuntimeError,
         match=r"^elasticity: forces and reactions do not balance: the remainder .* mN exceeds",
@@ -757,7 +757,7 @@ def eighth_of_a_shell(inner, outer, around, across):
                 [low + a, low + b, high + b, high + c],
                 [low + a, high + a, high + b, high + c],
             ]
-    mesh = Mesh(points, oriented(points, np.array(cells)))
+    mesh = Mesh(points, orient_cells(points, np.array(cells)))
     rows = boundary_rows(mesh)
     triples = mesh.points[facet_triples(mesh.cells, rows)]
     distance = np.linalg.norm(triples, axis=2)

@@ -33,7 +33,7 @@ from tetopt.geometry.simplex import (
     edge_pairs,
     facet_areas,
     facet_nodes,
-    oriented,
+    orient_cells,
     rho,
     squared_edges,
     volume_gradients,
@@ -47,7 +47,7 @@ dimensions = st.sampled_from([2, 3])
 def random_cells(seed, n, count=20):
     """`count` generic simplices, positively oriented, each on its own nodes."""
     points = np.random.default_rng(seed).normal(size=(count * (n + 1), n))
-    return points, oriented(points, np.arange(len(points)).reshape(count, n + 1))
+    return points, orient_cells(points, np.arange(len(points)).reshape(count, n + 1))
 
 
 # Volumes
@@ -109,7 +109,7 @@ def test_oriented_swaps_the_last_two_nodes_of_negative_cells_only(seed, n):
     points = rng.normal(size=(30, n))
     cells = np.array([rng.permutation(30)[: n + 1] for _ in range(20)])
     given_cells = cells.copy()
-    turned = oriented(points, cells)
+    turned = orient_cells(points, cells)
     is_negative = volumes(points, cells) < 0
     assert (volumes(points, turned) > 0).all()
     assert_array_equal(turned[~is_negative], cells[~is_negative])

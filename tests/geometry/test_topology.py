@@ -13,7 +13,7 @@ from tetopt.geometry.topology import (
     boundary_facets,
     components,
     facets,
-    folded,
+    folded_groups,
     greedy_colours,
     largest_component,
     stars,
@@ -225,11 +225,11 @@ def test_folded(n):
     facet is one.
     """
     mesh = tetopt.lattice_mesh(tetopt.Image(np.zeros((4,) * n)), blocks=(2,) * n)
-    assert folded(mesh.cells).shape == (0, 2)
+    assert folded_groups(mesh.cells).shape == (0, 2)
     first = mesh.cells[0]
     flipped = mesh.cells.copy()
     flipped[0] = first[[1, 0, *range(2, n + 1)]]
-    pairs = folded(flipped)
+    pairs = folded_groups(flipped)
     inner = [pair for pair in facets(mesh.cells).cells.tolist() if 0 in pair and -1 not in pair]
     assert sorted(map(sorted, pairs.tolist())) == sorted(map(sorted, inner))
-    assert len(folded(np.vstack([mesh.cells, first]))) >= n
+    assert len(folded_groups(np.vstack([mesh.cells, first]))) >= n

@@ -10,7 +10,7 @@ from meshes import CUBE_CORNER, FIVE_TET_CUBE, REGULAR_TET, TWO_TETS
 from shapes import n_pieces, volume_and_area
 
 from tetopt.errors import InputError
-from tetopt.geometry.simplex import facet_areas, oriented, volumes
+from tetopt.geometry.simplex import facet_areas, orient_cells, volumes
 from tetopt.geometry.surface import SHIFT_FRACTION, extract_surface
 from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
@@ -175,7 +175,7 @@ def test_the_wall_of_a_cavity_is_turned_into_it():
 @pytest.mark.parametrize(("chosen", "shared"), [([0, 1], [0, 1]), ([0, 2], [3])])
 def test_cells_that_share_an_edge_or_a_node_come_apart(chosen, shared):
     points, cells = TOUCHING
-    cells = oriented(points, cells)
+    cells = orient_cells(points, cells)
     surface = extract_surface(points, cells, chosen)
     assert_surface_of(surface, points, cells[chosen])
     assert (len(surface.points), len(surface.triangles)) == (8, 8)
@@ -256,7 +256,7 @@ def test_cavities_that_share_a_node_part_into_themselves():
 
 def test_the_shift_is_felt_in_float32_and_turns_no_cell():
     points, cells = TOUCHING
-    cells = oriented(points, cells)
+    cells = orient_cells(points, cells)
     for scale, place in ((1e-2, 500.0), (1e-3, 500.0), (1.0, 1e4)):
         moved = points * scale + place
         surface = extract_surface(moved, cells, [0, 1])

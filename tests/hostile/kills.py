@@ -14,7 +14,7 @@ from hostile.faults import Fault, left_in, steps_count
 from models import sample_image, sample_model
 
 import tetopt
-from tetopt.system.files import checked_output, outputs_of_command, save_json
+from tetopt.system.files import check_output, outputs_of_command, save_json
 
 MODEL, IMAGE = sample_model(3), sample_image(3)
 WRITERS = {
@@ -31,7 +31,7 @@ CASES = ("new", "replaced", "through a link")
 def write(path, k, force):
     """Write file number `k`, as a command does; its bytes."""
     with outputs_of_command():
-        checked_output(path, (path.suffix,), force)
+        check_output(path, (path.suffix,), force)
         WRITERS[path.name](path, k)
     return path.read_bytes()
 

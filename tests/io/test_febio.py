@@ -17,7 +17,7 @@ from tetopt.geometry.quadratic import quadratic, quadratic_facet_nodes
 from tetopt.geometry.simplex import volumes
 from tetopt.io.febio import MOST_MATERIAL_PARTS, febio
 from tetopt.model.materials import materials
-from tetopt.model.model import described, elements, in_space, in_units
+from tetopt.model.model import elements, header_lines, in_space, in_units
 from tetopt.model.sets import facet_triples, nodes_of
 
 
@@ -131,7 +131,7 @@ def test_everything_comes_back(kind, space):
     assert_same(feb, model)
     assert len(feb.parts) == (len(model.materials.young) if kind == "parts" else 1)
     head = raw.decode().split("-->")[0]
-    assert [line for line in head.splitlines() if line][2:] == described(model)
+    assert [line for line in head.splitlines() if line][2:] == header_lines(model)
 
 
 def test_no_name_is_taken_twice():

@@ -22,7 +22,7 @@ from tetopt.geometry.surface import extract_surface
 from tetopt.io import formats
 from tetopt.io.abaqus import input_sets
 from tetopt.io.formats import FORMATS, file_bytes, save_mesh, save_model
-from tetopt.io.surfaces import checked_surface, save_surface
+from tetopt.io.surfaces import check_surface, save_surface
 from tetopt.io.text import plain
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.model.sets import Sets
@@ -112,7 +112,7 @@ def found(path, model):
 def assert_whole(path, model):
     """A reader, for most formats not of tetopt's, finds all of the mesh and the sets."""
     if FORMATS[path.suffix].is_surface:
-        assert checked_surface(path).is_watertight
+        assert check_surface(path).is_watertight
         return
     n_points, n_cells, *names = found(path, model)
     assert (n_points, n_cells) == (len(model.mesh.points), len(model.mesh.cells))

@@ -20,7 +20,7 @@ from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io import images
 from tetopt.io.images import (
-    cropped,
+    crop_image,
     file_shape,
     image_slice,
     load_image,
@@ -1071,7 +1071,7 @@ def test_slice_of_a_2d_image():
 @pytest.mark.parametrize("bounds", [[(1, 3), (0, 2), (2, 5)], [(None, None), (1, None), (None, 4)]])
 def test_crop_leaves_voxels_where_they_are(bounds):
     image = Image(ramp(3, 4, 5), OBLIQUE)
-    small = cropped(image, bounds)
+    small = crop_image(image, bounds)
     start = np.array([b[0] or 0 for b in bounds])
     assert small.shape == tuple(
         len(range(s)[slice(*b)]) for s, b in zip(image.shape, bounds, strict=True)
@@ -1084,14 +1084,14 @@ def test_crop_leaves_voxels_where_they_are(bounds):
 
 
 def test_crop_of_a_2d_image():
-    small = cropped(Image(ramp(4, 5), np.diag([2.0, 3.0, 1.0])), [(1, 3), (2, None)])
+    small = crop_image(Image(ramp(4, 5), np.diag([2.0, 3.0, 1.0])), [(1, 3), (2, None)])
     np.testing.assert_array_equal(small.data, ramp(4, 5)[1:3, 2:])
     np.testing.assert_array_equal(small.affine, [[2, 0, 2], [0, 3, 6], [0, 0, 1]])
 
 
 def test_open_crop_is_the_image():
     image = Image(ramp(3, 4, 5), OBLIQUE)
-    same = cropped(image, [(None, None)] * 3)
+    same = crop_image(image, [(None, None)] * 3)
     np.testing.assert_array_equal(same.data, image.data)
     np.testing.assert_array_equal(same.affine, image.affine)
 
@@ -1101,13 +1101,13 @@ def test_open_crop_is_the_image():
 )
 def test_crop_out_of_range(ends):
     with pytest.raises(InputError, match="expected 0 <= start < stop <= 4 along axis 1"):
-        cropped(Image(ramp(3, 4, 5)), [(None, None), ends, (None, None)])
+        crop_image(Image(ramp(3, 4, 5)), [(None, None), ends, (None, None)])
 
 
 @pytest.mark.parametrize("n", [0, 2, 4])
 def test_crop_with_another_number_of_axes(n):
     with pytest.raises(InputError, match=f"expected 3 ranges for shape .*, got {n}"):
-        cropped(Image(ramp(3, 4, 5)), [(None, None)] * n)
+        crop_image(Image(ramp(3, 4, 5)), [(None, None)] * n)
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -1119,7 +1119,7 @@ def test_load_with_volume_crop_and_slice(tmp_path, axis):
     bounds = [(1, 4), (2, None), (None, 6)]
     loaded = load_image(path, volume=1, crop=bounds, slice_=(axis, 3))
     plane = image_slice(load_image(path, volume=1), axis, 3)
-    expected = cropped(plane, bounds[:axis] + bounds[axis + 1 :])
+    expected = crop_image(plane, bounds[:axis] + bounds[axis + 1 :])
     np.testing.assert_array_equal(loaded.data, expected.data)
     np.testing.assert_array_equal(loaded.affine, expected.affine)
     # And the documented order: crop first, then the slice of the crop.

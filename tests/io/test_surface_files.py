@@ -19,7 +19,7 @@ from tetopt.geometry.simplex import volumes
 from tetopt.geometry.surface import Surface, extract_surface
 from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
-from tetopt.io.surfaces import checked_surface, save_surface
+from tetopt.io.surfaces import check_surface, save_surface
 from tetopt.start.lattice import lattice_mesh
 
 # Two cells that share the edge 0 1, far from the origin
@@ -50,7 +50,7 @@ def some_surface(seed, fraction=0.5):
 def test_any_surface_is_closed_when_read_back(tmp_path, suffix, seed, fraction):
     surface, expected = some_surface(seed, fraction)
     save_surface(tmp_path / f"a{suffix}", surface)
-    check = checked_surface(tmp_path / f"a{suffix}")
+    check = check_surface(tmp_path / f"a{suffix}")
     volume, area = volume_and_area(surface)
     assert check[:2] == (True, True)
     assert check.n_pieces == n_pieces(surface)
@@ -66,9 +66,9 @@ def test_any_surface_is_closed_when_read_back(tmp_path, suffix, seed, fraction):
 def test_cells_that_touch_are_closed_only_once_they_are_parted(tmp_path, suffix):
     points, cells = EDGE
     save_surface(tmp_path / f"raw{suffix}", Surface(points, boundary_facets(cells), 0, 0.0))
-    assert not checked_surface(tmp_path / f"raw{suffix}").is_watertight
+    assert not check_surface(tmp_path / f"raw{suffix}").is_watertight
     save_surface(tmp_path / f"a{suffix}", extract_surface(points, cells, [0, 1]))
-    check = checked_surface(tmp_path / f"a{suffix}")
+    check = check_surface(tmp_path / f"a{suffix}")
     assert (check.is_watertight, check.is_winding_consistent, check.n_pieces) == (True, True, 2)
     assert check.volume == pytest.approx(1 / 3, rel=3e-3)
 
@@ -79,9 +79,9 @@ def test_a_triangle_turned_over_or_left_out_is_seen(tmp_path, suffix):
     turned = surface.triangles.copy()
     turned[0] = turned[0, ::-1]
     save_surface(tmp_path / f"turned{suffix}", surface._replace(triangles=turned))
-    assert checked_surface(tmp_path / f"turned{suffix}")[:2] == (True, False)
+    assert check_surface(tmp_path / f"turned{suffix}")[:2] == (True, False)
     save_surface(tmp_path / f"open{suffix}", surface._replace(triangles=surface.triangles[1:]))
-    assert not checked_surface(tmp_path / f"open{suffix}").is_watertight
+    assert not check_surface(tmp_path / f"open{suffix}").is_watertight
 
 
 def test_every_bit_and_the_order_come_back_from_ply(tmp_path):
@@ -183,7 +183,7 @@ def test_one_line_for_every_bad_file(tmp_path):
     ):
         save_surface(tmp_path / "a.obj", extract_surface(*CUBE_CORNER, [0]))
     with pytest.raises(InputError, match="no such surface file"):
-        checked_surface(tmp_path / "none.stl")
+        check_surface(tmp_path / "none.stl")
     save_surface(tmp_path / "a.ply", extract_surface(*CUBE_CORNER, [0]))
     whole = (tmp_path / "a.ply").read_bytes()
     for name, content in {
@@ -194,7 +194,7 @@ def test_one_line_for_every_bad_file(tmp_path):
     }.items():
         (tmp_path / name).write_bytes(content)
         with pytest.raises(InputError, match=f"{name}: .*damaged\\?$"):
-            checked_surface(tmp_path / name)
+            check_surface(tmp_path / name)
 
 
 @SUFFIXES
@@ -203,4 +203,4 @@ def test_a_name_that_is_not_utf8_is_read_back(tmp_path, suffix):
     save_surface(
         tmp_path / f"caf\udce9{suffix}", extract_surface(points, cells, np.arange(2)), "two"
     )
-    assert checked_surface(tmp_path / f"caf\udce9{suffix}").is_watertight
+    assert check_surface(tmp_path / f"caf\udce9{suffix}").is_watertight

@@ -7,14 +7,14 @@ from models import sample_model
 
 from tetopt.io.abaqus import abaqus
 from tetopt.io.febio import febio
-from tetopt.io.tags import named_materials, tagged
+from tetopt.io.tags import named_materials, tag_sets
 from tetopt.model.build import build_model
 from tetopt.model.labels import TABLE_TEXT, LabelTable
 
 
 def test_tags_say_which_sets_an_item_is_in():
     for sets in (sample_model(3).sets.facets, sample_model(3).sets.cells):
-        tags = tagged(sets)
+        tags = tag_sets(sets)
         assert tags.tags.min() == 1
         assert len(np.unique(tags.items, axis=0)) == len(tags.items)
         for name, members in sets.items():
@@ -27,7 +27,7 @@ def test_tags_say_which_sets_an_item_is_in():
         assert len(together) == tags.tags.max()  # no two tags for one combination
         # as they first occur
         assert list(dict.fromkeys(tags.tags.tolist())) == list(range(1, tags.tags.max() + 1))
-    assert tagged({}).tags_of == {}
+    assert tag_sets({}).tags_of == {}
 
 
 def named_model(young, names):

@@ -21,10 +21,10 @@ from tetopt.errors import InputError
 from tetopt.io import apart
 from tetopt.io.apart import read_apart
 from tetopt.io.images import load_image, parse_crop, parse_slice, sha256
-from tetopt.io.itk_headers import checked_header
+from tetopt.io.itk_headers import check_header
 from tetopt.io.meshes import load_mesh
 from tetopt.job.inputs import file_and_volume
-from tetopt.job.model import parsed_bins
+from tetopt.job.model import parse_bins
 from tetopt.model.labels import labels_named
 from tetopt.model.mappings import load_mapping
 from tetopt.system import budget, incoming
@@ -525,10 +525,10 @@ def test_voxels_after_a_header_that_go_on(tmp_path, name):
             if name == "a.nrrd"
             else mha(file=data.name if name == "a.mhd" else "LOCAL", more=more)
         )
-        assert checked_header(path)[0].value_bytes == 60
+        assert check_header(path)[0].value_bytes == 60
         os.truncate(data, 2**25 + 400)
         if more:
-            assert checked_header(path)[0].value_bytes == 60
+            assert check_header(path)[0].value_bytes == 60
         else:
             refused(load_image, path, "it continues far after the last voxel")
 
@@ -595,7 +595,7 @@ def test_json_without_end(text):
 
 def test_numbers_of_thousands_of_digits_among_options():
     digits = "9" * 5000
-    for parse in (parsed_bins, parse_crop, parse_slice):
+    for parse in (parse_bins, parse_crop, parse_slice):
         for text in (digits, f"{digits}:", f"2={digits}"):
             with pytest.raises(InputError) as caught:
                 parse(text)

@@ -14,7 +14,7 @@ from tetopt.errors import InputError
 from tetopt.io.xdmf import xdmf
 from tetopt.model.loads import load_words
 from tetopt.model.materials import materials
-from tetopt.model.model import described, elements, in_space, in_units
+from tetopt.model.model import elements, header_lines, in_space, in_units
 from tetopt.model.sets import Sets, facet_triples, standard_sets
 
 MODELS = {
@@ -203,7 +203,7 @@ def test_loads_and_origin_are_told():
     loads = [each.get("Value") for each in head if each.get("Name") == "load"]
     assert loads == [load_words(load) for load in model.loads]
     about = [each.get("Value") for each in head if each.get("Name") == "about"]
-    assert about == described(model)
+    assert about == header_lines(model)
     assert f"image: {ABOUT['image']}, sha256 {ABOUT['image_sha256']}" in about
 
 

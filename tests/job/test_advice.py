@@ -11,18 +11,18 @@ from tetopt.contents.labels import LostComponent
 from tetopt.engine.interfaces import crowded_nodes
 from tetopt.engine.loop import IterationRecord, MeshingResult
 from tetopt.job.advice import (
-    agreed,
     beyond_requirements,
     of_empty,
     of_result,
     of_sizes,
+    order_problems,
     required_of,
     sentences,
     tell,
     tell_label_sizes,
 )
-from tetopt.job.advice import unmet as unmet_of
-from tetopt.job.events import listened
+from tetopt.job.advice import unmet_requirements as unmet_of
+from tetopt.job.events import listen_with
 from tetopt.measure.fidelity import LabelFidelity, MaskFidelity
 from tetopt.measure.interfaces import LabelInterface
 from tetopt.measure.judge import LABEL_REMEDY, PIECES_REMEDY, judge
@@ -42,7 +42,7 @@ def unmet(violated, measured, word="mask"):
 
 def told(*problems):
     """Tell problems, as one list; return those that have a name."""
-    tell(agreed(problems))
+    tell(order_problems(problems))
     return sentences(problems)
 
 
@@ -56,7 +56,7 @@ def said():
         events.clear()
         return "".join(lines)
 
-    with listened(events.append):
+    with listen_with(events.append):
         yield texts
 
 

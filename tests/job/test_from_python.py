@@ -15,7 +15,7 @@ from tetopt.commands.boundary import SurfacePart, write_surface
 from tetopt.commands.conversion import convert_file
 from tetopt.commands.judgement import judge
 from tetopt.commands.simulation import solve_file
-from tetopt.job.events import listened
+from tetopt.job.events import listen_with
 from tetopt.job.options import LabelledPart, ModelOptions, SolverOptions
 from tetopt.system.files import save_json
 
@@ -38,7 +38,7 @@ def place(tmp_path):
 def test_python_has_the_numbers_of_the_commands(place, capfd):
     mesh, image = place / "a.vtu", place / "image.nii.gz"
     load = {"young": "0=1,1=5", "loads": ["compress:5%"]}
-    with listened(lambda event: None):
+    with listen_with(lambda event: None):
         numbers = [
             judge(mesh, image).numbers,
             solve_file(mesh, model=ModelOptions(**load), part=LabelledPart()).numbers,
@@ -81,7 +81,7 @@ def test_a_violated_requirement_is_told(place):
     points = np.array([[0, 0, 0], [30, 0, 0], [0, 30, 0], [5, 5, 20], [6, 6, 30]])
     tetopt.save_mesh(place / "overlapping.vtu", tetopt.Mesh(points, cells))
     events = []
-    with listened(events.append):
+    with listen_with(events.append):
         wrong = judge(place / "overlapping.vtu", check=True).tell()
     assert wrong == [event.text for event in events if event.kind == "violated"]
     assert wrong[0].startswith(str(place / "overlapping.vtu"))

@@ -10,7 +10,7 @@ from models import sample_image
 import tetopt
 from tetopt.engine.fast import Run
 from tetopt.io.formats import FORMATS
-from tetopt.job.events import listened, note
+from tetopt.job.events import listen_with, note
 from tetopt.job.source import Source
 
 pytestmark = pytest.mark.full
@@ -170,9 +170,9 @@ def test_without_a_listener_warnings_are_pythons_and_within_one_they_are_its_eve
     with pytest.warns(UserWarning, match="requirement violated: min_dihedral: "):
         assert "min_dihedral" in tetopt.run(job).violated
     events = []
-    with listened(events.append):
+    with listen_with(events.append):
         note("one")
-        with listened(None):
+        with listen_with(None):
             note("two")
     assert [event.text for event in events] == ["one", "two"]
 

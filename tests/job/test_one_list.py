@@ -16,7 +16,7 @@ from tetopt.cohort.flags import flags_of
 from tetopt.cohort.layout import mesh_name, numbers_path, subject_folder
 from tetopt.cohort.numbers import row_of
 from tetopt.cohort.state import state_of
-from tetopt.job.advice import Problem, agreed, of_layers, sentences
+from tetopt.job.advice import Problem, of_layers, order_problems, sentences
 from tetopt.job.events import ended_words
 from tetopt.job.options import SourceOptions
 from tetopt.job.source import read_source
@@ -200,9 +200,9 @@ def test_remedies_agree():
         Problem("b", "reduce `nodes`", wants="larger"),
     )
     lost = Problem("c", "allow more nodes", "labels", "smaller")
-    assert [each.words for each in agreed([more, fewer])] == ["a; allow more nodes", "b"]
-    assert [each.words for each in agreed([fewer, more])] == ["b; reduce `nodes`", "a"]
-    assert [each.words for each in agreed([fewer, Problem("d"), lost])] == [
+    assert [each.words for each in order_problems([more, fewer])] == ["a; allow more nodes", "b"]
+    assert [each.words for each in order_problems([fewer, more])] == ["b; reduce `nodes`", "a"]
+    assert [each.words for each in order_problems([fewer, Problem("d"), lost])] == [
         "c; allow more nodes",
         "b",
         "d",

@@ -15,7 +15,7 @@ from tetopt.cli.options import from_records
 from tetopt.io.images import sha256
 from tetopt.job.inputs import label_sizes_of
 from tetopt.job.options import RunOptions, given_options
-from tetopt.job.request import checksum, requested
+from tetopt.job.request import checksum, job_request
 from tetopt.job.texts import option_words, with_options
 from tetopt.model.labels import LabelTable
 from tetopt.start.label_sizes import LabelSize
@@ -113,7 +113,9 @@ def request_of(tmp_path):
 
     def request(folder=tmp_path, suffix=".vtu", **others):
         options = {"mask": folder / "m.nii", "nodes": 50, **others}
-        return requested(Job(images=[folder / "a.nii"], output=folder / f"any{suffix}", **options))
+        return job_request(
+            Job(images=[folder / "a.nii"], output=folder / f"any{suffix}", **options)
+        )
 
     return request
 
@@ -205,7 +207,7 @@ def test_run_json_states_the_request(tmp_path):
     job = Job(
         images=[tmp_path / "sphere.nii.gz"], nodes=60, iterations=1, output=tmp_path / "b.vtu"
     )
-    assert numbers_in(tmp_path / "a.json")["request"] == requested(job)
+    assert numbers_in(tmp_path / "a.json")["request"] == job_request(job)
 
 
 def test_options_of_a_row_replace_those_of_all():

@@ -10,7 +10,7 @@ from meshes import random_affine, random_rotation
 from numpy.testing import assert_allclose, assert_array_equal
 
 import tetopt
-from tetopt.geometry.simplex import centroids, oriented, volumes
+from tetopt.geometry.simplex import centroids, orient_cells, volumes
 from tetopt.measure.fidelity import (
     MOST_POINTS,
     FacetSurface,
@@ -387,7 +387,7 @@ def test_mask_of_a_ball(n):
     image = tetopt.Image(ball_field(n, 32, 10.0, 15.2), random_affine(rng, n))
     points, cells = ball(n, 11.5, np.full(n, 15.2))
     points = image.to_world(points)
-    mesh = tetopt.Mesh(points, oriented(points, cells))
+    mesh = tetopt.Mesh(points, orient_cells(points, cells))
     fidelity = mask_fidelity(image, mesh)
     assert fidelity.mesh_volume == pytest.approx(volumes(points, mesh.cells).sum())
     assert_allclose(fidelity[4:8], 1.5, atol=0.03)

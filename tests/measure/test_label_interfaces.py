@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from shapes import OBLIQUE, shaped
 
 import tetopt
-from tetopt.geometry.simplex import centroids, oriented
+from tetopt.geometry.simplex import centroids, orient_cells
 from tetopt.measure.fidelity import (
     FacetSurface,
     LabelFidelity,
@@ -230,7 +230,7 @@ def test_a_ball_of_cells():
     sphere = pyvista.Icosphere(radius=12.0, nsub=4)
     points = np.vstack([np.asarray(sphere.points, dtype=np.float64), np.zeros(3)]) + 15.2
     cells = np.column_stack([sphere.regular_faces, np.full(sphere.n_cells, len(points) - 1)])
-    mesh = tetopt.Mesh(points, oriented(points, cells))
+    mesh = tetopt.Mesh(points, orient_cells(points, cells))
     at = np.stack(np.meshgrid(*[np.arange(32)] * 3, indexing="ij"), axis=-1)
     labels = tetopt.Image(np.linalg.norm(at - 15.2, axis=-1) < 12.0)
     background, ball = label_interfaces(labels, mesh, np.ones(len(cells)))

@@ -10,7 +10,7 @@ import pytest
 import tetopt
 from tetopt.measure.fidelity import label_fidelity, mask_fidelity
 from tetopt.measure.interfaces import label_interfaces
-from tetopt.measure.measures import fidelity, measured_each
+from tetopt.measure.measures import fidelity, measure_each
 from tetopt.measure.thin import label_contacts
 
 
@@ -18,7 +18,7 @@ def test_measures_keep_to_the_number_of_threads():
     before = numba.get_num_threads()
     try:
         numba.set_num_threads(1)
-        assert measured_each({"a": numba.get_num_threads, "b": numba.get_num_threads}, None) == {
+        assert measure_each({"a": numba.get_num_threads, "b": numba.get_num_threads}, None) == {
             "a": 1,
             "b": 1,
         }
@@ -32,9 +32,9 @@ def test_the_first_error_ends_the_measures(monkeypatch):
     begun, broken, failed = [], {"a": lambda: 1 // 0}, {}
     others = {name: partial(begun.append, name) for name in "bcdefgh"}
     with pytest.raises(ZeroDivisionError):
-        measured_each(broken | {"slow": partial(time.sleep, 0.3)} | others, None)
+        measure_each(broken | {"slow": partial(time.sleep, 0.3)} | others, None)
     assert begun == []
-    assert measured_each(broken | others, failed) == dict.fromkeys(others)
+    assert measure_each(broken | others, failed) == dict.fromkeys(others)
     assert failed["a"].startswith("ZeroDivisionError")
 
 

@@ -8,7 +8,7 @@ import pytest
 import tetopt
 from tetopt.contents import otsu
 from tetopt.contents.otsu import class_thresholds
-from tetopt.measure.segmentation import dice, segment, thresholded
+from tetopt.measure.segmentation import dice, segment, threshold_image
 
 
 def within(values, weights, thresholds):
@@ -98,7 +98,7 @@ def test_optimising_the_mesh_improves_the_segmentation():
     assert after[1] > before[1] + 0.03
     assert after[0] > before[0]
     assert after[1] > 0.9
-    assert dice(thresholded(image, 2), truth)[1] > after[1]  # the voxels themselves know more
+    assert dice(threshold_image(image, 2), truth)[1] > after[1]  # the voxels themselves know more
 
 
 def test_mesh_that_resolves_every_voxel_thresholds_it():

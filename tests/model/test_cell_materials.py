@@ -9,7 +9,7 @@ from tetopt.errors import InputError
 from tetopt.model.averages import cell_values
 from tetopt.model.build import build_model
 from tetopt.model.mappings import ByLabel
-from tetopt.model.materials import binned, by_label, density_of, materials, without_moduli
+from tetopt.model.materials import bin_moduli, by_label, density_of, materials, without_moduli
 
 YOUNG = np.array([3.0, 1.0, 3.0, 2.0, 8.0])
 
@@ -42,7 +42,9 @@ def test_values_out_of_range(young, nu, match):
 
 def test_bins_of_equal_width_hold_the_mean_by_volume():
     size = np.array([1.0, 1.0, 3.0, 1.0, 1.0])
-    table = binned(materials([1.0, 2.0, 3.0, 7.0, 9.0], 0.3, 5), size, 2)  # halves: 1 to 5, 5 to 9
+    table = bin_moduli(
+        materials([1.0, 2.0, 3.0, 7.0, 9.0], 0.3, 5), size, 2
+    )  # halves: 1 to 5, 5 to 9
     assert table.young.tolist() == [(1.0 + 2.0 + 9.0) / 5.0, 8.0]
     assert table.of_cell.tolist() == [0, 0, 0, 1, 1]
     off = np.abs(table.young[table.of_cell] / [1.0, 2.0, 3.0, 7.0, 9.0] - 1.0)
@@ -54,30 +56,32 @@ def test_bins_of_equal_width_hold_the_mean_by_volume():
 
 def test_bins_by_number_and_by_logarithm():
     exact = materials([1.0, 2.0, 4.0, 8.0, 1024.0, 512.0], 0.3, 6)
-    by_number = binned(exact, np.ones(6), 2, "quantile")
+    by_number = bin_moduli(exact, np.ones(6), 2, "quantile")
     assert by_number.of_cell.tolist() == [0, 0, 0, 1, 1, 1]
-    by_log = binned(exact, np.ones(6), 2, "log")  # halves at 2^5
+    by_log = bin_moduli(exact, np.ones(6), 2, "log")  # halves at 2^5
     assert by_log.of_cell.tolist() == [0, 0, 0, 0, 1, 1]
     assert by_log.young.tolist() == [3.75, 768.0]
     wide = materials([1.0, 9.0, 30.0, 100.0], 0.3, 4)
     # at 10; at 30.25 of square roots
-    assert binned(wide, np.ones(4), 2, "log").of_cell.tolist() == [0, 0, 1, 1]
-    equal = binned(exact, np.ones(6), 4)  # the third quarter is empty
+    assert bin_moduli(wide, np.ones(4), 2, "log").of_cell.tolist() == [0, 0, 1, 1]
+    equal = bin_moduli(exact, np.ones(6), 4)  # the third quarter is empty
     assert equal.young.tolist() == [3.75, 512.0, 1024.0]
 
 
 def test_enough_bins_change_nothing():
     exact = materials(YOUNG, 0.3, 5)
-    table = binned(exact, np.ones(5), 4)
+    table = bin_moduli(exact, np.ones(5), 4)
     assert_array_equal(table.young, exact.young)
     assert table.binning == (0.0, 0.0)
 
 
 def test_ratios_by_label_are_not_blended():
-    table = binned(materials(np.arange(1.0, 11.0), np.repeat([0.3, 0.45], 5), 10), np.ones(10), 3)
+    table = bin_moduli(
+        materials(np.arange(1.0, 11.0), np.repeat([0.3, 0.45], 5), 10), np.ones(10), 3
+    )
     assert set(table.nu) == {0.3, 0.45}
     assert_array_equal(table.nu[table.of_cell], np.repeat([0.3, 0.45], 5))
-    many = binned(materials(1.0, np.linspace(0.0, 0.4, 9), 9), np.ones(9), 2)
+    many = bin_moduli(materials(1.0, np.linspace(0.0, 0.4, 9), 9), np.ones(9), 2)
     assert len(many.nu) == 2
 
 
@@ -86,7 +90,7 @@ def test_ratios_by_label_are_not_blended():
 )
 def test_bins_that_are_none(count, spacing, match):
     with pytest.raises(InputError, match=match):
-        binned(materials(YOUNG, 0.3, 5), np.ones(5), count, spacing)
+        bin_moduli(materials(YOUNG, 0.3, 5), np.ones(5), count, spacing)
 
 
 # By label, from an image or from means
@@ -219,7 +223,7 @@ def test_cells_of_another_density_are_of_another_material():
     alone = without_moduli(table)
     assert (alone.young.tolist(), alone.density.tolist()) == ([1.0, 1.0], [1000.0, 1500.0])
     assert materials(1.0, 0.3, 2).density is None
-    fewer = binned(materials([1.0, 2.0, 3.0], 0.3, 3, [900.0, 1000.0, 2000.0]), np.ones(3), 2)
+    fewer = bin_moduli(materials([1.0, 2.0, 3.0], 0.3, 3, [900.0, 1000.0, 2000.0]), np.ones(3), 2)
     assert np.unique(fewer.density).tolist() == [950.0, 2000.0]
 
 

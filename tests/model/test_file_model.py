@@ -6,7 +6,7 @@ from models import quadratic_model, sample_model
 
 import tetopt
 from tetopt.cli import main
-from tetopt.model.labels import coloured, table_words
+from tetopt.model.labels import colour_labels, table_words
 
 TABLE = tetopt.LabelTable({0: "white matter", 1: "skull"}, {1: (1.0, 0.0, 0.0)})
 
@@ -55,7 +55,7 @@ def test_what_the_file_has_goes_on(tmp_path, model):
     }
     assert again.point_data.keys() >= first.point_data.keys()
     assert again.about["image"] == "T1.nii.gz"
-    assert again.about["label_table"] == table_words(coloured(TABLE, np.array([0])))
+    assert again.about["label_table"] == table_words(colour_labels(TABLE, np.array([0])))
 
 
 def test_what_is_stated_takes_the_place_of_the_file_s(tmp_path):

@@ -10,7 +10,7 @@ from tetopt.geometry.quadratic import QUADRATIC_EDGES, quadratic, quadratic_face
 from tetopt.mesh import Mesh
 from tetopt.model.build import build_model
 from tetopt.model.loads import parse_loads
-from tetopt.model.model import Model, described, in_space, in_units, mass_densities
+from tetopt.model.model import Model, header_lines, in_space, in_units, mass_densities
 from tetopt.model.sets import Sets, facet_triples
 
 # Units and space
@@ -40,8 +40,8 @@ def test_units():
     other = in_units(model, "MPa")
     assert_allclose(other.materials.young, model.materials.young / 1000.0, rtol=1e-15)
     assert_array_equal(other.materials.nu, model.materials.nu)
-    assert described(model)[2] == "units: mm, kPa, mN, uJ, kg, s"
-    assert described(other)[2] == "units: mm, MPa, N, mJ, t, s"
+    assert header_lines(model)[2] == "units: mm, kPa, mN, uJ, kg, s"
+    assert header_lines(other)[2] == "units: mm, MPa, N, mJ, t, s"
     assert_allclose(in_units(other, "kPa").materials.young, model.materials.young, rtol=1e-15)
     with pytest.raises(InputError, match="expected one of kPa, MPa, Pa, got psi"):
         in_units(model, "psi")
@@ -67,7 +67,7 @@ def test_with_pascals_lengths_are_in_metres():
         point_data={"displacement": np.full((n_nodes, 3), 5.0)},
     )
     other = in_units(model, "Pa")
-    assert described(other)[1:3] == ["coordinates: RAS+, m", "units: m, Pa, N, J, kg, s"]
+    assert header_lines(other)[1:3] == ["coordinates: RAS+, m", "units: m, Pa, N, J, kg, s"]
     assert_allclose(other.mesh.points, model.mesh.points / 1000.0, rtol=1e-15)
     assert other.materials.young.tolist() == [4000.0]
     assert mass_densities(other).tolist() == [1000.0]
@@ -95,7 +95,7 @@ def test_the_head_is_of_single_lines():
     model = sample_model(3)._replace(
         about={"tetopt": "1", "image": "a\nb.nii", "image_sha256": "00"}
     )
-    assert described(model) == [
+    assert header_lines(model) == [
         "tetopt 1",
         "coordinates: RAS+, mm",
         "units: mm, kPa, mN, uJ, kg, s",
@@ -104,7 +104,7 @@ def test_the_head_is_of_single_lines():
         "volume), "
         f"{model.materials.binning.largest:.3%} (largest)",
     ]
-    assert "of the slice's plane" in described(sample_model(2))[1]
+    assert "of the slice's plane" in header_lines(sample_model(2))[1]
 
 
 # Quadratic cells

@@ -21,7 +21,7 @@ import tetopt
 from tetopt.contents.labels import LABEL_PALETTE
 from tetopt.errors import InputError
 from tetopt.geometry.cut import plane_cut
-from tetopt.geometry.simplex import centroids, oriented, volumes
+from tetopt.geometry.simplex import centroids, orient_cells, volumes
 from tetopt.geometry.topology import boundary_facets, facets
 from tetopt.model.labels import LabelTable
 from tetopt.report import explore
@@ -763,7 +763,7 @@ def ball(radius=30.0, n=600):
     places[n:] *= 0.93 * random.random((n, 1)) ** (1 / 3)
     points = radius * places
     cells = Delaunay(points).simplices.astype(np.int64)
-    return tetopt.Mesh(points, oriented(points, cells))
+    return tetopt.Mesh(points, orient_cells(points, cells))
 
 
 @pytest.mark.deep

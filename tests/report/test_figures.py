@@ -26,7 +26,7 @@ from tetopt.image import Image
 from tetopt.measure.fidelity import cell_labels
 from tetopt.measure.quality import rho_histogram
 from tetopt.mesh import Mesh
-from tetopt.model.labels import LabelTable, coloured, table_words
+from tetopt.model.labels import LabelTable, colour_labels, table_words
 from tetopt.report import figures
 from tetopt.report.colours import LISTED_LABELS, UNCOVERED_COLOUR, label_colours, legend_patches
 from tetopt.report.figures import (
@@ -341,13 +341,13 @@ def test_a_label_has_one_colour_whatever_else_is_there():
     assert (few.shape, many.shape) == ((8, 3), (10, 3))
     assert_array_equal(few, many[:8])
     assert_array_equal(many, to_rgba_array([BACKGROUND_COLOUR, *LABEL_PALETTE[:9]])[:, :3])
-    words = table_words(coloured(LabelTable({}, {2: (1.0, 0.0, 0.0)}), np.array([0, 7, 2, 7])))
+    words = table_words(colour_labels(LabelTable({}, {2: (1.0, 0.0, 0.0)}), np.array([0, 7, 2, 7])))
     assert words == {
         "0": {"colour": BACKGROUND_COLOUR},
         "2": {"colour": "#ff0000"},
         "7": {"colour": LABEL_PALETTE[6]},
     }
-    black = coloured(LabelTable({}, {0: (0.0, 0.0, 0.0)}), np.array([0, 7]))
+    black = colour_labels(LabelTable({}, {0: (0.0, 0.0, 0.0)}), np.array([0, 7]))
     assert table_words(black)["0"] == {"colour": BACKGROUND_COLOUR}
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import PIL.Image
 import pytest
 
-from tetopt.report.page import picture_html, rendered, write_page
+from tetopt.report.page import picture_html, render_page, write_page
 
 EVIL = '<b onclick="x">&\''
 
@@ -32,7 +32,7 @@ def test_a_picture_keeps_its_size_and_a_wide_one_scrolls(tmp_path):
 
 def test_a_name_that_a_template_lacks_is_an_error():
     with pytest.raises(jinja2.UndefinedError):
-        rendered("report/page.html", title="t")
+        render_page("report/page.html", title="t")
 
 
 def test_the_page_forbids_the_network(tmp_path):

@@ -18,13 +18,13 @@ from skfem.helpers import ddot, sym_grad, trace
 
 import tetopt
 from tetopt import Mesh
-from tetopt.fem.elasticity import constrained, lame_constants, solved, stiffness
+from tetopt.fem.elasticity import constrain_nodes, lame_constants, solve_system, stiffness
 from tetopt.fem.solution import solve
 from tetopt.geometry.quadratic import quadratic, quadratic_facet_nodes
 from tetopt.geometry.simplex import volumes
 from tetopt.io.abaqus import abaqus
 from tetopt.model.loads import parse_loads
-from tetopt.model.materials import binned, materials
+from tetopt.model.materials import bin_moduli, materials
 from tetopt.model.model import Model, in_space, in_units
 from tetopt.model.sets import box_of, facet_triples, nodes_of, standard_sets, with_requested
 
@@ -93,7 +93,7 @@ def pressed_model(loading="compression"):
     sets = with_requested(
         mesh, sets, ["dark-cells=below:20", "Patch=point:40,0,0:15"], fields["mean"]
     )
-    table = binned(
+    table = bin_moduli(
         materials(0.5 + fields["mean"] / 7.0, NU, len(mesh.cells)),
         volumes(mesh.points, mesh.cells),
         16,
@@ -122,8 +122,8 @@ def ours(model):
     is_given, values = prescribed(
         model, len(model.mesh.points), lambda rows: nodes_of(model.mesh, rows)
     )
-    system = constrained(model.mesh, young_of(model), NU, is_given, values)
-    u = solved(system)
+    system = constrain_nodes(model.mesh, young_of(model), NU, is_given, values)
+    u = solve_system(system)
     return u, 0.5 * float(u.ravel() @ (system.K @ u.ravel())), (system.K @ u.ravel()).reshape(-1, 3)
 
 

@@ -9,7 +9,7 @@ import tetopt
 from tetopt.contents.content import content
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import components
-from tetopt.start.carve import carved, part_of
+from tetopt.start.carve import carve_mesh, part_of
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ def test_each_component_of_the_mask_keeps_its_largest(pieces):
         components(result.mesh.cells).max() + 1 == scipy.ndimage.label(target.region.inside)[1] == 2
     )
     assert result.n_dropped == 0
-    assert carved(result.mesh, target.image, target.region).is_kept.all()
+    assert carve_mesh(result.mesh, target.image, target.region).is_kept.all()
 
 
 def test_components_that_the_mask_does_not_have_are_dropped_unless_they_are_kept(pieces):
@@ -42,17 +42,17 @@ def test_components_that_the_mask_does_not_have_are_dropped_unless_they_are_kept
     number = components(halves.cells)
     sizes = np.sort(np.bincount(number))[::-1]
     assert len(sizes) >= 2
-    kept = carved(halves, target.image, target.region)
+    kept = carve_mesh(halves, target.image, target.region)
     left = part_of(halves, kept.is_kept)
     large = sizes[sizes > 0.2 * sizes[0]]
     assert components(left.cells).max() + 1 == len(large) == 2
     assert kept.n_dropped == len(sizes) - len(large)
     capped = part_of(whole, np.abs(whole.points[whole.cells].mean(axis=1)[:, 2] - 22.5) > 1.5)
-    left = part_of(capped, carved(capped, target.image, target.region).is_kept)
+    left = part_of(capped, carve_mesh(capped, target.image, target.region).is_kept)
     size = np.sort(np.bincount(components(left.cells), volumes(left.points, left.cells)))
     assert len(size) == 2
     assert 0.01 * size[1] < size[0] < 0.05 * size[1]
-    every = carved(halves, target.image, target.region, keeps_components=True)
+    every = carve_mesh(halves, target.image, target.region, keeps_components=True)
     assert every.n_dropped == 0
     assert every.is_kept.sum() >= kept.is_kept.sum()
 

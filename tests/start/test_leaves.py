@@ -16,7 +16,7 @@ import tetopt
 from tetopt.geometry.simplex import volumes
 from tetopt.start import leaves
 from tetopt.start.leaves import FACE_RING, leaf_cells, leaf_nodes
-from tetopt.start.octree import _Blocks, _divided, octree_mesh
+from tetopt.start.octree import _Blocks, _divide_blocks, octree_mesh
 
 seeds = st.integers(0, 2**32 - 1)
 dimensions = st.sampled_from([2, 3])
@@ -27,7 +27,7 @@ def random_leaves(rng, n):
     roots, depth = tuple(rng.integers(1, 4, n).tolist()), int(rng.integers(0, 4))
     shapes = [tuple(root << d for root in roots) for d in range(depth + 1)]
     blocks = [_Blocks(rng.random(shape), np.zeros(shape, dtype=bool), None) for shape in shapes]
-    return roots, _divided(blocks, 1.0 - float(rng.choice([0.02, 0.1, 0.3])), 1)
+    return roots, _divide_blocks(blocks, 1.0 - float(rng.choice([0.02, 0.1, 0.3])), 1)
 
 
 def joined(roots, divided, to_world=lambda places: places):

@@ -14,7 +14,7 @@ from test_octree import OBLIQUE, ball, grid
 import tetopt
 from tetopt.engine.meshing import Aim, MeshSearch
 from tetopt.start import octree
-from tetopt.start.octree import _Blocks, _divided, nearest_octree, nodes_of_sizes, octree_mesh
+from tetopt.start.octree import _Blocks, _divide_blocks, nearest_octree, nodes_of_sizes, octree_mesh
 from tetopt.start.sizes import (
     EQUILATERAL_NODES,
     RATIO_BINS,
@@ -290,7 +290,7 @@ def test_blocks_around_a_divided_one(rings):
     levels = [
         _Blocks(e, np.zeros(e.shape, dtype=bool), np.ones(e.shape, dtype=bool)) for e in error
     ]
-    divided = _divided(levels, 0.5, rings)
+    divided = _divide_blocks(levels, 0.5, rings)
     assert np.argwhere(divided[1]).tolist() == [[7, 9]]
     parents = {
         (i // 2, j // 2) for i in range(7 - rings, 8 + rings) for j in range(9 - rings, 10 + rings)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import tetopt
-from tetopt.job.events import Event, listened
+from tetopt.job.events import Event, listen_with
 from tetopt.study.child import run_in_child
 from tetopt.study.endings import AFTER_CRASHES
 from tetopt.study.pipelines import PIPELINES, PipelineInput
@@ -73,7 +73,7 @@ def test_a_crash_is_repeated_once(tmp_path, monkeypatch):
     """And said; what is not installed is not repeated."""
     monkeypatch.setenv("PIPES_PID", str(tmp_path / "pid"))
     events = []
-    with listened(events.append):
+    with listen_with(events.append):
         outcome = run_in_child(pipes.crash_once, JOB, "mine", max_seconds=60.0)
     said = "mine: crashed: signal 11, SIGSEGV; running it again, with smoother surfaces"
     assert events == [Event("note", said)]
@@ -85,7 +85,7 @@ def test_a_crash_is_repeated_once(tmp_path, monkeypatch):
     outcome = run_in_child(pipes.crash_and_refuse, JOB, max_seconds=60.0)
     assert outcome.failure == "crashed: signal 11, SIGSEGV; then thing: expected a, got b; do c"
     events.clear()
-    with listened(events.append):
+    with listen_with(events.append):
         outcome = run_in_child(pipes.absent, JOB, max_seconds=60.0)
     assert (outcome.failure, events) == ("thing: not installed", [])
 

@@ -12,7 +12,7 @@ import pytest
 import tetopt
 from tetopt.cli import main
 from tetopt.fem.elasticity import box_faces, compression, push_of
-from tetopt.fem.reference import averaged, nearest, reference, refined
+from tetopt.fem.reference import average_voxels, nearest, reference, refine_voxels
 from tetopt.fem.reference import compare as reference_errors
 from tetopt.geometry.quadratic import quadratic
 from tetopt.model.averages import element_young, young_image
@@ -123,15 +123,15 @@ def test_numbers_are_those_of_the_meshes(run, head):
 def test_a_cell_without_a_label_of_its_own_has_that_of_most_voxels(head):
     image, labels = (tetopt.load_image(head / name) for name in ("image.nii.gz", "labels.nii.gz"))
     mapping, _ = compare.default_mapping(image)
-    standard = compare.prepared(
+    standard = compare.prepare_references(
         image, labels, mapping, Settings(200, nus=(0.3,), reference_dofs=1000)
     )
     mesh = tetopt.lattice_mesh(image, nodes=200)
     none, first = np.full(len(mesh.cells), -1), tetopt.measure.fidelity.cell_labels(labels, mesh)
-    made = compare.measured(standard, mesh, 1.0, own=none)
+    made = compare.measure_mesh(standard, mesh, 1.0, own=none)
     assert repr(made.own_labels) == repr(made.labels)
     first[: len(first) // 2] = 0
-    made = compare.measured(standard, mesh, 1.0, own=first)
+    made = compare.measure_mesh(standard, mesh, 1.0, own=first)
     assert (
         repr(made.own_labels)
         == repr(tetopt.label_fidelity(labels, mesh, first))
@@ -160,7 +160,7 @@ def test_the_quadratic_mesh_is_a_coarser_one(run, head):
     image = tetopt.load_image(head / "image.nii.gz")
     mapping, _ = compare.default_mapping(image)
     settings = Settings(400, reference_dofs=REFERENCE_DOFS)
-    modulus = averaged(
+    modulus = average_voxels(
         young_image(image, mapping),
         compare.reference_shape(image.shape, image.spacing, REFERENCE_DOFS),
     )
@@ -174,7 +174,7 @@ def test_the_quadratic_mesh_is_a_coarser_one(run, head):
         assert median["n_nodes"] == len(quadratic(mesh.points, mesh.cells)[0])
         assert 0.75 < median["n_nodes"] / 400 < 1.25  # of a lattice there are few so coarse
         bottom, top = box_faces(image, mesh)
-        young = element_young(refined(modulus, image.shape), mesh, None, "gauss", 2)
+        young = element_young(refine_voxels(modulus, image.shape), mesh, None, "gauss", 2)
         pressed = compression(
             mesh,
             young,

@@ -10,7 +10,7 @@ from tetopt.geometry.box import ON_SIDE_VOXELS
 from tetopt.geometry.check import beyond_box
 from tetopt.geometry.simplex import volumes
 from tetopt.study import mmg
-from tetopt.study.mmg import remeshed
+from tetopt.study.mmg import remesh_image
 from tetopt.study.pipelines import PIPELINES, PipelineInput
 
 needs_mmgpy = pytest.mark.skipif(
@@ -57,4 +57,4 @@ def test_a_box_of_labelled_cells(labels, monkeypatch):
 def test_what_is_refused(monkeypatch):
     monkeypatch.setitem(sys.modules, "mmgpy", None)
     with pytest.raises(tetopt.InputError, match=r"mmgpy: not installed; .* pip install"):
-        remeshed(IMAGE, LABELS, 100)
+        remesh_image(IMAGE, LABELS, 100)

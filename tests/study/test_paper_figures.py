@@ -15,7 +15,7 @@ from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import largest_component
 from tetopt.study import paper
 
-PRINTED = paper.printed()
+PRINTED = paper.printed_numbers()
 
 
 def errors(name):

@@ -75,7 +75,7 @@ def test_every_other_number_is_on_the_page(run):
     """
     sections = {s["title"]: s for s in json.loads((run / "paper.json").read_text())["sections"]}
     page = (run / "paper.html").read_text(encoding="utf-8")
-    printed = paper.printed()["change"]
+    printed = paper.printed_numbers()["change"]
     for section in sections.values():
         for value in section.get("E_D_relative", {}).values():
             assert f"<td>{value:.4f}</td>" in page

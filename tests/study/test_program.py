@@ -18,12 +18,12 @@ from test_child import is_running, wait_for
 import tetopt
 from tetopt.cli import main
 from tetopt.fem.elasticity import check_fills_box
-from tetopt.geometry.simplex import oriented, volumes
+from tetopt.geometry.simplex import orient_cells, volumes
 from tetopt.geometry.topology import boundary_facets
 from tetopt.study.child import run_in_child
 from tetopt.study.interfaces import class_labels
 from tetopt.study.pipelines import PipelineInput
-from tetopt.study.program import boxed, by_program, parse_program, pipelines_with
+from tetopt.study.program import by_program, parse_program, pipelines_with, put_on_sides
 
 IMAGE = tetopt.load_phantom("sphere").image(voxel_mm=4.0)
 JOB = PipelineInput(IMAGE, None, 1000, classes=3)
@@ -79,7 +79,7 @@ def covered(mesh):
     fans = [np.roll(rim, -k) for k in range(len(rim))]
     lids = [np.array([[node, fan[0], *pair] for pair in pairwise(fan[1:])]) for fan in fans]
     best = max(lids, key=lambda cells: np.abs(volumes(points, cells)).min())
-    return tetopt.Mesh(points, np.vstack([mesh.cells, oriented(points, best)]))
+    return tetopt.Mesh(points, np.vstack([mesh.cells, orient_cells(points, best)]))
 
 
 def test_number_of_nodes_is_corrected(tmp_path):
@@ -149,14 +149,14 @@ def test_a_boundary_near_the_box_is_put_on_it(shape):
     """Also one whose nodes lie a little inside, under cells that are all but flat: these are
     taken off.
     """
-    mesh, kept, notes = boxed(IMAGE, shape(scaled(lattice(300), 1)))
+    mesh, kept, notes = put_on_sides(IMAGE, shape(scaled(lattice(300), 1)))
     check_fills_box(IMAGE, mesh)
     assert len(mesh.cells) == len(kept) == len(lattice(300).cells)
     assert notes == ["its boundary was moved by up to 0.5 voxels onto the sides of the image's box"]
 
 
 def test_a_boundary_far_from_the_box_stays():
-    mesh, _, notes = boxed(IMAGE, scaled(lattice(300), -6))
+    mesh, _, notes = put_on_sides(IMAGE, scaled(lattice(300), -6))
     assert notes == ["its boundary lies up to 3 voxels from the sides of the image's box"]
     assert IMAGE.to_index(mesh.points).min() == pytest.approx(2.5)
 

@@ -17,8 +17,8 @@ import pytest
 
 from tetopt.errors import InputError
 from tetopt.system.files import (
+    check_output,
     check_space,
-    checked_output,
     name_files,
     outputs_of_command,
     results_folder,
@@ -33,23 +33,23 @@ NIFTI = (".nii", ".nii.gz")
 
 
 def assert_refused(path, match, suffixes=VTU, **options):
-    """`checked_output` says why in one line that starts with the path, and touches nothing."""
+    """`check_output` says why in one line that starts with the path, and touches nothing."""
     with pytest.raises(InputError, match=match) as caught:
-        checked_output(path, suffixes, **options)
+        check_output(path, suffixes, **options)
     assert str(caught.value).startswith(f"{path}: ")
     assert "\n" not in str(caught.value)
 
 
 def test_a_new_file_may_be_written(tmp_path):
     path = tmp_path / "mesh.vtu"
-    assert checked_output(path, VTU) == path
-    assert checked_output(str(path), VTU, force=True) == path
+    assert check_output(path, VTU) == path
+    assert check_output(str(path), VTU, force=True) == path
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", ["a.nii", "a.nii.gz", "A.NII.GZ", "v1.2.nii.gz", "Schädel.nii"])
 def test_suffix_of_any_case(tmp_path, name):
-    assert checked_output(tmp_path / name, NIFTI) == tmp_path / name
+    assert check_output(tmp_path / name, NIFTI) == tmp_path / name
 
 
 @pytest.mark.parametrize("name", ["a", "nii", "a.gz", "a.nii.gz.part"])
@@ -61,7 +61,7 @@ def test_an_existing_file_is_refused_without_force(tmp_path):
     path = tmp_path / "mesh.vtu"
     path.write_text("old")
     assert_refused(path, "already exists; pass `force`")
-    assert checked_output(path, VTU, force=True) == path
+    assert check_output(path, VTU, force=True) == path
     assert path.read_text() == "old"
 
 
@@ -122,7 +122,7 @@ def test_a_link_is_written_through(tmp_path):
         if old is not None:
             target.write_text(old)
         assert_refused(link, "already exists; pass `force`")
-        checked_output(link, VTU, force=True)
+        check_output(link, VTU, force=True)
         save_bytes(link, b"new")
         assert link.is_symlink()
         assert not target.is_symlink()
@@ -137,7 +137,7 @@ def test_a_link_that_is_turned_during_the_run_changes_nothing(tmp_path):
     link = tmp_path / "l.vtu"
     link.symlink_to("a")
     with outputs_of_command():
-        checked_output(link, VTU, force=True)
+        check_output(link, VTU, force=True)
         link.unlink()
         link.symlink_to("b")
         save_bytes(link, b"new")
@@ -151,7 +151,7 @@ def test_a_link_that_is_turned_during_the_run_changes_nothing(tmp_path):
 def test_a_new_output_appears_and_may_be_written_again(tmp_path):
     path = tmp_path / "a.vtu"
     with outputs_of_command() as outputs:
-        checked_output(path, VTU)
+        check_output(path, VTU)
         for text in (b"new", b"newer"):
             save_bytes(path, text)
             assert path.read_bytes() == text
@@ -179,8 +179,8 @@ def test_no_output_is_an_input_or_another_output(tmp_path, monkeypatch):
             )
     with outputs_of_command():
         name_files([Path("a.vtu"), Path("b.vtu")])
-        checked_output("a.vtu", VTU, force=True)
-        checked_output("b.vtu", VTU)
+        check_output("a.vtu", VTU, force=True)
+        check_output("b.vtu", VTU)
 
 
 # --------------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import pytest
 from attacks import KINDS, content, outside, planted
 
 from tetopt.errors import InputError
-from tetopt.system.work_directory import check, create, locked
+from tetopt.system.work_directory import check, create, lock_directory
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ def test_an_empty_folder_becomes_one(tmp_path):
 def test_what_is_none_is_one_line_and_stays(tmp_path, kind):
     planted(kind, tmp_path / "work", outside(tmp_path))
     before = content(tmp_path)
-    for act in (check, create, lambda path: locked(path).__enter__()):
+    for act in (check, create, lambda path: lock_directory(path).__enter__()):
         with pytest.raises(
             InputError,
             match=rf"^{tmp_path}/work: expected [^\n]*; move it away and run this again$",
@@ -62,11 +62,11 @@ def test_a_lock_says_whose_it_is_and_ends_with_its_process(work):
         words = rf"^{work}: another run is writing there \(process {other.pid} on .*\); wait until"
         try:
             for keys in (None, ["a"]):
-                with pytest.raises(InputError, match=words), locked(work, keys):
+                with pytest.raises(InputError, match=words), lock_directory(work, keys):
                     pass
         finally:
             other.kill()
-    with locked(work):
+    with lock_directory(work):
         pass
 
 
@@ -75,9 +75,9 @@ def test_runs_of_other_keys_share_it(work):
         ("b",): rf"b: another run is writing there \(process {os.getpid()} ",
         None: r"another run is [^\n]*process\)",
     }
-    with locked(work, ["a", "b"]), locked(work, ["c"]):
+    with lock_directory(work, ["a", "b"]), lock_directory(work, ["c"]):
         for keys, words in refused.items():
-            with pytest.raises(InputError, match=f"^{work}: {words}"), locked(work, keys):
+            with pytest.raises(InputError, match=f"^{work}: {words}"), lock_directory(work, keys):
                 pass
     assert (work / "tetopt-lock").read_text() == (work / "b.lock").read_text() == ""
 
@@ -90,7 +90,7 @@ def test_a_lock_that_is_a_link_empties_no_file(work, tmp_path):
         (work / name).symlink_to(mine)
         with (
             pytest.raises(InputError, match=f"{name}: expected a regular file, got a link"),
-            locked(work, keys),
+            lock_directory(work, keys),
         ):
             pass
         assert mine.read_text() == "of the user"

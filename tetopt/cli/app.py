@@ -28,7 +28,7 @@ from tetopt.cli.console import (
 )
 from tetopt.cli.ending import INTERRUPTED_CODE, signal_code, signals_heard, tell_end
 from tetopt.errors import InputError, error_words
-from tetopt.job.events import listened
+from tetopt.job.events import listen_with
 from tetopt.system.files import Outputs, outputs_of_command
 from tetopt.system.interpreter import THREADS_NAME
 
@@ -140,7 +140,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         warnings.catch_warnings(),
         outputs_of_command() as outputs,
         signals_heard(),
-        listened(show_event),
+        listen_with(show_event),
     ):
         warnings.showwarning = warnings_once()
         # its font-cache notice does not concern the user

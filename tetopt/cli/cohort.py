@@ -29,8 +29,8 @@ from tetopt.cohort.numbers import Row
 from tetopt.cohort.options import CohortOptions
 from tetopt.cohort.page import STATUS_WORDS
 from tetopt.cohort.subjects import Problems
-from tetopt.io.text import counted
-from tetopt.job.events import Event, listened, time_words
+from tetopt.io.text import count_text
+from tetopt.job.events import Event, listen_with, time_words
 from tetopt.job.options import Option, RunOptions
 from tetopt.system.budget import memory_words
 
@@ -65,7 +65,7 @@ def cohort_command(
         _say_estimate(plan)
         return 0
     display = _CohortDisplay(plan, [] if cohort.collect else context.obj)
-    with listened(display):
+    with listen_with(display):
         run_planned(plan)
     return display.code
 
@@ -82,7 +82,7 @@ def _say_estimate(plan: CohortPlan) -> None:
         print_line("nothing to run")
         return
     whole = (
-        f"{counted(len(to_run), 'subject')}, up to about "
+        f"{count_text(len(to_run), 'subject')}, up to about "
         f"{memory_words(max(estimate.values(), default=0.0))} each"
     )
     if cohort.scheduler is None:
@@ -147,9 +147,11 @@ class _CohortDisplay:
         for row in [row for row in own if row.status == "failed"][:NAMED_FAILURES]:
             log.print(escape(in_options(f"{row.key}: {row.reason}")))
         parts = [f"{counts[name]} {text}" for name, text in STATUS_WORDS.items() if counts[name]]
-        print_line(f"{counted(len(own), 'subject')}: {', '.join(parts)}")
+        print_line(f"{count_text(len(own), 'subject')}: {', '.join(parts)}")
         if n_more := len(rows) - len(own):
-            more = f"the page also shows {counted(n_more, 'subject')} from other tables in {place}"
+            more = (
+                f"the page also shows {count_text(n_more, 'subject')} from other tables in {place}"
+            )
             log.print(escape(more))
         for name in (PAGE_NAME, TABLE_NAME):
             print_line(str(place / name))

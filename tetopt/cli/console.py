@@ -161,7 +161,7 @@ def width_of(console: Console) -> int:
     return min(console.width, LINE_WIDTH) if console.is_terminal else LINE_WIDTH
 
 
-def wrapped(text: str, console: Console) -> list[str]:
+def wrap_text(text: str, console: Console) -> list[str]:
     """Break a line between words, where it is wider than allowed; long words, as paths, are kept
     whole.
     """
@@ -173,7 +173,7 @@ def wrapped(text: str, console: Console) -> list[str]:
 
 def print_line(text: str) -> None:
     """Print a line of the result on standard output, wrapped."""
-    for line in wrapped(plain(text), out):
+    for line in wrap_text(plain(text), out):
         out.print(escape(line))
 
 
@@ -189,7 +189,7 @@ def show_error(message: object) -> None:
 
 def _say(line: str, head: str = "", style: str = "", is_wrapped: bool = True) -> None:
     """Print a line on standard error, its head in a style."""
-    first, *rest = wrapped(line, log) if is_wrapped else [line]
+    first, *rest = wrap_text(line, log) if is_wrapped else [line]
     if head and first.startswith(head):
         log.print(f"[{style}]{head}[/]{escape(first.removeprefix(head))}")
     else:

@@ -14,7 +14,7 @@ from tetopt.commands.voxel_fields import is_image_name, write_on_image
 from tetopt.errors import InputError
 from tetopt.io.formats import FORMATS, format_of
 from tetopt.io.images import OUTPUT_SUFFIXES
-from tetopt.job.events import Event, listened
+from tetopt.job.events import Event, listen_with
 from tetopt.job.options import (
     LabelChoice,
     LabelledPart,
@@ -23,7 +23,7 @@ from tetopt.job.options import (
     VoxelOptions,
     given_options,
 )
-from tetopt.system.files import checked_output
+from tetopt.system.files import check_output
 
 
 def convert_command(
@@ -64,9 +64,9 @@ def convert_command(
     if not is_image:
         format_of(output)
     _check_options(output, voxels if not is_image else None, part, choice, solver)
-    output = checked_output(output, OUTPUT_SUFFIXES if is_image else tuple(FORMATS), numbers.force)
+    output = check_output(output, OUTPUT_SUFFIXES if is_image else tuple(FORMATS), numbers.force)
     numbers.check()
-    with listened(_show):
+    with listen_with(_show):
         if is_image:
             numbers.save(
                 write_on_image(

@@ -18,7 +18,7 @@ from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.options import LabelledPart, ModelOptions, Option
 from tetopt.model.mappings import ByLabel, parse_any_mapping
 from tetopt.report.tables import new_table, nodes_in_words
-from tetopt.system.files import checked_output
+from tetopt.system.files import check_output
 
 STEPS_BESIDE = 3  # columns of a table
 # of a force's largest component: less is the residual of an iterative solution
@@ -70,7 +70,7 @@ def fem_command(
     mesh_path, image_path = mesh_and_image(paths, image_path)
     numbers.check()
     if output is not None:
-        output = checked_output(output, VTK_SUFFIXES, numbers.force)
+        output = check_output(output, VTK_SUFFIXES, numbers.force)
     elif model.written_sets is not None:
         raise InputError("--sets: no file is written; add -o SOLVED.vtu")
     files = (mesh_path, image_path, output)

@@ -31,7 +31,7 @@ from tetopt.job.options import (
     option_name,
     option_of,
 )
-from tetopt.system.files import checked_output, name_files, save_json
+from tetopt.system.files import check_output, name_files, save_json
 
 ImageArgument = Annotated[Path, Option("IMAGE", IMAGE_FILES, is_argument=True)]
 MeshArgument = Annotated[
@@ -58,7 +58,7 @@ class NumberOptions:
     def check(self) -> None:
         """Raise InputError if the file may not be written."""
         if self.json_path is not None:
-            checked_output(self.json_path, (".json",), self.force)
+            check_output(self.json_path, (".json",), self.force)
 
     def save(self, numbers: dict[str, Any]) -> None:
         """Write the file if it was requested."""
@@ -133,7 +133,7 @@ def from_records(command: Callable[..., int]) -> Callable[..., int]:
             name,
             inspect.Parameter.KEYWORD_ONLY,
             default=default,
-            annotation=_typed(name, kind, default, panel),
+            annotation=_annotation_of(name, kind, default, panel),
         )
         for name, kind, default, panel in leaves
     ]
@@ -170,7 +170,7 @@ def _panel_of(record: type, name: str) -> str | None:
     return next((each.panel for each in bringing if hasattr(each, "panel")), None)
 
 
-def _typed(name: str, kind: Any, default: Any, panel: str | None) -> Any:
+def _annotation_of(name: str, kind: Any, default: Any, panel: str | None) -> Any:
     """Return the annotation for typer, with the option's help panel; arguments have a panel of
     their own.
     """

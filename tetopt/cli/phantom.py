@@ -11,7 +11,7 @@ from tetopt.cli.options import ForceOption
 from tetopt.io.images import OUTPUT_SUFFIXES
 from tetopt.io.zarr_images import ZARR_SUFFIX, is_node
 from tetopt.job.options import Option
-from tetopt.system.files import checked_output
+from tetopt.system.files import check_output
 
 
 def phantom_command(
@@ -33,9 +33,9 @@ def phantom_command(
 ) -> int:
     """Write a phantom as an image of known shapes and intensities."""
     if labels is not None:
-        labels = checked_output(labels, OUTPUT_SUFFIXES, force)
+        labels = check_output(labels, OUTPUT_SUFFIXES, force)
     is_folder = output.name.lower().endswith(ZARR_SUFFIX)
-    output = checked_output(
+    output = check_output(
         output, (*OUTPUT_SUFFIXES, ZARR_SUFFIX), force, is_node if is_folder else None
     )
     phantom = load_phantom(name)

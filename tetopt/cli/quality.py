@@ -56,7 +56,7 @@ def quality_command(
     print_table(table)
     print_fidelity(judgement.measured, judgement.loaded.mesh.ndim, judgement.mask_word, every)
     if check and not judgement.numbers["problems"]:
-        print_line(f"checked: conforming, oriented{_checked_words(judgement)}")
+        print_line(f"checked: conforming, oriented{_check_words(judgement)}")
     wrong = judgement.tell()
     if check:
         whole = (
@@ -74,7 +74,7 @@ def quality_command(
     return int(bool(wrong))
 
 
-def _checked_words(judgement: Judgement) -> str:
+def _check_words(judgement: Judgement) -> str:
     """Describe the other properties for which a valid mesh was checked."""
     if judgement.is_masked:
         return "; meshed within a mask, which may have several components"

@@ -17,7 +17,7 @@ from tetopt.energy.sampling import overlap_of
 from tetopt.job.inputs import read_mesh
 from tetopt.job.options import MaskedPart, Option
 from tetopt.report.tables import new_table
-from tetopt.system.files import checked_output
+from tetopt.system.files import check_output
 
 
 def segment_command(
@@ -40,9 +40,9 @@ def segment_command(
     """Segment an image by its mesh, quickly and roughly: group cells by mean into K classes and
     label their voxels.
     """
-    from tetopt.measure.segmentation import dice, segment, stands_for, thresholded
+    from tetopt.measure.segmentation import dice, segment, stands_for, threshold_image
 
-    output = checked_output(output, (".nii", ".nii.gz"), numbers.force)
+    output = check_output(output, (".nii", ".nii.gz"), numbers.force)
     numbers.check()
     mesh_path, image_path = mesh_and_image(paths, image_path)
     if image_path is None:
@@ -78,7 +78,10 @@ def segment_command(
         table.add_row(str(number), f"{fraction:.4f}", "" if mean is None else f"{mean:.4g}", *last)
     overlaps = new_table("label", "Dice, mesh", "Dice, thresholded voxels")
     if truth_path is not None and truth is not None:
-        by_mesh, by_voxels = dice(labels, truth), dice(thresholded(image, classes, inside), truth)
+        by_mesh, by_voxels = (
+            dice(labels, truth),
+            dice(threshold_image(image, classes, inside), truth),
+        )
         overlap = {"mesh": by_mesh, "voxels": by_voxels}
         report |= {"truth": truth_path.name, "stands_for": names, "dice": overlap}
         if lost := [str(label) for label in by_mesh if label not in names.values()]:

@@ -15,11 +15,11 @@ from tetopt.io.tags import (
     group_labels,
     group_of_zero,
     label_lines,
-    numbered_parts,
+    number_parts,
     renumbered_labels,
 )
 from tetopt.io.vtk import VTK_SUFFIXES
-from tetopt.job.inputs import listed
+from tetopt.job.inputs import list_names
 from tetopt.job.options import SolverOptions
 from tetopt.model.fields import GAUSS_MODULI
 from tetopt.model.labels import TABLE_TEXT, labels_of, table_of_words
@@ -80,7 +80,7 @@ def _materials_by_name(model: Model, materials: Materials) -> Iterator[str]:
             yield f"  and {len(materials.young) - MOST_SETS} more materials"
             return
         made_of = [names.get(label, str(label)) for label, material in pairs if material == number]
-        yield f"  {young:.4g} kPa, nu {nu:.4g}: {listed(made_of)}"
+        yield f"  {young:.4g} kPa, nu {nu:.4g}: {list_names(made_of)}"
 
 
 def _gmsh_lines(model: Model, suffix: str) -> Iterator[str]:
@@ -97,7 +97,7 @@ def _gmsh_lines(model: Model, suffix: str) -> Iterator[str]:
     ]:
         yield (
             "physical groups number the labels, as large labels do not fit: "
-            f"{listed(renumbered)} (see $Comments)"
+            f"{list_names(renumbered)} (see $Comments)"
         )
     if suffix == ".msh2" and (short := incomplete_groups(model)):
         yield (
@@ -150,7 +150,7 @@ def _lines(output: Path, model: Model, solver: SolverOptions) -> Iterator[str]:
     if (suffix := output.suffix.lower()) in GMSH_SUFFIXES:
         yield from _gmsh_lines(model, suffix)
     elif suffix in CELL_NUMBERS:
-        lines = label_lines(model, numbered_parts(model)[0], CELL_NUMBERS[suffix])
+        lines = label_lines(model, number_parts(model)[0], CELL_NUMBERS[suffix])
         yield from lines[:MOST_LABEL_LINES]
         if len(lines) > MOST_LABEL_LINES:
             yield f"and {len(lines) - MOST_LABEL_LINES} more; the file's header lists all"

@@ -13,7 +13,7 @@ from tetopt.commands.boundary import SurfacePart, write_surface
 from tetopt.io.surfaces import SURFACE_SUFFIXES
 from tetopt.job.options import Option
 from tetopt.report.tables import new_table
-from tetopt.system.files import checked_output
+from tetopt.system.files import check_output
 
 
 def surface_command(
@@ -28,7 +28,7 @@ def surface_command(
     """Write the boundary of a structure in a mesh, watertight, or interfaces of its labels;
     print volume and area.
     """
-    output = checked_output(output, SURFACE_SUFFIXES, numbers.force)
+    output = check_output(output, SURFACE_SUFFIXES, numbers.force)
     numbers.check()
     written = write_surface(mesh_path, output, part)
     table = new_table(*map(escape, written.heads))

@@ -21,7 +21,7 @@ from tetopt.job.options import BoxPart, MaskedPart, MaskPart, Option
 from tetopt.model.fields import cell_fields
 from tetopt.model.file import MeshFile, sets_beside
 from tetopt.model.sets import facet_triples
-from tetopt.system.files import checked_output
+from tetopt.system.files import check_output
 from tetopt.system.incoming import json_of
 
 
@@ -41,7 +41,7 @@ def view_command(
     A mesh with displacements is drawn deformed, scaled by a slider; quadratic cells are drawn by
     their corners.
     """
-    html = None if how.html is None else checked_output(how.html, (".html",), force)
+    html = None if how.html is None else check_output(how.html, (".html",), force)
     limits = None if how.limits is None else _limits(how.limits)
     mesh_path, image_path = mesh_and_image(paths, image_path)
     counted = MaskedPart(**vars(part), **vars(region))

@@ -81,10 +81,10 @@ def bids_subjects(
     paths = {key: _simplest(images) for key, images in sorted(rows.items())}
     problems += [_ambiguity(each, folder) for each in paths.values() if len(each) > 1]
     if problems:
-        raise Problems([f"{_shown(folder)}: {plain(problem)}" for problem in problems])
+        raise Problems([f"{_path_text(folder)}: {plain(problem)}" for problem in problems])
     if not paths:
         raise InputError(
-            f"{_shown(folder)}: no subject has an image _{suffix}.nii.gz; use `suffix` for "
+            f"{_path_text(folder)}: no subject has an image _{suffix}.nii.gz; use `suffix` for "
             "another kind"
         )
     if not labels:
@@ -139,7 +139,7 @@ def _images(folder: Path, suffix: str, labels: Sequence[str]) -> list[Any]:
     except (OSError, ValueError, RecursionError) as error:
         words = plain(str(error).partition("\n")[0])
         raise InputError(
-            f"{_shown(folder)}: expected a BIDS dataset, or a table ({words})"
+            f"{_path_text(folder)}: expected a BIDS dataset, or a table ({words})"
         ) from error
     return list(layout.get(extension=BIDS_ENDINGS, invalid_filters="allow", **kind))
 
@@ -172,10 +172,10 @@ def _warn_of_others(folder: Path, what: str, subjects: set[str]) -> None:
             ", ..." if len(others) > NAMED_SUBJECTS else ""
         )
         warn(
-            f"{_shown(folder)}: left out subjects without {plain(what)}: {len(others)} "
+            f"{_path_text(folder)}: left out subjects without {plain(what)}: {len(others)} "
             f"({plain(some)})"
         )
 
 
-def _shown(path: Path) -> str:
+def _path_text(path: Path) -> str:
     return plain(str(path))

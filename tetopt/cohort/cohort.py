@@ -9,30 +9,38 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tetopt.cohort.estimate import Estimate, estimated, share_for
+from tetopt.cohort.estimate import Estimate, estimate_memory, share_for
 from tetopt.cohort.layout import WORK_NAME, begin, check_out, clean, failure_path, linked_place
 from tetopt.cohort.numbers import Row, collect
 from tetopt.cohort.options import CohortOptions
 from tetopt.cohort.page import STATUS_WORDS, save_cohort_files
 from tetopt.cohort.plan import (
     PlannedSubject,
-    checked_suffix,
-    chosen,
+    choose_subjects,
     entries_of,
     subjects_of,
+    suffix_of_meshes,
     with_states,
 )
 from tetopt.cohort.run import Ended, SubjectTask, run_all
 from tetopt.cohort.subjects import TABLE_SUFFIXES, Problems, key, write_table
 from tetopt.errors import InputError
-from tetopt.io.text import counted
-from tetopt.job.events import Listener, listened, note, progress, started, violated, warning
+from tetopt.io.text import count_text
+from tetopt.job.events import (
+    Listener,
+    listen_with,
+    note,
+    progress,
+    report_violation,
+    start_stage,
+    warning,
+)
 from tetopt.job.job import in_kinds
 from tetopt.job.options import RunOptions, kinds_of, near_hint
-from tetopt.job.plan import changed
+from tetopt.job.plan import changed_options
 from tetopt.system.budget import memory_words
-from tetopt.system.files import checked_output
-from tetopt.system.work_directory import locked
+from tetopt.system.files import check_output
+from tetopt.system.work_directory import lock_directory
 from tetopt.workers import SchedulerLost, check_workers, workers
 
 NAMED_FAILURES = 20  # reasons printed: the table and the page have all
@@ -119,7 +127,7 @@ def run_cohort(
             raise InputError(f"run_cohort: unknown option {name!r}" + near_hint(name, known))
     of_cohort = {name: value for name, value in values.items() if name in kinds_of(CohortOptions)}
     of_runs = {name: value for name, value in values.items() if name not in of_cohort}
-    with listened(on):
+    with listen_with(on):
         plan = plan_cohort(
             Path(subjects), in_kinds(CohortOptions, of_cohort), in_kinds(RunOptions, of_runs)
         )
@@ -138,7 +146,7 @@ def plan_cohort(subjects: Path, cohort: CohortOptions, options: RunOptions) -> C
         Options are invalid; `Problems` lists all problems of the subjects.
     """
     check_workers(cohort.workers, cohort.scheduler)
-    suffix = checked_suffix(cohort.mesh_format)
+    suffix = suffix_of_meshes(cohort.mesh_format)
     place = cohort.output
     if options.threads is not None and options.threads < 1:
         raise InputError(f"`threads`: expected 1 or more, got {options.threads}")
@@ -147,11 +155,11 @@ def plan_cohort(subjects: Path, cohort: CohortOptions, options: RunOptions) -> C
             "`collect` runs no subjects; omit it, or `write_table`, `dry_run` and `retry_failed`"
         )
     if cohort.write_table is not None:
-        checked_output(cohort.write_table, TABLE_SUFFIXES)
+        check_output(cohort.write_table, TABLE_SUFFIXES)
     check_out(place)
     if (place / WORK_NAME).is_dir() and cohort.write_table is None and not cohort.dry_run:
         # checked here as well, as planning many subjects takes minutes
-        with locked(place / WORK_NAME, []):
+        with lock_directory(place / WORK_NAME, []):
             pass
     rows = subjects_of(subjects, cohort)
     plan = CohortPlan(
@@ -160,7 +168,7 @@ def plan_cohort(subjects: Path, cohort: CohortOptions, options: RunOptions) -> C
     if cohort.collect:
         return plan
     entries = entries_of(rows, options, place, suffix)
-    to_run = chosen(entries, cohort.retry_failed)
+    to_run = choose_subjects(entries, cohort.retry_failed)
     if links := [
         wrong for entry in to_run if (wrong := linked_place(place, entry.key)) is not None
     ]:
@@ -170,7 +178,7 @@ def plan_cohort(subjects: Path, cohort: CohortOptions, options: RunOptions) -> C
         write_table(cohort.write_table, [entry.row() for entry in entries])
         return plan
     _tell_plan(plan)
-    return plan._replace(estimate=estimated(to_run))
+    return plan._replace(estimate=estimate_memory(to_run))
 
 
 def _tell_plan(plan: CohortPlan) -> None:
@@ -181,7 +189,9 @@ def _tell_plan(plan: CohortPlan) -> None:
     }
     words["missing"] = "not yet run"
     parts = [f"{counts[name]} {text}" for name, text in words.items() if counts[name]]
-    note(f"{counted(len(plan.entries), 'subject')}: {', '.join(parts)}; {len(plan.to_run)} to run")
+    note(
+        f"{count_text(len(plan.entries), 'subject')}: {', '.join(parts)}; {len(plan.to_run)} to run"
+    )
     reasons = Counter(
         (e.state.status, e.state.why)
         for e in plan.to_run
@@ -202,10 +212,10 @@ def run_planned(plan: CohortPlan) -> list[Row]:
     # Other runs may use the same folder.
     alone = keys if plan.entries and cohort.participants and len(keys) <= MOST_BESIDE else None
     begin(place, [plan.subjects.absolute().as_uri()])
-    with locked(place / WORK_NAME, alone):
+    with lock_directory(place / WORK_NAME, alone):
         clean(place, alone)
         # Again, as another run may have ended since.
-        to_run = chosen(with_states(plan.to_run, place, plan.suffix), cohort.retry_failed)
+        to_run = choose_subjects(with_states(plan.to_run, place, plan.suffix), cohort.retry_failed)
         for entry in plan.entries:
             # later failures had other options or inputs
             if entry.state.status in ("done", "violated"):
@@ -218,8 +228,8 @@ def run_planned(plan: CohortPlan) -> list[Row]:
                 clean(place, alone)
             rows = collect(place, keys)
             save_cohort_files(place, rows)
-            started("collected")
-            progress(f"table and page of {counted(len(rows), 'subject')}", rows)
+            start_stage("collected")
+            progress(f"table and page of {count_text(len(rows), 'subject')}", rows)
     return rows
 
 
@@ -235,9 +245,9 @@ def _run(plan: CohortPlan, to_run: Sequence[PlannedSubject]) -> None:
             tasks = [_task(entry, plan.estimate, place, plan.suffix) for entry in to_run]
             # so that no large run remains alone at the end
             tasks.sort(key=lambda task: -task.n_bytes)
-            started(
+            start_stage(
                 "subjects",
-                f"{counted(n_tasks, 'subject')}, {max(pool.slots(), 1)} at a time",
+                f"{count_text(n_tasks, 'subject')}, {max(pool.slots(), 1)} at a time",
                 n_tasks,
             )
             start = time.monotonic()
@@ -254,7 +264,7 @@ def _run(plan: CohortPlan, to_run: Sequence[PlannedSubject]) -> None:
                     _outcome_words(ended), CohortProgress(ended, n_done, n_tasks, n_failed, left)
                 )
     except SchedulerLost as lost:
-        violated(f"{lost}; finished subjects are kept")
+        report_violation(f"{lost}; finished subjects are kept")
 
 
 def _outcome_words(ended: Ended) -> str:
@@ -278,5 +288,5 @@ def _with_pages(outcomes: Iterable[Ended], place: Path) -> Iterator[Ended]:
 
 def _task(entry: PlannedSubject, estimate: Estimate, place: Path, suffix: str) -> SubjectTask:
     command = shlex.join(["tetopt", "mesh", "-o", f"{entry.key}{suffix}", *entry.words()])
-    job = changed(entry.plan.bare, threads=None)  # its worker's
+    job = changed_options(entry.plan.bare, threads=None)  # its worker's
     return SubjectTask(entry.key, job, suffix, place, estimate.get(entry.key, 0.0), command)

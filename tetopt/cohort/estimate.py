@@ -12,7 +12,7 @@ from tetopt.cohort.plan import PlannedSubject
 from tetopt.engine.meshing import process_bytes
 from tetopt.errors import InputError
 from tetopt.io.images import file_shape
-from tetopt.job.events import listened
+from tetopt.job.events import listen_with
 from tetopt.job.options import SizeOptions
 from tetopt.job.plan import expected_nodes
 from tetopt.job.read import read_planned
@@ -27,7 +27,7 @@ LIKE_READS = 8
 Estimate = dict[str, float]  # bytes by key
 
 
-def estimated(entries: Sequence[PlannedSubject]) -> Estimate:
+def estimate_memory(entries: Sequence[PlannedSubject]) -> Estimate:
     """Return the memory of subjects, by some subjects of each kind, which are read.
 
     A kind has the same options and number of files; if its images have several shapes, one of each
@@ -60,7 +60,7 @@ def _read_bytes(entry: PlannedSubject) -> float | None:
     report.
     """
     try:
-        with listened(lambda event: None), contextlib.redirect_stderr(StringIO()):
+        with listen_with(lambda event: None), contextlib.redirect_stderr(StringIO()):
             task = read_planned(entry.plan)
     except (InputError, OSError):
         return None

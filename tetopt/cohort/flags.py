@@ -113,7 +113,7 @@ def flags_of(rows: Sequence[Row]) -> list[list[Flag]]:
     return [sorted(each, key=lambda flag: -flag.score) for each in flags]
 
 
-def unjudged(rows: Sequence[Row]) -> list[str]:
+def comparisons_left_out(rows: Sequence[Row]) -> list[str]:
     """Return, a sentence each, comparisons that are not made: too few rows, or values too mixed to
     have outliers.
 
@@ -133,7 +133,9 @@ def unjudged(rows: Sequence[Row]) -> list[str]:
             sentences.append(
                 f"{len(own)} {kind} are too few to compare their numbers ({FEW_SUBJECTS} needed)."
             )
-        mixed = [words for column, words in GRID_COLUMNS.items() if _is_mixed(_known(own, column))]
+        mixed = [
+            words for column, words in GRID_COLUMNS.items() if _is_mixed(_values_of(own, column))
+        ]
         if mixed:
             sentences.append(
                 f"The {len(own)} {kind} are too mixed to judge by {', '.join(mixed)}: no value "
@@ -152,7 +154,7 @@ def _groups(rows: Sequence[Row]) -> dict[Value, list[int]]:
     return groups
 
 
-def _known(rows: Sequence[Row], column: str) -> list[Value]:
+def _values_of(rows: Sequence[Row], column: str) -> list[Value]:
     return [text for row in rows if (text := row.numbers.get(column)) is not None]
 
 
@@ -201,7 +203,7 @@ def _absent(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
 def _grids(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
     """Yield flags of orientations and the like that differ from a majority."""
     for column, words in GRID_COLUMNS.items():
-        texts, known = [row.numbers.get(column) for row in rows], _known(rows, column)
+        texts, known = [row.numbers.get(column) for row in rows], _values_of(rows, column)
         if len(set(known)) < 2 or _is_mixed(known):
             continue
         usual, count = Counter(known).most_common(1)[0]

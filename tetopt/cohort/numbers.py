@@ -142,14 +142,14 @@ def with_numbers(row: Row, run: dict[str, Any]) -> Row:
     labels, names = run.get("labels") or [], run.get("label_names") or {}
     return row._replace(
         violated=tuple(map(plain, run.get("violated") or {})),
-        numbers=flattened(run),
+        numbers=flatten_run(run),
         label_names={int(number): plain(name) for number, name in names.items()},
         volumes={each["label"]: each["volume"] for each in labels},
         n_lost={each["label"]: each["voxels"] for each in labels if each["is_lost"]},
     )
 
 
-def flattened(run: dict[str, Any]) -> dict[str, Value]:
+def flatten_run(run: dict[str, Any]) -> dict[str, Value]:
     """Return the numbers and texts of run.json by column, in its order.
 
     Names of nested objects are joined by dots. Labels have a column per number, `labels.17.dice`

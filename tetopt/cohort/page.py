@@ -14,14 +14,14 @@ from tetopt.cohort.flags import (
     QUANTITIES,
     Flag,
     Quantity,
+    comparisons_left_out,
     flags_of,
     label_quantities,
     units,
-    unjudged,
 )
 from tetopt.cohort.layout import PAGE_NAME, TABLE_NAME
 from tetopt.cohort.numbers import Row, Value, description, present, save_table
-from tetopt.report.page import data_html, package_text, rendered, script_html, write_page
+from tetopt.report.page import data_html, package_text, render_page, script_html, write_page
 
 PAGE_PICTURES = 600  # thumbnails of about 8 kB, 6 MB in base64
 LISTED_FAILURES = 100  # reasons, and subjects per reason, above the full table
@@ -90,7 +90,7 @@ def save_cohort_files(out: Path, rows: Sequence[Row]) -> None:
             f" The page has {len(pictures)} of them, flagged subjects first; the rest are linked."
         )
     reasons = _failures(rows)
-    content = rendered(
+    content = render_page(
         "cohort/cohort.html",
         summary=_summary(rows, flags),
         reasons=reasons,
@@ -124,14 +124,14 @@ def _summary(rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -> list[str]:
         text += f" The largest run used {units('bytes', 3)(max(peaks))} of memory."
     options = _options(rows)
     common = [
-        f"{_option(name)} {_shown(next(iter(each)))}"
+        f"{_option(name)} {_round_value(next(iter(each)))}"
         for name, each in options.items()
         if len(each) == 1
     ]
     different = [
-        f"{_option(name)}: {_counted(each)}" for name, each in options.items() if len(each) > 1
+        f"{_option(name)}: {_count_values(each)}" for name, each in options.items() if len(each) > 1
     ]
-    lines = [text, *unjudged(rows)]
+    lines = [text, *comparisons_left_out(rows)]
     if common:
         lines.append(f"Common to all meshes: {', '.join(common)}.")
     if different:
@@ -144,12 +144,13 @@ def _option(name: str) -> str:
     return name.rpartition(".")[2]
 
 
-def _counted(counts: Counter[Value]) -> str:
+def _count_values(counts: Counter[Value]) -> str:
     """Format values with their numbers of subjects, the most frequent first."""
     if len(counts) > LISTED_VALUES:
         return f"{len(counts)} values"
     return ", ".join(
-        f"{'none' if value is None else _shown(value)} ({n})" for value, n in counts.most_common()
+        f"{'none' if value is None else _round_value(value)} ({n})"
+        for value, n in counts.most_common()
     )
 
 
@@ -249,9 +250,9 @@ def _row_data(row: Row, flags: Sequence[Flag], columns: Iterable[str]) -> list[A
     letters = "".join(letter for name, letter in FILE_LETTERS.items() if name in row.files)
     own = [[flag.words, flag.column] for flag in flags[:LISTED_FLAGS]]
     fixed = [row.key, row.status, row.reason, own, len(flags), row.files.get("mesh", ""), letters]
-    return [*fixed, *(_shown(row.numbers.get(name)) for name in columns)]
+    return [*fixed, *(_round_value(row.numbers.get(name)) for name in columns)]
 
 
-def _shown(value: Value) -> Value:
+def _round_value(value: Value) -> Value:
     """Round a float for the page."""
     return float(f"{value:.{SHOWN_DIGITS}g}") if isinstance(value, float) else value

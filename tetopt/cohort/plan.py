@@ -17,10 +17,10 @@ from tetopt.cohort.subjects import (
     FILE_OPTIONS,
     Problems,
     Subject,
-    doubled,
     key,
     label_of,
     matching,
+    name_problems,
     read_table,
     with_files,
 )
@@ -29,8 +29,8 @@ from tetopt.io.formats import BUILT_IN
 from tetopt.job.events import note
 from tetopt.job.inputs import file_and_volume, tissue_files
 from tetopt.job.options import JobOptions, RunOptions, given_options
-from tetopt.job.plan import Plan, changed, resolved
-from tetopt.job.request import requested
+from tetopt.job.plan import Plan, changed_options, plan_job
+from tetopt.job.request import job_request
 from tetopt.job.texts import option_words, with_options
 from tetopt.model.mappings import FILES_IN_TEXTS
 
@@ -80,7 +80,7 @@ def subjects_of(path: Path, cohort: CohortOptions) -> list[Subject]:
     return subjects
 
 
-def checked_suffix(text: str) -> str:
+def suffix_of_meshes(text: str) -> str:
     """Return the suffix of meshes' files; raise InputError for an unknown one."""
     suffix = text.lower() if text.startswith(".") else f".{text.lower()}"
     if suffix not in BUILT_IN:  # subjects are run by separate processes, which know only these
@@ -98,14 +98,14 @@ def entries_of(
     Problems
         All problems of all subjects.
     """
-    problems = [("", line) for line in doubled(subjects)]
+    problems = [("", line) for line in name_problems(subjects)]
     texts = {name: text for name in FILES_IN_TEXTS if (text := getattr(options, name)) is not None}
     # a worker may have another current folder
     placed: dict[str, Any] = dict(with_files(texts, os.path.abspath))
     options, entries = replace(options, **placed), []
     for subject in subjects:
         try:
-            plan = _planned(subject, options, Path(f"mesh{suffix}"))
+            plan = _plan_subject(subject, options, Path(f"mesh{suffix}"))
         except InputError as error:
             problems.append((subject.place, str(error)))
             continue
@@ -130,7 +130,7 @@ def _lines(problems: Iterable[tuple[str, str]]) -> Iterator[str]:
         yield f"{own[0]}{more}: {words}" if own[0] else words
 
 
-def _planned(subject: Subject, options: RunOptions, output: Path) -> Plan:
+def _plan_subject(subject: Subject, options: RunOptions, output: Path) -> Plan:
     """Plan a subject with its files and options; raise InputError for invalid options."""
     patterns = {
         name: str(path) for name in FILE_OPTIONS if (path := getattr(options, name)) is not None
@@ -142,7 +142,7 @@ def _planned(subject: Subject, options: RunOptions, output: Path) -> Plan:
         )
     own = with_options(options, {name.replace("_", "-"): text for name, text in texts.items()})
     job = JobOptions(**vars(own), images=list(subject.images), output=output)
-    return resolved(job, reads_files=True)
+    return plan_job(job, reads_files=True)
 
 
 def _missing(job: JobOptions) -> Iterator[str]:
@@ -175,14 +175,16 @@ def with_states(entries: list[PlannedSubject], out: Path, suffix: str) -> list[P
     def state(entry: PlannedSubject) -> PlannedSubject:
         request = None
         if numbers_path(out, entry.key).is_file():
-            request = requested(changed(entry.plan.bare, output=Path(mesh_name(entry.key, suffix))))
+            request = job_request(
+                changed_options(entry.plan.bare, output=Path(mesh_name(entry.key, suffix)))
+            )
         return entry._replace(state=state_of(out, entry.key, request))
 
     with ThreadPoolExecutor() as pool:
         return list(pool.map(state, entries))
 
 
-def chosen(entries: Iterable[PlannedSubject], only_failed: bool) -> list[PlannedSubject]:
+def choose_subjects(entries: Iterable[PlannedSubject], only_failed: bool) -> list[PlannedSubject]:
     """Return the subjects to run."""
     statuses = ("failed",) if only_failed else ("missing", "failed", "changed")
     return [entry for entry in entries if entry.state.status in statuses]

@@ -77,7 +77,7 @@ def run_subject(task: SubjectTask) -> Ended:
                 f"{memory_words(limit)}; reduce the "
                 "number of nodes, or use larger workers"
             )
-        result = _meshed(task, lines)
+        result = _mesh_subject(task, lines)
     except Exception as error:
         reason = _reason(error)
         lines.append(reason if _is_users(error) else traceback.format_exc())
@@ -89,7 +89,7 @@ def run_subject(task: SubjectTask) -> Ended:
     return Ended(task.key, status, reason, time.monotonic() - begin, peak)
 
 
-def _meshed(task: SubjectTask, lines: list[str]) -> Result:
+def _mesh_subject(task: SubjectTask, lines: list[str]) -> Result:
     """Run a subject's job in a folder of its own and publish what it writes; add the texts of
     its events to `lines`.
     """

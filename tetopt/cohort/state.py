@@ -29,8 +29,8 @@ def state_of(out: Path, key: str, request: dict[str, Any] | None = None) -> Subj
     out : Path
     key : str
     request : dict, optional
-        The current request, from `tetopt.job.request.requested`. Outputs of the same request count,
-        whatever failed since; without it, outputs are not compared.
+        The current request, from `tetopt.job.request.job_request`. Outputs of the same request
+        count, whatever failed since; without it, outputs are not compared.
     """
     path, failure = numbers_path(out, key), failure_path(out, key)
     numbers = table_in(path)

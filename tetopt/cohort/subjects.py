@@ -118,7 +118,7 @@ def read_table(path: Path) -> list[Subject]:
     return subjects
 
 
-def doubled(subjects: Iterable[Subject]) -> Iterator[str]:
+def name_problems(subjects: Iterable[Subject]) -> Iterator[str]:
     """Yield the problems of the subjects' names: empty, too long, repeated, with and without a
     session.
     """

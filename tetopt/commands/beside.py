@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.contents.content import Content, continuation, continued
-from tetopt.contents.labels import checked_labels
+from tetopt.contents.content import Content, continuation, continue_image
+from tetopt.contents.labels import check_labels
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.job.inputs import (
@@ -62,7 +62,7 @@ def read_labels(path: Path, image: Image, part: BoxPart = WHOLE_BOX) -> Image:
             f"{labels.shape}; "
             "resample them to the image first"
         )
-    return checked_labels(str(path), labels, is_map=True)
+    return check_labels(str(path), labels, is_map=True)
 
 
 def image_and_labels(
@@ -161,7 +161,7 @@ def _within(image: Image, part: MaskedPart, beside: Beside, loaded: MeshFile) ->
     """
     mask = mask_for(part, image, beside, loaded)
     beyond = None if mask is None else continuation(mask, image.spacing)
-    return Content(continued(image, beyond), continuation=beyond, whole=image)
+    return Content(continue_image(image, beyond), continuation=beyond, whole=image)
 
 
 def _with_labels(
@@ -170,7 +170,7 @@ def _with_labels(
     """Return the mesh with the majority labels of an image's voxels, instead of the file's, and
     these voxels.
     """
-    labels = checked_labels(str(path), read_companion(path, part.spacing_mm), is_map=True)
+    labels = check_labels(str(path), read_companion(path, part.spacing_mm), is_map=True)
     if labels.ndim != loaded.mesh.ndim:
         raise InputError(
             f"{path}: expected {loaded.mesh.ndim}-D labels like the mesh, got a {labels.ndim}-D "

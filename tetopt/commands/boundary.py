@@ -16,8 +16,8 @@ from tetopt.errors import InputError
 from tetopt.geometry.manifold import OUTSIDE_LABEL, LabelSurfaces, label_surfaces, surface_ridges
 from tetopt.geometry.surface import Surface, extract_surface
 from tetopt.geometry.topology import facets, largest_component
-from tetopt.io.surfaces import LABELLED_SUFFIXES, SurfaceCheck, checked_surface, save_surface
-from tetopt.job.events import note, violated, warning
+from tetopt.io.surfaces import LABELLED_SUFFIXES, SurfaceCheck, check_surface, save_surface
+from tetopt.job.events import note, report_violation, warning
 from tetopt.job.inputs import label_table, read_mesh
 from tetopt.job.options import LabelNamesOption, Option, SpaceOption
 from tetopt.measure.fidelity import FacetSurface, surface_areas
@@ -120,10 +120,10 @@ def _write_closed(
     if part.label is not None:
         chosen = _with_label(loaded, path, labels_named(part.label, names), names)
     else:
-        chosen = _chosen(loaded, path, part)
+        chosen = _structure_cells(loaded, path, part)
     surface = extract_surface(loaded.mesh.points, loaded.mesh.cells, chosen)
     save_surface(output, surface, path.name, part.space)
-    written = checked_surface(output)
+    written = check_surface(output)
     rows = [
         ("cells", str(len(chosen))),
         ("triangles", str(len(surface.triangles))),
@@ -140,7 +140,7 @@ def _write_closed(
         )
     is_sound = written.is_watertight and written.is_winding_consistent and written.volume > 0.0
     if not is_sound:
-        violated(f"{output}: not watertight according to trimesh; please report this")
+        report_violation(f"{output}: not watertight according to trimesh; please report this")
     measured = {
         "volume_mm3": written.volume,
         "area_mm2": written.area,
@@ -182,7 +182,7 @@ def _write_interfaces(
     surface = Surface(loaded.mesh.points[used], triangles.reshape(-1, 3), 0, 0.0)
     is_labelled = output.suffix.lower() in LABELLED_SUFFIXES
     save_surface(output, surface, path.name, part.space, of_triangle if is_labelled else None)
-    return _of_interfaces(output, surface, shown, names, checked_surface(output))
+    return _of_interfaces(output, surface, shown, names, check_surface(output))
 
 
 def _of_interfaces(
@@ -261,7 +261,7 @@ def _with_label(
     return cells
 
 
-def _chosen(loaded: MeshFile, path: Path, part: SurfacePart) -> NDArray[np.int64]:
+def _structure_cells(loaded: MeshFile, path: Path, part: SurfacePart) -> NDArray[np.int64]:
     """Return the numbers of the structure's cells."""
     if part.cell_set is not None:
         if part.cell_set not in loaded.sets.cells:

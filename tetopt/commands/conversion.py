@@ -20,14 +20,14 @@ from tetopt.io.abaqus import input_sets
 from tetopt.io.formats import format_of
 from tetopt.io.frd import read_frd
 from tetopt.io.images import sha256
-from tetopt.io.text import counted
+from tetopt.io.text import count_text
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.events import note, progress, warning, warnings_heard
-from tetopt.job.inputs import listed, read_mesh
+from tetopt.job.inputs import list_names, read_mesh
 from tetopt.job.model import (
     check_solver_options,
     choices_of,
-    converted_model,
+    convert_model,
     large_words,
     save_for_solver,
     with_chosen_sets,
@@ -141,7 +141,7 @@ def convert_file(
             name: rows for name, rows in loaded.cell_data.items() if name not in MATERIAL_FIELDS
         }
         loaded = loaded._replace(cell_data=kept)
-    model = with_chosen_sets(converted_model(loaded, voxels, solver, about, box), output, solver)
+    model = with_chosen_sets(convert_model(loaded, voxels, solver, about, box), output, solver)
     save_for_solver(output, model, solver)
     files = {"mesh": mesh.name, "output": output.name, "units": solver.units, "space": solver.space}
     files |= {} if results is None else {"results": results.name}
@@ -160,8 +160,8 @@ def _loads_of_file(loaded: MeshFile, choice: LabelChoice) -> list[str] | None:
     if choice == ALL_LABELS or not loads:
         return loads
     warning(
-        f"the file's loads were for all labels and are left out: {listed(loads)}; give those of "
-        "the rest (`load`)"
+        f"the file's loads were for all labels and are left out: {list_names(loads)}; give those "
+        "of the rest (`load`)"
     )
     return None
 
@@ -178,7 +178,7 @@ def _of_labels(loaded: MeshFile, choice: LabelChoice) -> MeshFile:
     is_kept = _without_crumbs(loaded.mesh, labels, np.isin(labels, kept))
     part = with_cells(loaded, labels, is_kept)
     left = [name for name in part.sets.facets if name.startswith(INTERFACE_PREFIX)]
-    more = f"; their interfaces are sets: {listed(left)}" if left else ""
+    more = f"; their interfaces are sets: {list_names(left)}" if left else ""
     note(f"labels left out: {len(part.mesh.cells)} of {len(labels)} cells stay{more}")
     rebuilt = {*standard_names(loaded.mesh.ndim), *label_set_names(present, names).values()}
     for what, before, after in zip(("facets", "cells"), loaded.sets, part.sets, strict=True):
@@ -213,7 +213,7 @@ def _without_crumbs(
         count, volume = int((share < SMALL_COMPONENT_FRACTION).sum()), float(volumes[crumbs].sum())
         words = f"less than {SMALL_COMPONENT_FRACTION:.0%} of any label, are left out with them"
         note(
-            f"{counted(count, 'component')} ({counted(len(crumbs), 'cell')}, {volume:.4g} "
+            f"{count_text(count, 'component')} ({count_text(len(crumbs), 'cell')}, {volume:.4g} "
             f"mm{mesh.ndim}), {words}"
         )
     is_kept = is_kept.copy()

@@ -18,7 +18,14 @@ from tetopt.energy.sampling import cell_moments
 from tetopt.errors import InputError
 from tetopt.geometry.check import check_mesh, manifold_problems, scaled_jacobians
 from tetopt.geometry.simplex import dihedral_angles
-from tetopt.job.advice import Problem, agreed, required_of, sentences, tell, unmet
+from tetopt.job.advice import (
+    Problem,
+    order_problems,
+    required_of,
+    sentences,
+    tell,
+    unmet_requirements,
+)
 from tetopt.job.events import warning
 from tetopt.job.inputs import label_table, read_companion, read_mesh, warn_of_other_image
 from tetopt.job.options import WHOLE_IMAGE, ImagePart, MaskedPart, SourceOptions
@@ -126,10 +133,10 @@ class Judgement(NamedTuple):
         if not self.is_checked:  # only what makes the numbers meaningless
             requirements = {name: each for name, each in requirements.items() if name == "mask"}
             measured = {}
-        problems += unmet(requirements, measured, self.mask_word)
+        problems += unmet_requirements(requirements, measured, self.mask_word)
         if self.is_checked and self.source is None:
             problems += self._recorded(("min_dihedral", *(name for name, _ in named)))
-        return agreed(
+        return order_problems(
             [
                 *problems,
                 *(Problem(f"{self.path}: {each}") for each in self.numbers.get("remarks", [])),
@@ -197,13 +204,13 @@ def judge(
             )
         has_mask = part.mask is not None or loaded.table("inputs").get("background") is not None
         judgement = judgement._replace(source=source, is_compared=has_mask)
-        judgement = _measured(judgement, label_table(label_names, loaded, labels).names)
+        judgement = _measure_fit(judgement, label_table(label_names, loaded, labels).names)
         numbers |= {**judgement.measured, "image": image.name, "fit": judgement.fit}
     elif check and loaded.mesh.ndim == 3:
         rows = {"min_dihedral": dihedral_angles(loaded.mesh.points, loaded.mesh.cells).min(axis=1)}
         judgement = judgement._replace(violated=judge_rows(rows, judgement.required))
     if check:
-        problems, remarks = _checked(judgement)
+        problems, remarks = _mesh_problems(judgement)
         numbers |= {"problems": problems, "remarks": remarks}
     if check or image is not None:
         numbers["violated"] = sentences(judgement.problems())
@@ -240,17 +247,17 @@ def _source(
             }
         )
     names = None if part.mask_label is None else names
-    numbers = None if labels is None else _merged(inputs, labels, part)
+    numbers = None if labels is None else _merged_numbers(inputs, labels, part)
     return read_source(
         options,
         names,
         numbers=numbers,
         loaded=loaded,
-        kept=None if labels is None else _kept(inputs),
+        kept=None if labels is None else _kept_labels(inputs),
     )
 
 
-def _kept(inputs: Mapping[str, Any]) -> list[int] | None:
+def _kept_labels(inputs: Mapping[str, Any]) -> list[int] | None:
     """Return the labels that the mesh's run kept, if it left out others."""
     kept = inputs.get("kept_labels")
     return (
@@ -260,7 +267,7 @@ def _kept(inputs: Mapping[str, Any]) -> list[int] | None:
     )
 
 
-def _merged(inputs: Mapping[str, Any], labels: Path, part: ImagePart) -> dict[int, int]:
+def _merged_numbers(inputs: Mapping[str, Any], labels: Path, part: ImagePart) -> dict[int, int]:
     """Return the numbers that the mesh's run gave to merged labels; none if the labels have them
     already.
     """
@@ -279,7 +286,7 @@ def _merged(inputs: Mapping[str, Any], labels: Path, part: ImagePart) -> dict[in
     )
 
 
-def _measured(judgement: Judgement, names: Mapping[int, str]) -> Judgement:
+def _measure_fit(judgement: Judgement, names: Mapping[int, str]) -> Judgement:
     """Measure the fit of the cells to the image, mask and labels, and judge it."""
     source, loaded = cast(Source, judgement.source), judgement.loaded
     mesh, of_cell = loaded.mesh, loaded.cell_data.get("label")
@@ -314,7 +321,7 @@ def _number(value: Any) -> float | None:
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
 
 
-def _checked(judgement: Judgement) -> tuple[list[str], list[str]]:
+def _mesh_problems(judgement: Judgement) -> tuple[list[str], list[str]]:
     """Return the problems of a mesh; without any, remarks that are no faults.
 
     Non-manifold interfaces of labels are remarks, but problems of a run that smoothed interfaces.

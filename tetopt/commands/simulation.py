@@ -18,7 +18,7 @@ from tetopt.job.events import warning, warnings_heard
 from tetopt.job.inputs import read_mesh
 from tetopt.job.model import (
     check_model_options,
-    converted_model,
+    convert_model,
     large_words,
     with_chosen_sets,
 )
@@ -89,7 +89,7 @@ def solve_file(
     _check_options(image, compress, model, part)
     task = _model(mesh, image, model, part, compress)
     of_box = image is not None and not model.loads
-    solutions, extremes = _solved(task, of_box if conditioning is None else conditioning)
+    solutions, extremes = _solve_steps(task, of_box if conditioning is None else conditioning)
     if output is not None:
         save_model(output, with_chosen_sets(_with_results(task, solutions), output, model))
     _advise(task, solutions)
@@ -125,7 +125,7 @@ def _check_options(
     check_model_options(model, has_materials=True)
 
 
-def _filled(
+def _fill_options(
     model: ModelOptions, loaded: MeshFile, image: Image | None, compress: float | None
 ) -> ModelOptions:
     """Return the options, completed from the mesh's file, or for an image's box from the paper's
@@ -174,13 +174,13 @@ def _model(
             _check_box(whole, loaded)
         box = box_of(whole)
     about |= {} if box is None else {"box": box_text(box)}
-    model = _filled(model, loaded, whole, compress)
-    return converted_model(
+    model = _fill_options(model, loaded, whole, compress)
+    return convert_model(
         loaded, voxels, model, about, box, has_units=model.young != INTENSITY_MAPPING
     )
 
 
-def _solved(model: Model, is_conditioned: bool) -> tuple[list[Solution], Conditioning | None]:
+def _solve_steps(model: Model, is_conditioned: bool) -> tuple[list[Solution], Conditioning | None]:
     """Solve each step, and compute the conditioning of the first if requested."""
     from tetopt.fem.conditioning import conditioning
     from tetopt.fem.solution import solve

@@ -17,12 +17,12 @@ import scipy
 from numpy.typing import NDArray
 
 from tetopt.contents.domain import INSIDE_FRACTION
-from tetopt.contents.labels import BACKGROUND_LABEL, checked_labels, warn_of_absent
+from tetopt.contents.labels import BACKGROUND_LABEL, check_labels, warn_of_absent
 from tetopt.contents.memberships import finer_affine
 from tetopt.contents.otsu import class_thresholds
 from tetopt.errors import InputError, warn
 from tetopt.geometry.box import box_sides
-from tetopt.image import Image, transformed
+from tetopt.image import Image, transform_vectors
 
 # two grids whose corners differ by no more are the same: headers hold single precision
 SAME_GRID_VOXELS = 1e-4
@@ -79,7 +79,7 @@ def resample_mask(mask: Image, image: Image, name: str = "mask") -> Image:
     """
     _check_axes(name, mask, image)
     inside = _mask_values(name, mask.data)
-    moved = _moved(Image(inside, mask.affine), image)
+    moved = _values_at(Image(inside, mask.affine), image)
     if not (moved >= INSIDE_FRACTION).any():
         if (in_box(image, mask).astype(bool) & (inside >= INSIDE_FRACTION)).any():
             raise InputError(
@@ -139,8 +139,8 @@ def resample_labels(
     ((16, 16, 16), [0.0, 1.0])
     """
     _check_axes(name, labels, image)
-    labels = checked_labels(name, labels, is_map=True)
-    moved = _moved(labels, image)
+    labels = check_labels(name, labels, is_map=True)
+    moved = _values_at(labels, image)
     if labels.data.max() == 0:
         raise InputError(
             f"{name}: expected labels above 0, got 0 in every voxel; is it the right file?"
@@ -173,7 +173,7 @@ def divisions(image: Image, others: Iterable[Image]) -> tuple[int, ...]:
     return tuple(int(k) for k in np.ceil(np.max(steps, axis=0) - COARSER_STEP))
 
 
-def divided(image: Image, factors: Sequence[int]) -> Image:
+def divide_voxels(image: Image, factors: Sequence[int]) -> Image:
     """Return the image on voxels divided by `factors` along the axes, each part with its voxel's
     value.
     """
@@ -265,7 +265,7 @@ def resample_contrast(other: Image, image: Image, name: str = "contrast") -> Ima
             f"{100 * fraction:.1f} %; "
             f"{_both_boxes(other, image)}"
         )
-    return Image(_resampled(other.data, other, image, 1, "nearest"), image.affine)
+    return Image(_resample(other.data, other, image, 1, "nearest"), image.affine)
 
 
 class Foreground(NamedTuple):
@@ -388,7 +388,7 @@ class FilledHoles(NamedTuple):
     around: NDArray[np.int64]  # (H,) the label that most of its faces touch
 
 
-def filled_holes(labels: Image, label: int) -> FilledHoles:
+def fill_holes(labels: Image, label: int) -> FilledHoles:
     """Give a label to the voxels of label 0 that no path through faces of such voxels connects
     to the box's sides.
     """
@@ -485,14 +485,14 @@ def _mask_values(name: str, data: NDArray[np.floating]) -> NDArray[np.float32]:
     return data.astype(np.float32)
 
 
-def _moved(other: Image, image: Image) -> NDArray[np.floating]:
+def _values_at(other: Image, image: Image) -> NDArray[np.floating]:
     """Values of `other` at the image's voxel centres: those of the voxels that contain them, 0
     outside.
     """
     return (
         other.data
         if is_same_grid(other, image)
-        else _resampled(other.data, other, image, 0, "grid-constant")
+        else _resample(other.data, other, image, 0, "grid-constant")
     )
 
 
@@ -525,10 +525,10 @@ def other_box(grid: Any, image: Image, tolerance: float = SAME_BOX_VOXELS) -> st
 
 def in_box(other: Image, image: Image) -> NDArray[np.uint8]:
     """1 at the image's voxel centres in the box of `other`, else 0, in the image's shape."""
-    return _resampled(np.ones(other.shape, dtype=np.uint8), other, image, 0, "grid-constant")
+    return _resample(np.ones(other.shape, dtype=np.uint8), other, image, 0, "grid-constant")
 
 
-def _resampled(data: NDArray, other: Image, image: Image, order: int, mode: str) -> NDArray:
+def _resample(data: NDArray, other: Image, image: Image, order: int, mode: str) -> NDArray:
     """`data`, on the grid of `other`, at the image's voxel centres.
 
     scipy's mode `grid-constant` fills a grid's outer half voxels from their own voxels; `constant`
@@ -558,7 +558,7 @@ def _both_boxes(other: Image, image: Image) -> str:
 
 
 def _world_corners(grid: Any) -> NDArray[np.float64]:
-    return transformed(_corners(grid), grid.affine[:-1, :-1]) + grid.affine[:-1, -1]
+    return transform_vectors(_corners(grid), grid.affine[:-1, :-1]) + grid.affine[:-1, -1]
 
 
 def _extent(grid: Any) -> str:

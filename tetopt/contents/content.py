@@ -17,13 +17,13 @@ import scipy
 from numpy.typing import NDArray
 
 from tetopt.contents.domain import INSIDE_FRACTION, Region, region_of
-from tetopt.contents.labels import BACKGROUND_LABEL, checked_labels, label_channels, warn_of_absent
+from tetopt.contents.labels import BACKGROUND_LABEL, check_labels, label_channels, warn_of_absent
 from tetopt.contents.memberships import (
     Memberships,
     finer,
     memberships,
     memberships_of,
-    numbered,
+    number_labels,
     supersampling,
 )
 from tetopt.contents.noise import noise_level
@@ -89,7 +89,7 @@ class Content(NamedTuple):
     region : Region or None
         The region to cover; None for the image's box.
     continuation : Continuation, optional
-        Continuation beyond the region's mask; see `tetopt.contents.content.continued`.
+        Continuation beyond the region's mask; see `tetopt.contents.content.continue_image`.
     smooth : SmoothLabels, optional
         Labels with smooth interfaces.
     keeps_components : bool
@@ -139,7 +139,7 @@ class Content(NamedTuple):
         """The first contrast on its own voxels, continued beyond the mask, around which alone
         voxels are kept.
         """
-        return continued(self.given, None if self.whole is None else self.continuation)
+        return continue_image(self.given, None if self.whole is None else self.continuation)
 
     @property
     def own_mask(self) -> Image | None:
@@ -245,9 +245,11 @@ class Content(NamedTuple):
     @property
     def noise(self) -> float:
         """Variance of the contrasts' noise, in the unit of the channels; labels have none."""
-        inside = None if self.inside is None else undivided(self, self.inside)
+        inside = None if self.inside is None else undivide_voxels(self, self.inside)
         contrasts = map(self.channel, range(self.n_contrasts))
-        return float(sum(noise_level(undivided(self, values), inside) ** 2 for values in contrasts))
+        return float(
+            sum(noise_level(undivide_voxels(self, values), inside) ** 2 for values in contrasts)
+        )
 
 
 def content(
@@ -319,7 +321,7 @@ def content(
     images = [images] if isinstance(images, Image) else list(images)
     weights = [1.0] * len(images) if weights is None else [float(w) for w in weights]
     _check(images, {"labels": labels, "mask": mask}, weights, label_weight)
-    labels = None if labels is None else checked_labels("labels", labels, is_map=True)
+    labels = None if labels is None else check_labels("labels", labels, is_map=True)
     whole = images[0]
     images, labels, region, beyond = _within_mask(images, labels, mask)
     result = Content(
@@ -334,7 +336,7 @@ def content(
     members, n_rows = None, 0
     rows: NDArray[np.integer] = np.empty(0, dtype=np.int16)
     if labels is not None and label_weight > 0.0:
-        factors, (present, rows) = supersampling(labels.spacing), numbered(labels)
+        factors, (present, rows) = supersampling(labels.spacing), number_labels(labels)
         labels, n_rows = None, len(present)  # its memory is needed
         if smooth_interfaces:
             members = memberships_of(present, rows, factors)
@@ -342,7 +344,7 @@ def content(
             if max(factors) > 1:
                 images = [finer(image, factors) for image in images]
                 region = None if region is None else _finer_region(region, factors)
-    contrasts = _scaled(images, weights, region)
+    contrasts = _scale_contrasts(images, weights, region)
     codes = np.zeros((0, 1))
     if n_rows > 0:
         rows, codes = _one_hot(rows, n_rows, region)
@@ -381,10 +383,10 @@ def _within_mask(
     if mask is not None:
         beyond = continuation(mask, whole.spacing)
         region = region_of(_part(mask, beyond.part))
-        images = [continued(image, beyond) for image in images]
+        images = [continue_image(image, beyond) for image in images]
         if labels is not None:
             warn_of_absent("", labels, mask.data >= INSIDE_FRACTION, "mask")
-            labels = images[0] if labels is whole else continued(labels, beyond)
+            labels = images[0] if labels is whole else continue_image(labels, beyond)
     if labels is not None and labels.data.max() == BACKGROUND_LABEL:
         where = "" if mask is None else " in the meshed region"
         raise InputError(
@@ -405,7 +407,7 @@ def _finer_region(region: Region, factors: Sequence[int]) -> Region:
     return Region(sides.partition == 1, (0.5 * (within - outside)).astype(np.float32))
 
 
-def _scaled(
+def _scale_contrasts(
     images: list[Image], weights: list[float], region: Region | None
 ) -> list[NDArray[np.float32]]:
     """The contrasts of weight above 0, minus their means and scaled to variance `weight`."""
@@ -448,7 +450,7 @@ def _whole_numbers(
     return values, np.rint(scale * codes).astype(np.int32), scale
 
 
-def undivided(what: Content, values: NDArray) -> NDArray:
+def undivide_voxels(what: Content, values: NDArray) -> NDArray:
     """Return one of each group of voxels that repeat one of the image's file."""
     return values[tuple(slice(None, None, factor) for factor in what.repeats)]
 
@@ -507,7 +509,7 @@ def continuation(mask: Image, spacing: NDArray[np.float64]) -> Continuation:
     return Continuation(part, inside, flat.astype(np.int32 if inside.size < 2**31 else np.int64))
 
 
-def continued(image: Image, mask: Image | Continuation | None) -> Image:
+def continue_image(image: Image, mask: Image | Continuation | None) -> Image:
     """Continue an image beyond a mask with the nearest value inside, as cells at the boundary
     represent the inside.
 

@@ -55,14 +55,14 @@ def region_of(mask: Image) -> Region:
             where=np.abs(level) < 1.0,
         )
     else:
-        level = _smoothed(inside)
+        level = _smooth_level(inside)
     np.clip(level, -FARTHEST_LEVEL, FARTHEST_LEVEL, out=level)
     farther = scipy.ndimage.distance_transform_cdt(np.abs(level) >= FARTHEST_LEVEL)
     level += np.copysign(farther, level, dtype=np.float32)
     return Region(inside, level)
 
 
-def _smoothed(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
+def _smooth_level(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
     """The smooth level of a mask, but the raw one around sheets and gaps of one voxel, which
     smoothing would tear.
     """
@@ -70,12 +70,12 @@ def _smoothed(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
     level = smooth_level(wide, wide, None, (1,))
     is_single = np.zeros(wide.shape, dtype=bool)
     for side in (wide, ~wide):
-        is_single |= side & ~largest_around(_opened(side), 1)
+        is_single |= side & ~largest_around(_open_mask(side), 1)
     part = (slice(BEYOND_VOXELS, -BEYOND_VOXELS),) * inside.ndim
     return np.where(largest_around(is_single, 1)[part], raw_level(inside), level[part])
 
 
-def _opened(inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _open_mask(inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Voxels in cubes of two voxels a side that are inside: a tenth of the time of
     `scipy.ndimage.binary_opening`.
     """

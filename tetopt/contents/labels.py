@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tetopt.contents.smoothing import largest_around
 from tetopt.errors import InputError, warn
-from tetopt.image import Image, transformed
+from tetopt.image import Image, transform_vectors
 from tetopt.system.kernel_cache import njit
 
 # largest signed 32-bit integer, the widest type of labels in most programs
@@ -82,7 +82,7 @@ COMPONENT_VOXELS = 50  # a face-connected component of a label or mask of as man
 BACKGROUND_COLOUR = "#e6e6e6"  # of that label
 
 
-def checked_labels(name: str, labels: Image, *, is_map: bool = False) -> Image:
+def check_labels(name: str, labels: Image, *, is_map: bool = False) -> Image:
     """Return labels as whole numbers from 0 to `LARGEST_LABEL`; round values within 1e-3 of these,
     with a warning.
 
@@ -218,7 +218,7 @@ def voxel_components(
     middle = sums / sizes[:, None]
     order = np.lexsort((((index - middle[of_voxel]) ** 2).sum(axis=1), of_voxel, -sizes[of_voxel]))
     near = order[np.sort(np.unique(of_voxel[order], return_index=True)[1])]  # the first of each
-    places = transformed(index[near] + start, affine[:-1, :-1]) + affine[:-1, -1]
+    places = transform_vectors(index[near] + start, affine[:-1, :-1]) + affine[:-1, -1]
     rows = zip(sizes[of_voxel[near]].tolist(), places.tolist(), strict=True)
     return n_components, tuple(LostComponent(size, tuple(place)) for size, place in rows)
 

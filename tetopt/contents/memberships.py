@@ -19,7 +19,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from tetopt.contents.labels import checked_labels, label_channels
+from tetopt.contents.labels import check_labels, label_channels
 from tetopt.contents.smoothing import (
     FARTHEST_DISTANCE,
     FARTHEST_LEVEL,
@@ -116,11 +116,11 @@ def memberships(labels: Image, factors: Sequence[int] | None = None) -> Membersh
         Labels that are not whole numbers from 0.
     """
     return memberships_of(
-        *numbered(checked_labels("labels", labels)), tuple(factors or (1,) * labels.ndim)
+        *number_labels(check_labels("labels", labels)), tuple(factors or (1,) * labels.ndim)
     )
 
 
-def numbered(labels: Image) -> tuple[NDArray[np.int64], NDArray[np.integer]]:
+def number_labels(labels: Image) -> tuple[NDArray[np.int64], NDArray[np.integer]]:
     """Labels present, (K,), ascending, and the number of each voxel's among them; 16 bits if
     (K+1)^2 fits.
     """
@@ -163,7 +163,7 @@ def memberships_of(
             factors,
         )
 
-    members = gathered(values, start, level_in, prod(factors))
+    members = gather_levels(values, start, level_in, prod(factors))
     if off is not None and off.any():
         _merge_crumbs(members.levels, members.partition, members.channel, off == 0.0)
     elif len(values) > 2:
@@ -243,7 +243,7 @@ def _missing_depth(
     return lacking / area if area and abs(lacking) > AGREEMENT_FRACTION * is_own.sum() else 0.0
 
 
-def gathered(
+def gather_levels(
     values: NDArray[np.int64],
     start: NDArray[np.integer],
     level_in: Callable[[int, tuple[slice, ...]], NDArray[np.float32]],
@@ -464,20 +464,20 @@ def _between_slices(
             for s, n in zip(box, number.shape, strict=True)
         )
         fine = tuple(slice(s.start * f, s.stop * f) for s, f in zip(margin, divided, strict=True))
-        level = _interpolated(number[margin] == row, axis, factors[axis], length)
+        level = _interpolate_level(number[margin] == row, axis, factors[axis], length)
         least = smallest[fine]
         partition[fine][level < least] = row
         np.minimum(least, level, out=least)
     return partition
 
 
-def _interpolated(
+def _interpolate_level(
     inside: NDArray[np.bool_], axis: int, factor: int, length: Sequence[float]
 ) -> NDArray[np.float32]:
     """A label's level on slices divided along one axis."""
     inside = np.moveaxis(inside, axis, 0)
     length = [length[axis], *length[:axis], *length[axis + 1 :]]
-    level, deepest = _outlined(inside, length)
+    level, deepest = _outline_distance(inside, length)
     fine = np.repeat(level, factor, axis=0)
     middle = factor // 2
     for k in range(len(level) - 1):
@@ -502,7 +502,7 @@ def _rest(level: NDArray[np.float32], deepest: NDArray[np.float32], k: int) -> N
     return deepest[k] * (2.0 * np.sqrt(fraction / (2.0 - fraction)) - fraction)
 
 
-def _outlined(
+def _outline_distance(
     inside: NDArray[np.bool_], length: Sequence[float]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Signed distance to the outline within each slice, and the largest in each voxel's

@@ -47,7 +47,7 @@ def noise_planes(inside: NDArray[np.bool_]) -> NDArray[np.int64]:
     voxel is surrounded.
     """
     middles = noise_places(inside.shape)[1]
-    if len(middles) == 0 or _surrounded(_near(inside, middles)).any():
+    if len(middles) == 0 or _surrounded_voxels(_near(inside, middles)).any():
         return middles
     within = scipy.ndimage.minimum_filter(inside, size=3)[(slice(1, -1),) * inside.ndim]
     counts = within.sum(axis=tuple(range(1, inside.ndim)))
@@ -80,7 +80,7 @@ def _near(data: NDArray, middles: NDArray[np.int64]) -> NDArray:
     return np.stack([data[middles + k] for k in (-1, 0, 1)])
 
 
-def _surrounded(near: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _surrounded_voxels(near: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Voxels of the middle planes, but for those at their borders, with all neighbours inside,
     (P, ...).
     """
@@ -107,7 +107,7 @@ def sampled_noise(sample: NoiseSample, inside: NDArray[np.bool_] | None = None) 
     n_voxels = rest.size
     if inside is not None:
         n_voxels = int(inside[1].sum())
-        is_counted &= _surrounded(inside)
+        is_counted &= _surrounded_voxels(inside)
     size = np.abs(rest[is_counted])
     if np.count_nonzero(size) < 0.1 * n_voxels:
         return 0.0

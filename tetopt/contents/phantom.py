@@ -50,7 +50,7 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from tetopt.errors import InputError
-from tetopt.image import SINGULAR_DETERMINANT, Image, transformed
+from tetopt.image import SINGULAR_DETERMINANT, Image, transform_vectors
 from tetopt.system.budget import check_memory
 from tetopt.system.incoming import toml_of
 
@@ -697,7 +697,7 @@ def _voxel_centers(
         index = _index_block([b - a for a, b in zip(corner, ends, strict=True)]) + corner
         yield (
             tuple(map(slice, corner, ends)),
-            transformed(index, affine[:-1, :-1]) + affine[:-1, -1],
+            transform_vectors(index, affine[:-1, :-1]) + affine[:-1, -1],
         )
 
 

@@ -82,7 +82,7 @@ def smooth_level(
     off = np.zeros((0, 0, 0), dtype=np.float32) if off is None else off.reshape(whole)
     sigma = max(VOLUME_SIGMA, *factors)
     for _ in range(FLOW_STEPS):
-        level = _stepped(level, reach, n)
+        level = _step_flow(level, reach, n)
         _keep_volume(level, raw, sigma, square, off, n)
     # once more, between voxel centres: walls of two voxels would be 2 % too thick
     if max(factors) == 1:
@@ -145,19 +145,19 @@ def largest_around(values: NDArray, reach: int) -> NDArray:
     return np.ascontiguousarray(values)
 
 
-def _stepped(level: NDArray[np.float32], reach: NDArray[np.uint8], n: int) -> NDArray[np.float32]:
+def _step_flow(level: NDArray[np.float32], reach: NDArray[np.uint8], n: int) -> NDArray[np.float32]:
     """A step of the flow, with the broad Gaussian where nothing within `reach` is thin; the
     level is overwritten.
     """
     is_broad = BROAD_FRACTIONS[reach.max()] > 0.0
-    broad = _flowed(level, BROAD_SIGMA, n, np.empty_like(level)) if is_broad else None
-    smooth = _flowed(level, FINE_SIGMA, n, level)
+    broad = _flow_level(level, BROAD_SIGMA, n, np.empty_like(level)) if is_broad else None
+    smooth = _flow_level(level, FINE_SIGMA, n, level)
     if broad is not None:
         _blend(smooth, broad, reach)
     return smooth
 
 
-def _flowed(
+def _flow_level(
     level: NDArray[np.float32], sigma: float, n: int, rest: NDArray[np.float32]
 ) -> NDArray[np.float32]:
     """2 G - G^2 of a level (s_0, s_1, s_2), for the Gaussian G along its last n axes; `rest`
@@ -288,7 +288,7 @@ def _keep_volume(
     over_slabs(fill_sums, blocks[0], level.size)
     both = np.stack([missing, area]).reshape(2, *blocks[3 - n :])
     missing, area = np.concatenate(
-        over_slabs(lambda a, b: _blurred(both[a:b], sigma), 2, level.size, 2)
+        over_slabs(lambda a, b: _blur_sums(both[a:b], sigma), 2, level.size, 2)
     )
     lowered = np.where(
         area > 0.01 * VOLUME_BLOCK**n, missing / np.maximum(area, 1e-3), np.float32(0.0)
@@ -299,7 +299,7 @@ def _keep_volume(
     )
 
 
-def _blurred(sums: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
+def _blur_sums(sums: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
     """Fields of sums over blocks, (F, *shape), smoothed by a Gaussian of `sigma` voxels."""
     sigmas = [0.0] + [sigma / VOLUME_BLOCK] * (sums.ndim - 1)
     return scipy.ndimage.gaussian_filter(sums, sigmas, mode="constant", truncate=3.0)

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.contents.memberships import Memberships
-from tetopt.geometry.vectors import cross, dot, minus, row, scaled
+from tetopt.geometry.vectors import cross, dot, minus, row, scale_vector
 from tetopt.system.budget import check_memory
 from tetopt.system.kernel_cache import njit
 from tetopt.system.slabs import over_slabs
@@ -517,7 +517,7 @@ def _fill_crossings(
                         if height * rise[s] > 0.0 or abs(height) > abs(rise[s]) or rise[s] == 0.0:
                             continue
                         t = -height / rise[s]
-                        if _is_within(minus(place, scaled(-t, row(ways, s))), u, v):
+                        if _is_within(minus(place, scale_vector(-t, row(ways, s))), u, v):
                             part = COSINE_STEPS * int((COSINE_STEPS - 2) * t + 0.5)
                             part += int(
                                 (COSINE_STEPS - 1) * min(abs(rise[s]) / (size * lengths[s]), 1.0)

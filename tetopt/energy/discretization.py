@@ -77,7 +77,7 @@ def E_D(image: Image, mesh: Mesh) -> float:
     return float(cell_E_D(image, mesh).sum())
 
 
-def unexplained(content: Content, mesh: Mesh) -> float | None:
+def unexplained_variance(content: Content, mesh: Mesh) -> float | None:
     """Return the unexplained variance: the fraction of the variance of the voxels in cells that is
     left within cells.
 
@@ -137,7 +137,7 @@ def content_E_D(content: Content, mesh: Mesh) -> tuple[float, int]:
     return squares * content.unit * content.image.voxel_volume, int(sums[:, 0].sum())
 
 
-def combined(E_G: float, E_D: float, E_G0: float, E_D0: float, k_D: float) -> float:
+def combine_energies(E_G: float, E_D: float, E_G0: float, E_D0: float, k_D: float) -> float:
     """E = (1 - k_D) E_G / E_G0 + k_D E_D / E_D0, Eq. (4) normalised by the initial mesh as in
     Section 4.
 

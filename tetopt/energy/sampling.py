@@ -62,7 +62,7 @@ from tetopt.system.slabs import over_slabs
 # voxels: between its ends, the error of an edge's cut is far below the remainder to 0.5
 EDGE_MARGIN = 0.5 - 1e-9
 SUM_BYTES = 12.0  # per prefix sum and voxel: 8, and temporary arrays
-ONE_CELL = 1 << 40  # counts one cell in sums of cell numbers from 1; see `_visited`
+ONE_CELL = 1 << 40  # counts one cell in sums of cell numbers from 1; see `_visit_voxels`
 OWNER_SLABS = 2  # per thread, in finding the cell of each voxel: each slab looks for its facets
 CELLS_PER_CHUNK = 64  # cells, facets or nodes that a parallel task handles at once
 
@@ -129,7 +129,7 @@ def cell_moments(image: Image, mesh: Mesh) -> CellMoments:
     >>> float(moments.mean.min()), float(moments.mean.max())
     (20.0, 100.0)
     """
-    return _moments(image, mesh, _sampled(image, mesh))
+    return _moments(image, mesh, _sample_cells(image, mesh))
 
 
 def cell_moments_and_ranges(
@@ -138,7 +138,7 @@ def cell_moments_and_ranges(
     """`cell_moments`, and the least and greatest intensity in each cell, (M,) each; in a cell
     without voxel centre the nearest voxel's.
     """
-    sampled = _sampled(image, mesh)
+    sampled = _sample_cells(image, mesh)
     return _moments(image, mesh, sampled), _ranges(image, mesh, sampled)
 
 
@@ -150,12 +150,12 @@ class _Sampled(NamedTuple):
     sides: Facets
 
 
-def _sampled(image: Image, mesh: Mesh) -> _Sampled:
+def _sample_cells(image: Image, mesh: Mesh) -> _Sampled:
     return _on_grid(image, mesh, sampling_grid(image, mesh.points))
 
 
-def _placed(image: Image, mesh: Mesh) -> _Sampled:
-    """Like `_sampled`, but without values: only the places of cells."""
+def _place_cells(image: Image, mesh: Mesh) -> _Sampled:
+    """Like `_sample_cells`, but without values: only the places of cells."""
     shape = (1,) * (3 - image.ndim) + image.shape
     return _on_grid(
         image,
@@ -214,7 +214,7 @@ def cell_of_voxel(image: Image, mesh: Mesh) -> NDArray[np.int64]:
     >>> painted.shape
     (16, 16, 16)
     """
-    return _visited(mesh, _placed(image, mesh)).owner.reshape(image.shape)
+    return _visit_voxels(mesh, _place_cells(image, mesh)).owner.reshape(image.shape)
 
 
 class Overlap(NamedTuple):
@@ -241,7 +241,7 @@ def overlap_of(image: Image, mesh: Mesh) -> Overlap | None:
     InputError
         As for `cell_moments`.
     """
-    n_voxels, *rest = _visited(mesh, _placed(image, mesh)).shared.tolist()
+    n_voxels, *rest = _visit_voxels(mesh, _place_cells(image, mesh)).shared.tolist()
     voxel, cells = rest[3 - image.ndim : 3], rest[3:]
     return Overlap(n_voxels, tuple(voxel), (min(cells), max(cells))) if n_voxels else None
 
@@ -257,7 +257,7 @@ class _Visited(NamedTuple):
     shared: NDArray[np.int64]
 
 
-def _visited(mesh: Mesh, sampled: _Sampled, h: NDArray[np.floating] | None = None) -> _Visited:
+def _visit_voxels(mesh: Mesh, sampled: _Sampled, h: NDArray[np.floating] | None = None) -> _Visited:
     """Find the voxels of each cell, and the range of their intensities `h`, by default 0."""
     grid, ticks, sides = sampled
     n_cells, hand = len(mesh.cells), _hand(ticks, mesh.cells)
@@ -325,7 +325,7 @@ def _volume_of(
 def _ranges(
     image: Image, mesh: Mesh, sampled: _Sampled
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    _, low, high, _ = _visited(mesh, sampled, image.data)
+    _, low, high, _ = _visit_voxels(mesh, sampled, image.data)
     is_empty = low > high
     low[is_empty] = high[is_empty] = nearest_values(
         image, mesh.points[mesh.cells[is_empty]].mean(axis=1)

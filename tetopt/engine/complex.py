@@ -19,7 +19,16 @@ from numpy.typing import NDArray
 
 from tetopt.energy.sampling import CELLS_PER_CHUNK, Volume, few_threads
 from tetopt.energy.sampling import put_flux as sampled_flux
-from tetopt.geometry.vectors import cross, difference, dot, minus, over, put_row, scaled, times
+from tetopt.geometry.vectors import (
+    cross,
+    difference,
+    dot,
+    minus,
+    over,
+    put_row,
+    scale_vector,
+    times,
+)
 from tetopt.system.kernels import (
     Bools2,
     Floats1,
@@ -32,7 +41,7 @@ from tetopt.system.kernels import (
     entry,
     helper,
     inlined,
-    packed,
+    pack_record,
     run,
     unit,
 )
@@ -157,18 +166,18 @@ def remeasure(state: State) -> None:
     with few_threads(int(state.complex.n_cells[0]) * 4):
         n_chunks, laid_out = (
             (int(state.complex.n_cells[0]) + CELLS_PER_CHUNK - 1) // CELLS_PER_CHUNK,
-            packed(state),
+            pack_record(state),
         )
         run(_measure_cells, n_chunks, laid_out)
         run(_sum_cells, n_chunks, laid_out)
 
 
-def copied(state: State) -> State:
+def copy_state(state: State) -> State:
     """Copy the state, with a complex in separate arrays."""
     return state._replace(complex=Complex._make(array.copy() for array in state.complex))
 
 
-def grown(state: State, least: int = 64) -> State:
+def grow_state(state: State, least: int = 64) -> State:
     """The state with space for a quarter more cells, and at least `least`."""
     more = int(state.complex.n_cells[0]) // 4 + least
 
@@ -420,14 +429,18 @@ def load(x: NDArray, row: int, ticks: NDArray, node: int, base: int, objective: 
     exact, in integers.
     """
     put_row(
-        x, row, times(objective.matrix, scaled(2.0**-objective.bits, difference(ticks, node, base)))
+        x,
+        row,
+        times(objective.matrix, scale_vector(2.0**-objective.bits, difference(ticks, node, base))),
     )
 
 
 @helper
 def place(ticks: NDArray, node: int, base: int, objective: Objective) -> tuple:
     """A node's position relative to the node `base`, mm, as `load` writes it."""
-    return times(objective.matrix, scaled(2.0**-objective.bits, difference(ticks, node, base)))
+    return times(
+        objective.matrix, scale_vector(2.0**-objective.bits, difference(ticks, node, base))
+    )
 
 
 @helper
@@ -504,7 +517,7 @@ def _face_normal(x: NDArray, k: int) -> tuple:
     """An outward normal of the face opposite a corner of a tetrahedron."""
     a, b, c = (k + 1) & 3, (k + 2) & 3, (k + 3) & 3
     # (k+1, k+2, k+3) faces outwards for even k of a positive cell, inwards for odd k.
-    return scaled(-1.0 if k & 1 else 1.0, cross(difference(x, b, a), difference(x, c, a)))
+    return scale_vector(-1.0 if k & 1 else 1.0, cross(difference(x, b, a), difference(x, c, a)))
 
 
 @entry

@@ -81,7 +81,7 @@ class _Surfaces(NamedTuple):
     edges: NDArray[np.int64]  # (K,) whose
 
 
-def curved(
+def curve_mesh(
     mesh: Mesh, content: Content, labels: NDArray[np.int64] | None
 ) -> tuple[Mesh, Curving | None]:
     """Add midpoints to the mesh; those of edges on interfaces and on the mask's surface lie on the
@@ -116,7 +116,7 @@ def curved(
     ends = edges[surfaces.edges]
     is_on = np.any(np.all(is_on_sides(index, box_sides(content.image.shape))[ends], axis=1), axis=2)
     middle = index[ends].mean(axis=1)
-    at, is_found = _brought(
+    at, is_found = _bring_places(
         surfaces, middle, _ways(content.image)[is_on @ (1 << np.arange(mesh.ndim))]
     )
     for end in ends.T:
@@ -128,7 +128,7 @@ def curved(
     ways[surfaces.edges[is_found]] = off[is_found]
     part = np.zeros(len(edges))
     part[surfaces.edges[is_found]] = 1.0
-    midpoints, least = _unfolded(mesh, edges, number, ways, part)
+    midpoints, least = _unfold_midpoints(mesh, edges, number, ways, part)
     n_curved, n_on_level = int((part > 0.0).sum()), int((part == 1.0).sum())
     farthest = float(np.linalg.norm(part[:, None] * ways, axis=1).max(initial=0.0))
     curving = Curving(
@@ -198,7 +198,7 @@ def _values(surfaces: _Surfaces, at: NDArray[np.float64]) -> NDArray[np.float64]
     return values
 
 
-def _brought(
+def _bring_places(
     surfaces: _Surfaces, start: NDArray[np.float64], ways: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Places (K, n) moved from `start` to where their pairs of levels are equal, and a mask of
@@ -233,7 +233,7 @@ def _brought(
     return at, np.all(np.abs(_values(surfaces, at)) < tolerance[:, None], axis=1)
 
 
-def _unfolded(
+def _unfold_midpoints(
     mesh: Mesh,
     edges: NDArray[np.int64],
     number: NDArray[np.int64],

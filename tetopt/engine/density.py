@@ -32,7 +32,7 @@ from tetopt.engine.complex import (
     cosine_up_to_limit,
     energies,
     facet_of,
-    grown,
+    grow_state,
     has_node,
     image_energy,
     is_interface,
@@ -81,7 +81,7 @@ from tetopt.system.kernels import (
     Ints2,
     entry,
     helper,
-    packed,
+    pack_record,
     run,
     unit,
 )
@@ -176,7 +176,7 @@ def exchange(state: State, n_nodes: int, most: int, limits: Limits) -> Exchanged
     n_split, n_collapsed = make_exchanges(
         state, stars, splits, collapses, in_, out, (more, most, least), is_dirty
     )
-    return compacted(state, is_dirty, n_before, n_split, n_collapsed)
+    return compact_state(state, is_dirty, n_before, n_split, n_collapsed)
 
 
 def too_long(state: State, target: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -224,7 +224,7 @@ def roomy(state: State, n_nodes: int, n_cells: int) -> State:
     nodes yet.
     """
     if len(state.complex.cells) - state.complex.n_cells[0] < n_cells:
-        state = grown(state, n_cells)
+        state = grow_state(state, n_cells)
     ticks = np.concatenate([state.complex.ticks, np.zeros((n_nodes, 3), dtype=np.int64)])
     is_frozen = np.concatenate([state.complex.is_frozen, np.zeros((n_nodes, 4), dtype=np.bool_)])
     meeting = np.concatenate([state.complex.meeting, np.full((n_nodes, 4), -1, dtype=np.int64)])
@@ -238,7 +238,7 @@ def roomy(state: State, n_nodes: int, n_cells: int) -> State:
     return state._replace(complex=complex_)
 
 
-def compacted(
+def compact_state(
     state: State,
     is_dirty: NDArray[np.bool_] | None = None,
     n_before: int | None = None,
@@ -464,7 +464,7 @@ def mend(state: State, bad: NDArray[np.int64], target: float) -> Exchanged:
     state = roomy(state, len(bad), 16 * len(bad))
     is_dirty = np.zeros(len(state.complex.cells), dtype=np.bool_)
     n_split, n_collapsed = _mend(state, stars, bad, target, is_dirty)
-    return compacted(state, is_dirty, n_before, n_split, n_collapsed)
+    return compact_state(state, is_dirty, n_before, n_split, n_collapsed)
 
 
 @entry
@@ -804,7 +804,7 @@ def best_collapses(
     """The neighbour to which each allowed node is best joined, so that no flat cell remains."""
     n_nodes = len(may_collapse)
     moves = EdgeMoves(may_collapse, np.full(n_nodes, -1, dtype=np.int64), np.full(n_nodes, -np.inf))
-    laid_out = packed(state), packed(stars), packed(groups)
+    laid_out = pack_record(state), pack_record(stars), pack_record(groups)
     for chosen in colours_of(state, stars, groups):
         with few_threads(len(chosen) * 10_000):
             run(_fill_collapses, len(chosen), Collapses(moves, *laid_out, chosen, limits))

@@ -26,12 +26,12 @@ from tetopt.energy.sampling import cell_of_voxel, channel_grid, from_ticks
 from tetopt.engine.complex import (
     NodeStars,
     State,
-    copied,
+    copy_state,
     node_stars,
     remeasure,
     without_cells,
 )
-from tetopt.engine.density import Limits, compacted, exchange
+from tetopt.engine.density import Limits, compact_state, exchange
 from tetopt.engine.flips import _evaluate_cells, _evaluate_triangles, flip
 from tetopt.engine.interfaces import mend_pinches, with_labels
 from tetopt.engine.labelling import LabelVoxels, label_voxels
@@ -56,10 +56,10 @@ from tetopt.engine.surface import _fill_offsets, fill_offsets
 from tetopt.errors import InputError
 from tetopt.geometry.manifold import OUTSIDE_LABEL
 from tetopt.geometry.simplex import regular_edge, volumes
-from tetopt.image import Image, transformed
+from tetopt.image import Image, transform_vectors
 from tetopt.interop.notebook import with_bar
 from tetopt.mesh import Mesh
-from tetopt.start.carve import carved
+from tetopt.start.carve import carve_mesh
 from tetopt.start.lattice import lattice_mesh
 from tetopt.start.sizes import Sizes
 from tetopt.system.kernels import link, roots
@@ -210,7 +210,7 @@ def optimize(
         sizes,
         carves=boundary != "fixed",
     )
-    history, ended = followed(run, course, is_over, begin, callback, keep)
+    history, ended = follow_course(run, course, is_over, begin, callback, keep)
     if content.memberships is not None and not run.has_labels:  # too few iterations, or k_D is 0
         run.give_labels()
         run.mend_surfaces(False, min_dihedral)
@@ -236,7 +236,7 @@ class Course(NamedTuple):
     carves: bool = False  # True if the last iteration removes cells at pinches of a mask's boundary
 
 
-def followed(
+def follow_course(
     run: Run,
     course: Course,
     is_over: Callable[[], bool],
@@ -460,7 +460,7 @@ class Run:
     def _moved(self, since: NDArray[np.int64], fraction: float) -> NDArray[np.bool_]:
         """Nodes more than a fraction of an edge away from `since`, which is updated for them."""
         matrix = self.state.objective.matrix
-        way = transformed(
+        way = transform_vectors(
             (self.state.complex.ticks - since).astype(np.float64), matrix * 2.0**-self.grid.bits
         )
         moved: NDArray[np.bool_] = (way**2).sum(axis=1) > (fraction * self.edge) ** 2
@@ -595,7 +595,7 @@ class Run:
         than may be removed (none, unless it `carves`). Then it is undone, and cells stay below the
         minimum dihedral angle.
         """
-        before = self.state if self.content.region is None else copied(self.state)
+        before = self.state if self.content.region is None else copy_state(self.state)
         made = repair(self.state, degrees, is_late)
         if self.content.region is not None:
             n_over = int(self._overlapping(made.state).sum())
@@ -624,7 +624,7 @@ class Run:
                 if is_flat.sum() <= self.most_gone:
                     n_gone += self._take_out(is_flat)
             keeps, members = self.content.keeps_components, self.content.memberships
-            kept = carved(self.mesh(), self.image, self.content.region, keeps, members)
+            kept = carve_mesh(self.mesh(), self.image, self.content.region, keeps, members)
             n_gone, self.n_dropped = (
                 n_gone + self._take_out(~kept.is_kept),
                 self.n_dropped + kept.n_dropped,
@@ -643,7 +643,7 @@ class Run:
 
     def _take_out(self, is_gone: NDArray[np.bool_]) -> int:
         if is_gone.any():
-            made = compacted(without_cells(self.state, is_gone))
+            made = compact_state(without_cells(self.state, is_gone))
             self._renumber(made.state, made.source)
         return int(is_gone.sum())
 

@@ -29,7 +29,7 @@ from tetopt.engine.complex import (
     cell_energy,
     corner_of,
     facet_of,
-    grown,
+    grow_state,
     image_energy,
     is_interface,
     load,
@@ -135,7 +135,7 @@ def flip(
     n_moves = 0
     for _ in range(passes):
         if len(dirty) - n_cells < n_cells // 8 + 32:
-            state = grown(state)
+            state = grow_state(state)
             dirty = np.concatenate(
                 [dirty, np.zeros(len(state.complex.cells) - len(dirty), dtype=np.bool_)]
             )

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from tetopt.contents.labels import COMPONENT_VOXELS
 from tetopt.engine.complex import has_node
 from tetopt.geometry.simplex import facet_areas, regular_edge, volumes
-from tetopt.geometry.topology import linked, stars
+from tetopt.geometry.topology import connected_sets, stars
 from tetopt.system.kernels import (
     Bools1,
     Bools2,
@@ -220,7 +220,7 @@ def label_cells(
     dual = _dual(points, cells, across, contents)
     voxel = float(dual.volume.sum() / contents.counts.sum())
     targets = _targets(dual, np.bincount(dual.row, dual.volume, len(dual.bias)))
-    labels = _settled_majority(dual, targets, voxel * contents.counts, keeps_volumes)
+    labels = _settle_majority(dual, targets, voxel * contents.counts, keeps_volumes)
     _mend_cheaply(dual, labels, targets, voxel, components)
     _give_away_unfit(dual, labels, targets.volume)
     is_kept = np.zeros(len(labels), dtype=bool)
@@ -303,7 +303,7 @@ def _label_volumes(dual: Dual, labels: NDArray[np.int64]) -> NDArray[np.float64]
     return np.bincount(labels, dual.size, len(dual.bias))
 
 
-def _settled_majority(
+def _settle_majority(
     dual: Dual, targets: Targets, voxels: scipy.sparse.csr_array, keeps_volumes: bool
 ) -> NDArray[np.int64]:
     """Labels of most of each cell's voxels, (M,), settled; `voxels` (M, K) in mm^n.
@@ -508,7 +508,7 @@ def components_of(
     one = np.repeat(np.arange(len(labels)), across.shape[1])
     other = across.ravel()
     is_link = (other > one) & (labels[one] == labels[other])
-    n_pieces, number = linked(one[is_link], other[is_link], len(labels))
+    n_pieces, number = connected_sets(one[is_link], other[is_link], len(labels))
     of_component = np.empty(n_pieces, dtype=np.int64)
     of_component[number] = labels
     return number, of_component

@@ -18,7 +18,7 @@ from tetopt.energy.sampling import SamplingGrid
 from tetopt.engine.curving import Curving
 from tetopt.errors import InputError
 from tetopt.geometry.box import facets_on_sides
-from tetopt.image import Image, transformed
+from tetopt.image import Image, transform_vectors
 from tetopt.interop import notebook
 from tetopt.mesh import Mesh
 
@@ -311,6 +311,6 @@ def relative_movement(
     1(c).
     """
     centre = np.array([(s - 1) * 0.5 for s in grid.shape]) * 2.0**grid.bits
-    moved = transformed((after - before).astype(np.float64), matrix)
-    place = transformed(before - centre, matrix)
+    moved = transform_vectors((after - before).astype(np.float64), matrix)
+    place = transform_vectors(before - centre, matrix)
     return float(np.sqrt((moved**2).sum() / (place**2).sum()))

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from tetopt.contents.content import Content, plain
 from tetopt.contents.content import content as make_content
-from tetopt.engine.curving import curved
+from tetopt.engine.curving import curve_mesh
 from tetopt.engine.fast import optimize
 from tetopt.engine.loop import (
     CUT_SHORT,
@@ -55,7 +55,7 @@ from tetopt.measure.judge import (
     unexplained_by,
 )
 from tetopt.mesh import Mesh
-from tetopt.start.carve import carved, part_of
+from tetopt.start.carve import carve_mesh, part_of
 from tetopt.start.clip import lattice_within
 from tetopt.start.label_sizes import SizesByLabel, sizes_by_label
 from tetopt.start.memory import LABEL_BYTES, PROCESS_BYTES, READ_BYTES, REGION_BYTES, bytes_of
@@ -315,7 +315,7 @@ class MeshSearch:
 
     def __iter__(self) -> Iterator[Attempt]:
         """Yield the attempts, each once the result of the last one is told."""
-        result = yield from _searched(self._content, self._aim, self._attempted)
+        result = yield from _search_mesh(self._content, self._aim, self._attempted)
         self.result = self._finished(result)
 
     def tell(self, result: MeshingResult) -> None:
@@ -338,7 +338,7 @@ class MeshSearch:
         content = self._content
         if content.region is None or self._aim.mode == "start":
             return initial, 0, Counter()
-        carving = carved(
+        carving = carve_mesh(
             initial, content.image, content.region, content.keeps_components, content.memberships
         )
         return part_of(initial, carving.is_kept), carving.n_dropped, Counter(carving.volumes)
@@ -358,7 +358,7 @@ class MeshSearch:
         """Judge the result by the aim, and curve its surfaces for order 2."""
         content, aim = self._content, self._aim
         if aim.order == 2:
-            mesh, curving = curved(result.mesh, content, result.labels)
+            mesh, curving = curve_mesh(result.mesh, content, result.labels)
             result = result._replace(mesh=mesh, curving=curving)
         result = self._with_verdict(result)
         seconds = time.perf_counter() - self._begin
@@ -388,7 +388,7 @@ class MeshSearch:
         return result._replace(violated=judge(rows, required), fraction=fraction)
 
 
-def _searched(content: Content, aim: Aim, attempted: Attempted) -> Search:
+def _search_mesh(content: Content, aim: Aim, attempted: Attempted) -> Search:
     """Search for the mesh of an aim."""
     if aim.target_error is not None:
         return meshed_to_error(content, aim, attempted)

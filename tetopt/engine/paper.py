@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.contents.content import plain
-from tetopt.energy.discretization import combined
+from tetopt.energy.discretization import combine_energies
 from tetopt.energy.geometric import cell_E_G
 from tetopt.energy.sampling import (
     SamplingGrid,
@@ -32,16 +32,16 @@ from tetopt.engine.loop import (
     side_ticks,
 )
 from tetopt.engine.paper_moves import Moves, descend, relocate
-from tetopt.engine.state import unweighted, weighted
+from tetopt.engine.state import unweighted_state, weigh_state
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides, facets_on_sides
 from tetopt.geometry.check import filled_fraction
-from tetopt.geometry.topology import facets, folded, greedy_colours
+from tetopt.geometry.topology import facets, folded_groups, greedy_colours
 from tetopt.image import Image
 from tetopt.interop.notebook import with_bar
 from tetopt.mesh import Mesh
 from tetopt.start.delaunay import delaunay
-from tetopt.system.kernels import packed
+from tetopt.system.kernels import pack_record
 
 Retessellate = Literal["first", "accept", "never"]
 
@@ -141,7 +141,7 @@ def optimize_paper(
         E_G, E_D = _energies(state, image)
         n_cells, seconds = len(_cells(state)), time.perf_counter() - begin
         E, n_voxels = (
-            combined(E_G, E_D, E_G0, E_D0, k_D),
+            combine_energies(E_G, E_D, E_G0, E_D0, k_D),
             int(state.complex.sums[:n_cells, 0].sum()),
         )
         history.append(
@@ -156,9 +156,11 @@ def optimize_paper(
         # 1. Reconnect the nodes.
         is_new = False
         if retessellate == "accept" or (retessellate == "first" and iteration <= n_t):
-            candidate = _retessellated(image, grid, state)
+            candidate = _retessellate(image, grid, state)
             limit = history[-1].E if retessellate == "accept" else np.inf
-            if candidate and limit > combined(*_energies(candidate, image), E_G0, E_D0, k_D):
+            if candidate and limit > combine_energies(
+                *_energies(candidate, image), E_G0, E_D0, k_D
+            ):
                 is_new = not np.array_equal(_cells(candidate), _cells(state))
                 state = candidate
         # 2. Move the nodes, one colour at a time.
@@ -229,12 +231,12 @@ def _check_fills_box(image: Image, mesh: Mesh) -> None:
 
 def _initial(image: Image, mesh: Mesh, grid: SamplingGrid, k_D: float, boundary: Boundary) -> State:
     """The state of the initial mesh, which normalises the two energies."""
-    state = _with_E_G(unweighted(plain(image), mesh, grid, 1.0, boundary), image, grid)
+    state = _with_E_G(unweighted_state(plain(image), mesh, grid, 1.0, boundary), image, grid)
     E_G0, E_D0 = _energies(state, image)
     if k_D == 0.0:
-        return weighted(state, 1.0, 0.0)
+        return weigh_state(state, 1.0, 0.0)
     weight = k_D * image.voxel_volume / E_D0 if E_D0 > 0.0 else 0.0
-    return weighted(state, float((1.0 - k_D) / E_G0), float(weight))
+    return weigh_state(state, float((1.0 - k_D) / E_G0), float(weight))
 
 
 def _with_E_G(state: State, image: Image, grid: SamplingGrid) -> State:
@@ -251,7 +253,7 @@ def _energies(state: State, image: Image) -> tuple[float, float]:
     return float(E_G), float(E_D) if E_D > state.objective.rounding * image.voxel_volume else 0.0
 
 
-def _retessellated(image: Image, grid: SamplingGrid, state: State) -> State | None:
+def _retessellate(image: Image, grid: SamplingGrid, state: State) -> State | None:
     """The state with Delaunay cells; None if they are not a mesh of the same box.
 
     The checks are exact: every cell is oriented on the fixed-point grid, every facet lies between
@@ -264,7 +266,7 @@ def _retessellated(image: Image, grid: SamplingGrid, state: State) -> State | No
     shared = facets(cells)
     outer = shared.nodes[shared.n_cells == 1]
     is_on_box = facets_on_sides(mesh.ticks, outer, side_ticks(grid), tolerance=0).any(axis=(1, 2))
-    if len(folded(cells, shared)) or not is_on_box.all():
+    if len(folded_groups(cells, shared)) or not is_on_box.all():
         return None
     candidate = build(cells, mesh.ticks, mesh.is_frozen, state.objective, state.sides)
     is_flat = ~np.isfinite(candidate.complex.E_shape[: len(cells)])
@@ -279,7 +281,7 @@ def _sweep(state: State, step_ratio: float, k_D: float, is_over: Callable[[], bo
     colours = greedy_colours(cells, stars.start, stars.cells)
     is_free = ~state.complex.is_frozen[:, 4 - cells.shape[1] : 3].all(axis=1)
     move = relocate if k_D == 0.0 else descend
-    laid_out = packed(state), packed(stars)
+    laid_out = pack_record(state), pack_record(stars)
     for colour in range(colours.max() + 1):
         if is_over():
             return False

@@ -18,7 +18,7 @@ from tetopt.energy.sampling import cell_orientation, few_threads
 from tetopt.engine.complex import FLAT_FRACTION, NodeStars, State, cell_energy
 from tetopt.engine.smooth import Trial, TrialByValue, star_image, store, trial_of
 from tetopt.engine.surface import projection_at
-from tetopt.geometry.vectors import difference, minus, put_row, row, scaled, times
+from tetopt.geometry.vectors import difference, minus, put_row, row, scale_vector, times
 from tetopt.system.kernels import Floats2, Ints1, helper, run, unit
 
 # of a Lloyd step that inverts a cell or raises the star's energy, before the node stays
@@ -63,7 +63,7 @@ def _load_cell(x: NDArray, state: State, cell: int) -> None:
     """Write a cell's corners, mm from the middle of the first voxel, to x (4, 3)."""
     mesh, objective = state.complex, state.objective
     for k in range(mesh.cells.shape[1]):
-        place = scaled(2.0**-objective.bits, row(mesh.ticks, mesh.cells[cell, k]))
+        place = scale_vector(2.0**-objective.bits, row(mesh.ticks, mesh.cells[cell, k]))
         put_row(x, k, times(objective.matrix, place))
 
 
@@ -198,7 +198,7 @@ def _relocate(moves: Moves, number: int) -> None:
         energy += state.complex.E_shape[stars.cells[r]]
     # E_G over the star is |Omega| / (n+1) |x - minimiser|^2 + constant.
     step, here = times(projection_at(state, node), gradient), row(ticks, node)
-    step = scaled(-n_corners / (2.0 * star_volume), step)
+    step = scale_vector(-n_corners / (2.0 * star_volume), step)
     for halving in range(LLOYD_HALVINGS + 1):
         for d in range(3):
             ticks[node, d] = here[d] + np.int64(

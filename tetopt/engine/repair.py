@@ -19,7 +19,7 @@ from tetopt.engine.complex import (
     State,
     cell_cosine,
     facet_of,
-    grown,
+    grow_state,
     is_interface,
     load_cell,
     node_stars,
@@ -42,9 +42,9 @@ from tetopt.engine.flips import (
     ring_of_edge,
     turn_to_arcs,
 )
-from tetopt.engine.smooth import slid, star_energy, store, trial_of
+from tetopt.engine.smooth import slide_node, star_energy, store, trial_of
 from tetopt.engine.surface import projection_at, slides
-from tetopt.geometry.vectors import difference, dot, put_row, row, scaled, times
+from tetopt.geometry.vectors import difference, dot, put_row, row, scale_vector, times
 from tetopt.system.kernels import Bools1, Floats1, Floats2, Ints1, entry, helper, unit
 
 REPAIR_ROUNDS = 40  # at most; a round without changes ends them earlier
@@ -96,7 +96,7 @@ def repair(
         if len(bad) == 0 or is_over():
             break
         if len(state.complex.cells) - state.complex.n_cells[0] < 4 * len(bad) + 64:
-            state = grown(state)
+            state = grow_state(state)
         before = state.complex.cells[: state.complex.n_cells[0]].copy()
         n_made = _reconnect(
             state, bad, target, cavity(len(state.complex.cells), state.complex.fluxes.shape[2])
@@ -104,7 +104,7 @@ def repair(
         _free_changed(is_stuck, before, state.complex.cells[: state.complex.n_cells[0]])
         bad = _worst_first(state, target)
         if len(bad):
-            n_made += _displaced(state, bad, target, is_over, is_stuck)
+            n_made += _displace_until(state, bad, target, is_over, is_stuck)
         bad = _worst_first(state, target)
         if n_made == 0 and len(bad):
             mended = mend(state, bad, target)
@@ -113,7 +113,7 @@ def repair(
             is_stuck = np.zeros(len(source), dtype=bool)
         if n_made == 0 and len(bad):  # nodes between labels may leave their surfaces
             is_stuck[:] = False
-            n_made = _displaced(_released(state), bad, target, is_over, is_stuck)
+            n_made = _displace_until(_release_nodes(state), bad, target, is_over, is_stuck)
             is_stuck[:] = False
         n_moves += n_made
         if n_made == 0:
@@ -131,7 +131,7 @@ def _free_changed(
         is_stuck[nodes] = False
 
 
-def _displaced(
+def _displace_until(
     state: State,
     bad: NDArray[np.int64],
     target: float,
@@ -149,7 +149,7 @@ def _displaced(
     return n_made
 
 
-def _released(state: State) -> State:
+def _release_nodes(state: State) -> State:
     """The state in which nodes between labels are off their surfaces; those on a mask's surface
     still slide on it.
     """
@@ -388,11 +388,11 @@ def _step_around(
         if code == 13:
             continue
         d = float(code // 9 - 1), float(code // 3 % 3 - 1), float(code % 3 - 1)
-        way = scaled(step / np.sqrt(dot(d, d)) / scale, times(P, d))
+        way = scale_vector(step / np.sqrt(dot(d, d)) / scale, times(P, d))
         t[node, 0] = here[0] + np.int64(np.rint(way[0]))
         t[node, 1] = here[1] + np.int64(np.rint(way[1]))
         t[node, 2] = here[2] + np.int64(np.rint(way[2]))
-        if is_sliding and not slid(normal, state, stars, node):
+        if is_sliding and not slide_node(normal, state, stars, node):
             continue
         cosine = _star_cosine(x, state, stars, node, best)
         if cosine > best + LEAST_LIFT_COSINE:

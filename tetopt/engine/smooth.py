@@ -53,7 +53,7 @@ from tetopt.engine.surface import (
     star_faces_up,
 )
 from tetopt.geometry.topology import greedy_colours
-from tetopt.geometry.vectors import cross, difference, dot, minus, put_row, row, scaled, times
+from tetopt.geometry.vectors import cross, difference, dot, minus, put_row, row, scale_vector, times
 from tetopt.system.kernels import (
     Bools1,
     Floats1,
@@ -65,7 +65,7 @@ from tetopt.system.kernels import (
     entry,
     helper,
     inlined,
-    packed,
+    pack_record,
     run,
     unit,
 )
@@ -133,7 +133,7 @@ def sweep(
     `is_over` cut the sweep short, between two colours.
     """
     gains = np.zeros(len(may_move)) if gains is None else gains
-    laid_out = packed(state), packed(stars), packed(groups)
+    laid_out = pack_record(state), pack_record(stars), pack_record(groups)
     for chosen in colours_of(state, stars, groups):
         if is_over():
             return False
@@ -203,8 +203,8 @@ def _moments_of(
 ) -> float:
     scale, weight = 2.0**-objective.bits, 0.0
     moment[:] = 0.0
-    a = scaled(scale, row(ticks, node))
-    e = minus(scaled(scale, row(ticks, b)), a)
+    a = scale_vector(scale, row(ticks, node))
+    e = minus(scale_vector(scale, row(ticks, b)), a)
     if c < 0:
         parts = min(max(int(np.sqrt(dot(e, e)) / PART_VOXELS) + 1, 2), 4 * FACET_PARTS)
         for p in range(parts):
@@ -219,7 +219,7 @@ def _moments_of(
                 1.0 / parts,
             )
         return weight / parts
-    f = minus(scaled(scale, row(ticks, c)), a)
+    f = minus(scale_vector(scale, row(ticks, c)), a)
     parts = min(max(int(np.sqrt(max(dot(e, e), dot(f, f))) / PART_VOXELS) + 1, 2), FACET_PARTS)
     fraction = 1.0 / (parts * parts)
     for p in range(parts):
@@ -290,21 +290,21 @@ def _add_image_gradient(g: Floats1, H: Floats2, state: State, stars: NodeStars, 
             if _has_same_values(sums, cell, other, label_1, label_2, objective):
                 continue
             a, b, c = outward(cells, cell, k)
-            e = scaled(scale, difference(ticks, b, a))
+            e = scale_vector(scale, difference(ticks, b, a))
             if n == 3:  # the segment (a, b), its normal to the right; phi of `node`
                 normal = (0.0, e[2], -e[1])
                 b = a if b == node else b
             else:
-                normal = scaled(0.5, cross(e, scaled(scale, difference(ticks, c, a))))
+                normal = scale_vector(0.5, cross(e, scale_vector(scale, difference(ticks, c, a))))
                 if b == node:
                     b, c = c, a
                 elif c == node:
                     b, c = a, b
-            normal, area = scaled(float(objective.hand), normal), np.sqrt(dot(normal, normal))
+            normal, area = scale_vector(float(objective.hand), normal), np.sqrt(dot(normal, normal))
             # cells of one label differ only in their means
             moment = means if label_1 == label_2 else every
             weight = _facet_moments(
-                moment, ticks, node, b, c, scaled(FACET_ASIDE / area, normal), objective
+                moment, ticks, node, b, c, scale_vector(FACET_ASIDE / area, normal), objective
             )
             jump, rise = 0.0, 0.0
             for channel in range(moment.shape[1]):
@@ -363,7 +363,7 @@ def _add_shape_gradient(
         for k in range(n):
             apart = minus(apart, difference(x, k, at))
         nearest = min(nearest, dot(apart, apart))
-        v, w = scaled(1.0 / volume, volume_gradient(x, at, n)), scaled(2.0 / S, apart)
+        v, w = scale_vector(1.0 / volume, volume_gradient(x, at, n)), scale_vector(2.0 / S, apart)
         for d in range(3):
             slope = alpha * v[d] + power * w[d]
             g[d] += W * slope
@@ -685,9 +685,9 @@ def _newton_step(g: NDArray, H: NDArray, node: int, state: State) -> tuple:
     c02, c12 = H[0, 1] * H[1, 2] - H[0, 2] * H[1, 1], H[0, 1] * H[0, 2] - H[0, 0] * H[1, 2]
     determinant = H[0, 0] * c00 + H[0, 1] * c01 + H[0, 2] * c02
     if H[0, 0] > 0.0 and c22 > 0.0 and determinant > FLAT_BEND * H[0, 0] * H[1, 1] * H[2, 2]:
-        u = scaled(-1.0 / determinant, (g[0], g[1], g[2]))
+        u = scale_vector(-1.0 / determinant, (g[0], g[1], g[2]))
         return dot((c00, c01, c02), u), dot((c01, c11, c12), u), dot((c02, c12, c22), u)
-    return scaled(-1.0, times(projection_at(state, node), _per_mm(g, state)))
+    return scale_vector(-1.0, times(projection_at(state, node), _per_mm(g, state)))
 
 
 @helper
@@ -695,7 +695,7 @@ def _sliding_step(normal: NDArray, g: NDArray, node: int, state: State) -> tuple
     """Down the gradient g (3,), along the axes and on the surfaces on which a node may move;
     index units.
     """
-    step = scaled(-1.0, times(projection_at(state, node), _per_mm(g, state)))
+    step = scale_vector(-1.0, times(projection_at(state, node), _per_mm(g, state)))
     count = normals_at(normal, state, node)
     rise = dot(row(normal, 0), step), dot(row(normal, 1), step), dot(row(normal, 2), step)
     is_found, way = combined_ways(normal, count, rise)
@@ -716,7 +716,7 @@ def _try_place(
     the best place.
     """
     put_row(state.complex.ticks, node, place)
-    if search.is_sliding and not slid(search.normal, state, stars, node):
+    if search.is_sliding and not slide_node(search.normal, state, stars, node):
         return np.inf
     slot = 1 - search.slot[0]
     value = star_energy(
@@ -814,7 +814,7 @@ def _search_axes(
 
 
 @unit
-def slid(normal: Floats2, state: State, stars: NodeStars, node: int) -> bool:
+def slide_node(normal: Floats2, state: State, stars: NodeStars, node: int) -> bool:
     """Return a moved node to its surfaces; True if it gets there and the mask's facets keep
     facing outwards.
     """
@@ -836,7 +836,7 @@ def attract(state: State, stars: NodeStars, groups: Blocks, angle_limit: float) 
     """
     lowered = state._replace(objective=state.objective._replace(angle_limit=angle_limit))
     is_beside = (state.complex.meeting[:, 1] >= 0) | state.complex.is_frozen[:, 3]
-    laid_out = packed(lowered), packed(stars), packed(groups)
+    laid_out = pack_record(lowered), pack_record(stars), pack_record(groups)
     for chosen in colours_of(state, stars, groups):
         with few_threads(len(chosen) * BLOCK_NODES * 20):
             run(_attract, len(chosen), Sweep(*laid_out, chosen, is_beside, np.zeros(0)))

@@ -34,7 +34,7 @@ def state_of(
         A mesh that is invalid for sampling, is folded or has a cell too flat for a shape energy; or
         energies that overflow.
     """
-    state = unweighted(content, mesh, grid, power, boundary, is_graded)
+    state = unweighted_state(content, mesh, grid, power, boundary, is_graded)
     flat = np.flatnonzero(~np.isfinite(state.complex.E_shape[: len(mesh.cells)]))
     if len(flat):
         raise InputError(
@@ -49,10 +49,10 @@ def state_of(
             "usual range?"
         )
     geometry, surface = float((1.0 - k_D) / E_G0), float(weight * state.objective.wrong_side)
-    return weighted(state, geometry, float(weight), surface)
+    return weigh_state(state, geometry, float(weight), surface)
 
 
-def unweighted(
+def unweighted_state(
     content: Content,
     mesh: Mesh,
     grid: SamplingGrid,
@@ -84,7 +84,7 @@ def unweighted(
     return build(mesh.cells, ticks, is_frozen, objective, sides)
 
 
-def weighted(state: State, geometry: float, image: float, surface: float = 0.0) -> State:
+def weigh_state(state: State, geometry: float, image: float, surface: float = 0.0) -> State:
     """The state with other weights of E_G, squares and voxels on the wrong side."""
     return state._replace(
         objective=state.objective._replace(geometry=geometry, image=image, surface=surface)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tetopt.contents.domain import ON_SURFACE_VOXELS
 from tetopt.engine.complex import NodeStars, State, facet_area, has_node, outward, place
-from tetopt.geometry.vectors import cross, dot, row, scaled
+from tetopt.geometry.vectors import cross, dot, row, scale_vector
 from tetopt.system.kernels import Floats1, Floats2, Singles3, entry, helper, unit
 
 # where several surfaces meet, a place whose levels are this close to 0 lies on all of them
@@ -241,7 +241,7 @@ def combined_ways(
     if not g00 > FLAT_RISE:
         return False, w
     if count == 1:
-        return True, scaled(r[0] / g00, w)
+        return True, scale_vector(r[0] / g00, w)
     v = row(normal, 4)
     g01, g11 = dot(row(normal, 0), v), dot(row(normal, 1), v)
     pair = g00 * g11 - g01 * g01
@@ -321,7 +321,7 @@ def put_on_surface(normal: Floats2, state: State, node: int) -> bool:
             return False
         size = np.sqrt(dot(way, way))
         if count > 1 and size > CURVE_STEP_VOXELS:
-            way = scaled(CURVE_STEP_VOXELS / size, way)
+            way = scale_vector(CURVE_STEP_VOXELS / size, way)
         for d in range(3):
             ticks[node, d] -= np.int64(np.rint(way[d] / scale))
         _put_in_box(state, node)

@@ -22,7 +22,7 @@ from tetopt.fem.elasticity import (
     RESIDUAL_FRACTION,
     Method,
     System,
-    factorized,
+    factorize_matrix,
     is_direct,
     multigrid,
     on_one_blas_thread,
@@ -48,7 +48,7 @@ def conditioning(system: System, *, method: Method = "auto") -> Conditioning:
     Parameters
     ----------
     system : System
-        From `tetopt.fem.elasticity.constrained`, or the `system` of a `Compression`.
+        From `tetopt.fem.elasticity.constrain_nodes`, or the `system` of a `Compression`.
     method : {"auto", "direct", "amg"}
         Method for the smallest eigenvalue: factorisation, which "auto" uses up to `DIRECT_DOFS`
         free dofs, or LOBPCG preconditioned by multigrid.
@@ -110,7 +110,7 @@ def lambda_min(K_ff: csr_array, preconditioner: LinearOperator | None = None) ->
         return float(np.linalg.eigvalsh(K_ff.toarray())[0])
     if preconditioner is not None:
         return _by_lobpcg(K_ff, preconditioner)
-    return _by_inverse(K_ff, factorized(K_ff))
+    return _by_inverse(K_ff, factorize_matrix(K_ff))
 
 
 def _by_inverse(K_ff: csr_array, solve: Callable[[NDArray], NDArray], tol: float = 0.0) -> float:

@@ -50,7 +50,7 @@ from tetopt.geometry.quadratic import (
 from tetopt.geometry.simplex import determinants, volume_gradients, volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.model.mappings import checked_young
+from tetopt.model.mappings import check_young
 from tetopt.system.budget import check_memory
 
 Method = Literal["auto", "direct", "amg"]
@@ -156,7 +156,7 @@ def stiffness(mesh: Mesh, young: ArrayLike, nu: ArrayLike, order: int = 1) -> cs
     """
     elements = elements_of(mesh, order)
     return _stiffness(
-        elements, _checked_young(young, elements), _checked_nu(nu, mesh), np.eye(mesh.ndim)
+        elements, _check_young(young, elements), _check_nu(nu, mesh), np.eye(mesh.ndim)
     )
 
 
@@ -419,7 +419,7 @@ def check_fills_box(image: Image, mesh: Mesh) -> None:
         )
 
 
-def constrained(
+def constrain_nodes(
     mesh: Mesh,
     young: ArrayLike,
     nu: ArrayLike,
@@ -456,7 +456,7 @@ def constrained(
     n = mesh.ndim
     frame = np.eye(n) if frame is None else frame
     elements = elements_of(mesh, order)
-    young, nu = _checked_young(young, elements), _checked_nu(nu, mesh)
+    young, nu = _check_young(young, elements), _check_nu(nu, mesh)
     is_prescribed, prescribed = (
         np.asarray(is_prescribed, dtype=bool),
         np.asarray(prescribed, dtype=np.float64),
@@ -539,15 +539,15 @@ def compression(
         farthest from it; no force acts there, but the matrix is far worse conditioned than that of
         a bonded mesh. Disconnected components could slide apart, and are rejected.
     method : {"auto", "direct", "amg"}
-        See `solved`.
+        See `solve_system`.
 
     Raises
     ------
     InputError
-        As for `constrained`; a side without nodes or with invalid node numbers; a node on both
+        As for `constrain_nodes`; a side without nodes or with invalid node numbers; a node on both
         sides; or a displacement that is 0 or not n finite numbers.
     RuntimeError
-        As for `solved`.
+        As for `solve_system`.
 
     Examples
     --------
@@ -567,9 +567,9 @@ def compression(
     0.001
     """
     n = mesh.ndim
-    fixed = _checked_nodes("fixed_nodes", fixed_nodes, mesh)
-    pushed = _checked_nodes("pushed_nodes", pushed_nodes, mesh)
-    push = _checked_displacement(displacement, n)
+    fixed = _check_nodes("fixed_nodes", fixed_nodes, mesh)
+    pushed = _check_nodes("pushed_nodes", pushed_nodes, mesh)
+    push = _check_displacement(displacement, n)
     both = np.intersect1d(fixed, pushed)
     if len(both):
         raise InputError(
@@ -592,8 +592,8 @@ def compression(
         is_prescribed[fixed[0]] = True
         is_prescribed[fixed[partner], 2:] = True
         prescribed[pushed, 0] = np.linalg.norm(push)
-    system = constrained(mesh, young, nu, is_prescribed, prescribed, order=order, frame=frame)
-    u = solved(system, method)
+    system = constrain_nodes(mesh, young, nu, is_prescribed, prescribed, order=order, frame=frame)
+    u = solve_system(system, method)
     dofs = (u @ frame).ravel()
     force = system.K @ dofs
     reaction = force.reshape(-1, n)[pushed].sum(axis=0) @ frame.T
@@ -640,7 +640,7 @@ def _sliding_frame(
 # Solution
 
 
-def solved(system: System, method: Method = "auto") -> NDArray[np.float64]:
+def solve_system(system: System, method: Method = "auto") -> NDArray[np.float64]:
     """Solve for the displacement of every node, (N, n) float64, mm, in world components.
 
     Parameters
@@ -658,12 +658,12 @@ def solved(system: System, method: Method = "auto") -> NDArray[np.float64]:
         The residual stayed above ten times that, as it may if moduli differ by more than 9 orders
         of magnitude.
     """
-    return solved_in_steps(system, method)[0]
+    return solve_in_steps(system, method)[0]
 
 
 @on_one_blas_thread
-def solved_in_steps(system: System, method: Method = "auto") -> tuple[NDArray[np.float64], int]:
-    """The result of `solved`, and the number of conjugate gradient steps: 0 if the matrix was
+def solve_in_steps(system: System, method: Method = "auto") -> tuple[NDArray[np.float64], int]:
+    """The result of `solve_system`, and the number of conjugate gradient steps: 0 if the matrix was
     factorised.
     """
     n, n_steps = len(system.frame), 0
@@ -675,7 +675,7 @@ def solved_in_steps(system: System, method: Method = "auto") -> tuple[NDArray[np
     dofs = system.prescribed.copy()
     if len(system.free):
         if is_direct(system, method):
-            solution = factorized(system.K_ff)(system.load)
+            solution = factorize_matrix(system.K_ff)(system.load)
         else:
             options: dict[str, Any] = {
                 "rtol": RESIDUAL_FRACTION,
@@ -702,7 +702,7 @@ def is_direct(system: System, method: Method) -> bool:
     )
 
 
-def factorized(K_ff: csr_array):  # type: ignore[no-untyped-def]
+def factorize_matrix(K_ff: csr_array):  # type: ignore[no-untyped-def]
     """The solution of K_ff x = b as a function of b, by sparse factorisation of the positive
     definite K_ff.
     """
@@ -783,7 +783,7 @@ def _with_held(K: csr_array, is_free: NDArray[np.float64], alone: float) -> csr_
 # Checks of the arguments
 
 
-def _checked_young(young: ArrayLike, elements: Elements) -> NDArray[np.float64]:
+def _check_young(young: ArrayLike, elements: Elements) -> NDArray[np.float64]:
     """Moduli at the Gauss points, (M, Q)."""
     try:
         young = np.asarray(young, dtype=np.float64)
@@ -793,19 +793,19 @@ def _checked_young(young: ArrayLike, elements: Elements) -> NDArray[np.float64]:
     if young.ndim == 0:
         young = np.full(n_cells, float(young))
     if young.shape == (n_cells,):
-        return np.broadcast_to(checked_young(young)[:, None], (n_cells, n_places))
+        return np.broadcast_to(check_young(young)[:, None], (n_cells, n_places))
     if elements.is_curved and young.shape == (n_cells, elements.points.shape[1] + 1):
         young = on_curved_rule(young)
     if young.shape != (n_cells, n_places):
         raise InputError(
             f"young: expected one modulus for each of {n_cells} cells, got shape {young.shape}"
         )
-    checked_young(young.min(axis=1))  # any NaN makes this NaN
-    checked_young(young.max(axis=1))
+    check_young(young.min(axis=1))  # any NaN makes this NaN
+    check_young(young.max(axis=1))
     return young
 
 
-def _checked_nu(nu: ArrayLike, mesh: Mesh) -> NDArray[np.float64]:
+def _check_nu(nu: ArrayLike, mesh: Mesh) -> NDArray[np.float64]:
     """Poisson's ratios of the cells, (M,)."""
     ratios = np.asarray(nu, dtype=np.float64)
     if ratios.shape not in ((), (len(mesh.cells),)):
@@ -821,7 +821,7 @@ def _checked_nu(nu: ArrayLike, mesh: Mesh) -> NDArray[np.float64]:
     return np.broadcast_to(ratios, (len(mesh.cells),))
 
 
-def _checked_nodes(name: str, nodes: ArrayLike, mesh: Mesh) -> NDArray[np.int64]:
+def _check_nodes(name: str, nodes: ArrayLike, mesh: Mesh) -> NDArray[np.int64]:
     """Distinct node numbers, ascending."""
     nodes = np.asarray(nodes)
     if nodes.size == 0:
@@ -838,7 +838,7 @@ def _checked_nodes(name: str, nodes: ArrayLike, mesh: Mesh) -> NDArray[np.int64]
     return np.unique(nodes).astype(np.int64)
 
 
-def _checked_displacement(displacement: ArrayLike, n: int) -> NDArray[np.float64]:
+def _check_displacement(displacement: ArrayLike, n: int) -> NDArray[np.float64]:
     vector = np.asarray(displacement, dtype=np.float64)
     if vector.shape != (n,) or not np.isfinite(vector).all() or not vector.any():
         raise InputError(

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bsr_array, csr_array
 
-from tetopt.fem.elasticity import System, lame_constants, on_one_blas_thread, solved_in_steps
+from tetopt.fem.elasticity import System, lame_constants, on_one_blas_thread, solve_in_steps
 from tetopt.fem.rigidity import rigid_modes
 from tetopt.geometry.box import upright_axis
 from tetopt.image import Image
@@ -97,7 +97,7 @@ def solve_between_plates(modulus: Image, nu: float, u: NDArray[np.float64]) -> i
     InputError
         Too little memory.
     RuntimeError
-        As for `tetopt.fem.elasticity.solved`.
+        As for `tetopt.fem.elasticity.solve_system`.
     """
     what = f"reference: {u.size:.4g} degrees of freedom"
     check_memory(
@@ -111,7 +111,7 @@ def solve_between_plates(modulus: Image, nu: float, u: NDArray[np.float64]) -> i
     index = np.moveaxis(np.indices(u.shape[:-1]), 0, -1)[inside].reshape(-1, n).astype(np.float64)
     K = free_stiffness(modulus, nu)
     modes = rigid_modes(modulus.to_world(index))
-    solution, n_steps = solved_in_steps(
+    solution, n_steps = solve_in_steps(
         System(K, np.arange(len(load)), K, load, np.zeros(len(load)), modes, np.eye(n))
     )
     u[inside] = solution.reshape(u[inside].shape)

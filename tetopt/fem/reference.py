@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 from scipy.sparse import csr_array
 
-from tetopt.contents.align import divided
+from tetopt.contents.align import divide_voxels
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.errors import InputError
 from tetopt.fem.elasticity import Elements, elements_of, order_of, push_of
@@ -89,7 +89,7 @@ def reference(modulus: Image, nu: float, percent: float = 1.0) -> Reference:
     InputError
         A modulus that is not above 0, or too little memory.
     RuntimeError
-        As for `tetopt.fem.elasticity.solved`.
+        As for `tetopt.fem.elasticity.solve_system`.
     """
     if not (modulus.data > 0.0).all():
         raise InputError(
@@ -97,14 +97,16 @@ def reference(modulus: Image, nu: float, percent: float = 1.0) -> Reference:
             f"{modulus.data.min():g}"
         )
     push = push_of(modulus, percent)
-    u, n_iterations = _compressed(modulus, nu, push)
-    half = averaged(modulus, tuple(max(1, s // 2) for s in modulus.shape))
-    u_half, _ = _compressed(half, nu, push)
+    u, n_iterations = _compress_grid(modulus, nu, push)
+    half = average_voxels(modulus, tuple(max(1, s // 2) for s in modulus.shape))
+    u_half, _ = _compress_grid(half, nu, push)
     even = u
     if modulus.data.min() < modulus.data.max():
-        even, _ = _compressed(Image(np.ones(modulus.shape), modulus.affine), nu, push)
+        even, _ = _compress_grid(Image(np.ones(modulus.shape), modulus.affine), nu, push)
     energy, half_energy = _strain_energy(modulus, nu, u), _strain_energy(half, nu, u_half)
-    error, scale = (_squares(u - other) for other in (interpolated(u_half, modulus.shape), even))
+    error, scale = (
+        _squares(u - other) for other in (interpolate_nodes(u_half, modulus.shape), even)
+    )
     is_homogeneous = scale <= 1e-14 * _squares(u)  # only the solver's error remains
     own = OwnError(
         abs(half_energy / energy - 1.0), None if is_homogeneous else float(np.sqrt(error / scale))
@@ -112,7 +114,7 @@ def reference(modulus: Image, nu: float, percent: float = 1.0) -> Reference:
     return Reference(modulus, nu, energy, u, even, own, n_iterations)
 
 
-def _compressed(
+def _compress_grid(
     modulus: Image, nu: float, push: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], int]:
     """Displacements of the nodes with the bottom pushed in and the top fixed, and the number of
@@ -129,7 +131,7 @@ def _strain_energy(modulus: Image, nu: float, u: NDArray[np.float64]) -> float:
     return 0.5 * float((u * stiffness_product(modulus, nu, u)).sum())
 
 
-def interpolated(u: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.float64]:
+def interpolate_nodes(u: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.float64]:
     """Displacements of a grid's nodes at the nodes of another grid of this shape over the same
     box.
     """
@@ -222,7 +224,7 @@ def near_interface(labels: NDArray) -> NDArray[np.bool_]:
     return ndimage.distance_transform_edt(~is_edge) <= INTERFACE_BAND_VOXELS - 0.5
 
 
-def averaged(image: Image, shape: tuple[int, ...]) -> Image:
+def average_voxels(image: Image, shape: tuple[int, ...]) -> Image:
     """The image on a coarser grid over the same box: means over new voxels, with cut voxels
     weighted by their fraction.
 
@@ -263,14 +265,14 @@ def reference_shape(
         step *= STEP_GROWTH
 
 
-def refined(image: Image, shape: tuple[int, ...]) -> Image:
+def refine_voxels(image: Image, shape: tuple[int, ...]) -> Image:
     """The same field on evenly divided voxels, about `shape` along the axes.
 
     All voxels have the same number of parts, so that means over parts of the box are those of the
     field. Values at the centres of another grid (`nearest`) use some voxels more often: MNI152 at 2
     mm, sampled at 1 mm, has a mean modulus that is 0.6 % too high, as large as the measured errors.
     """
-    return divided(
+    return divide_voxels(
         image,
         [max(int(np.rint(new / old)), 1) for new, old in zip(shape, image.shape, strict=True)],
     )

@@ -17,7 +17,7 @@ from scipy.sparse import block_array, coo_array, csr_array
 from scipy.sparse.linalg import eigsh
 
 from tetopt.errors import InputError
-from tetopt.geometry.topology import components, linked
+from tetopt.geometry.topology import components, connected_sets
 
 # Least squared violation of all constraints by a rigid motion of size 1; less is rounding, and the
 # motion is free.
@@ -94,7 +94,9 @@ def _check_pieces(
     """Raise InputError if a component of cells connected by nodes has no prescribed dof."""
     n_bodies = int(body.max()) + 1
     bodies = np.repeat(body, cells.shape[1]) + len(is_prescribed)
-    label = linked(cells.ravel(), bodies, len(is_prescribed) + n_bodies)[1][: len(is_prescribed)]
+    label = connected_sets(cells.ravel(), bodies, len(is_prescribed) + n_bodies)[1][
+        : len(is_prescribed)
+    ]
     is_held = np.isin(label, label[is_prescribed.any(axis=1)])
     loose = np.flatnonzero(~is_held[cells[:, 0]])
     if len(loose):

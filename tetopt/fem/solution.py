@@ -23,12 +23,12 @@ from tetopt.fem.elasticity import (
     Outside,
     System,
     cell_means,
-    constrained,
+    constrain_nodes,
     gauss_strains,
     gauss_volumes,
     lame_constants,
     on_one_blas_thread,
-    solved_in_steps,
+    solve_in_steps,
 )
 from tetopt.geometry.quadratic import cell_edges, gauss_rule, of_order, on_curved_rule, shape_values
 from tetopt.geometry.simplex import volumes
@@ -118,7 +118,7 @@ def solve(model: Model, step: int = 1, method: Method = "auto") -> Solution:
     step : int
         Number of the step, from 1. Loads without a step belong to all steps.
     method : {"auto", "direct", "amg"}
-        See `tetopt.fem.elasticity.solved`.
+        See `tetopt.fem.elasticity.solve_system`.
 
     Returns
     -------
@@ -168,7 +168,7 @@ def solve(model: Model, step: int = 1, method: Method = "auto") -> Solution:
         raise InputError("model: the cells have no moduli; give `young`")
     task = _task(model, in_step(model.loads, step))
     young, nu = gauss_moduli(model), model.materials.nu[model.materials.of_cell]
-    system = constrained(
+    system = constrain_nodes(
         model.mesh,
         young,
         nu,
@@ -177,7 +177,7 @@ def solve(model: Model, step: int = 1, method: Method = "auto") -> Solution:
         order=model.order,
         outside=task.outside,
     )
-    u, n_iterations = solved_in_steps(system, method)
+    u, n_iterations = solve_in_steps(system, method)
     strain = gauss_strains(model.mesh, u)
     stress = _stress(strain, young, nu)
     strain_energy = 0.5 * float(

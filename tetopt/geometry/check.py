@@ -18,7 +18,7 @@ from tetopt.geometry.quadratic import (
     quadratic,
 )
 from tetopt.geometry.simplex import volumes
-from tetopt.geometry.topology import Facets, boundary_facets, components, facets, folded
+from tetopt.geometry.topology import Facets, boundary_facets, components, facets, folded_groups
 
 if TYPE_CHECKING:
     from tetopt.image import Image
@@ -155,7 +155,7 @@ def _problems_of_curves(mesh: Mesh) -> list[str]:
 def _problems_of_facets(mesh: Mesh) -> list[str]:
     problems = []
     shared = facets(mesh.cells)
-    pairs = folded(mesh.cells, shared)
+    pairs = folded_groups(mesh.cells, shared)
     if len(pairs):
         problems.append(
             "facets with both cells on the same side, or with more than two cells; cells: "
@@ -247,7 +247,7 @@ def check_unfolded(mesh: Mesh, shared: Facets | None = None, source: str = "mesh
     InputError
         Cells overlap; the message names the first.
     """
-    pairs = folded(mesh.cells, shared)
+    pairs = folded_groups(mesh.cells, shared)
     if len(pairs):
         raise InputError(
             f"{source}: at {len(pairs)} facets cells overlap (inverted cells do) or more than "

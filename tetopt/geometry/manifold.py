@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.geometry.simplex import facet_nodes
-from tetopt.geometry.topology import Facets, facets, linked, stars
+from tetopt.geometry.topology import Facets, connected_sets, facets, stars
 
 _Key = TypeVar("_Key", bound=Hashable)
 
@@ -108,7 +108,9 @@ def surface_fans(surfaces: LabelSurfaces, ridges: Ridges) -> Fans:
     by_ridge = np.argsort(ridges.of_facet.ravel(), kind="stable")
     ridge, ends = ridges.of_facet.ravel()[by_ridge], corner.reshape(-1, n - 1)[by_ridge]
     is_same = ridge[1:] == ridge[:-1]
-    n_fans, fan = linked(ends[:-1][is_same].ravel(), ends[1:][is_same].ravel(), surfaces.nodes.size)
+    n_fans, fan = connected_sets(
+        ends[:-1][is_same].ravel(), ends[1:][is_same].ravel(), surfaces.nodes.size
+    )
     base = int(surfaces.nodes.max(initial=0)) + 1
     key = np.empty(n_fans, dtype=np.int64)
     key[fan] = ((surfaces.label[:, None] - OUTSIDE_LABEL) * base + surfaces.nodes).ravel()
@@ -210,7 +212,7 @@ def _cells_at_pinch(
         ]
         for cell, corners in star.items()
     }
-    fans = _linked(links)
+    fans = _connected_sets(links)
     if len(fans) > 1:
         largest = max(fans, key=lambda fan: (size[fan].sum(), -fan[0]))
         return [cell for fan in fans if fan is not largest for cell in fan]
@@ -224,7 +226,7 @@ def _cells_at_pinch(
         if other < 0 and node not in place
     ]
     ends = {facet: {*star[facet[0]].nodes} - {facet[1], *place} for facet in outer}
-    patches = _linked(
+    patches = _connected_sets(
         {facet: [other for other in outer if ends[facet] & ends[other]] for facet in outer}
     )
     if len(patches) < 2:
@@ -236,7 +238,7 @@ def _cells_at_pinch(
     )
 
 
-def _linked(links: dict[_Key, list[_Key]]) -> list[list[_Key]]:
+def _connected_sets(links: dict[_Key, list[_Key]]) -> list[list[_Key]]:
     """Connected sets of a graph, each starting with its first member."""
     sets: list[list[_Key]] = []
     seen: set[_Key] = set()

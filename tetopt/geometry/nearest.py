@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.geometry.vectors import cross, dot, minus, over, row, scaled
+from tetopt.geometry.vectors import cross, dot, minus, over, row, scale_vector
 from tetopt.system.kernels import Floats1, Floats2, Ints1, Ints2, entry, helper, run, unit
 
 # exponent of the number of triangles for bins along the longest side, with a few triangles in each
@@ -88,7 +88,7 @@ def _list_by_bin(place: Ints1, listed: Ints1, bins: Ints2, facets: Ints2, counts
 def _edge_square(p: tuple, along: tuple) -> float:
     """Squared distance of p from the segment between 0 and `along`."""
     way = minus(
-        p, scaled(min(max(dot(p, along) / max(dot(along, along), 1e-300), 0.0), 1.0), along)
+        p, scale_vector(min(max(dot(p, along) / max(dot(along, along), 1e-300), 0.0), 1.0), along)
     )
     return float(dot(way, way))
 

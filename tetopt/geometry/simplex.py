@@ -63,7 +63,7 @@ def determinants(frames: NDArray[np.float64]) -> NDArray[np.float64]:
     return (a * (e * i - f * h) + c * (d * h - e * g)) + b * (f * g - d * i) + 0.0  # no -0
 
 
-def oriented(points: Points, cells: Cells) -> NDArray[np.int64]:
+def orient_cells(points: Points, cells: Cells) -> NDArray[np.int64]:
     """Copy of `cells`, (M, n+1) int64, with the last two nodes swapped where the signed volume
     is negative.
     """

@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import edge_pairs, facet_areas, volumes
-from tetopt.geometry.topology import Facets, facets, linked
-from tetopt.system.arrays import simplex_arrays, unmasked
+from tetopt.geometry.topology import Facets, connected_sets, facets
+from tetopt.system.arrays import plain_array, simplex_arrays
 
 # The facet opposite each local node, its nodes turned to face out of a positively oriented cell.
 OUTWARD_FACETS = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
@@ -146,9 +146,9 @@ def extract_surface(
     at[fan] = points[skin.triangles.ravel()]
 
     copies, nodes = _split_nodes(skin, fan)
-    at[copies], shift = _moved_apart(nodes)
+    at[copies], shift = _move_apart(nodes)
     doubled, edges = _split_edges(skin, fan)
-    middles, edge_shift = _moved_apart(edges)
+    middles, edge_shift = _move_apart(edges)
     at, triangles = _with_middles(at, fan.reshape(-1, 3), doubled, skin.partner[doubled], middles)
 
     n_parted = len(np.unique(nodes.place)) + len(np.unique(edges.place))
@@ -161,7 +161,7 @@ def _chosen_cells(points: NDArray, cells: NDArray, chosen: ArrayLike) -> NDArray
             f"surface: expected tetrahedra in space, got cells of {cells.shape[1]} nodes; mesh a "
             "3-D image"
         )
-    chosen = unmasked("surface", chosen)
+    chosen = plain_array("surface", chosen)
     if chosen.dtype == np.bool_:
         if chosen.shape != (len(cells),):
             raise InputError(
@@ -252,7 +252,9 @@ def _walks(
         steps.append(shared.of_cell[near][:, [k, m]] * len(crowded) + at[is_at, None])
     state, step = np.unique(np.vstack(steps), return_inverse=True)
     one, other = step.reshape(-1, 2).T
-    return linked(one, other, len(state))[1][np.searchsorted(state, facet * len(crowded) + edge)]
+    return connected_sets(one, other, len(state))[1][
+        np.searchsorted(state, facet * len(crowded) + edge)
+    ]
 
 
 def _inner_angles(
@@ -282,7 +284,7 @@ def _fans(partner: NDArray[np.int64]) -> NDArray[np.int64]:
     """
     corner = np.arange(len(partner))
     before = corner - corner % 3 + (corner + 2) % 3
-    return linked(corner, partner[before], len(corner))[1]
+    return connected_sets(corner, partner[before], len(corner))[1]
 
 
 def _split_nodes(skin: _Skin, fan: NDArray[np.int64]) -> tuple[NDArray[np.int64], _Sheets]:
@@ -335,7 +337,7 @@ def _split_edges(skin: _Skin, fan: NDArray[np.int64]) -> tuple[NDArray[np.int64]
     )
 
 
-def _moved_apart(sheets: _Sheets) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _move_apart(sheets: _Sheets) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """New positions of the sheets, (S, 3), and their displacements, (S,), mm.
 
     The narrower sides of two sheets that do not cross are disjoint or nested. So each sheet may

@@ -164,7 +164,7 @@ def _listed_facets(
     return nodes, sides, of_cell
 
 
-def folded(cells: NDArray[np.integer], shared: Facets | None = None) -> NDArray[np.int64]:
+def folded_groups(cells: NDArray[np.integer], shared: Facets | None = None) -> NDArray[np.int64]:
     """Groups of cells that do not lie on opposite sides of the facet they share, (K, 2) int64, by
     facet.
 
@@ -219,7 +219,7 @@ def greedy_colours(cells: NDArray, start: NDArray, star_cells: NDArray) -> NDArr
     return colours
 
 
-def linked(
+def connected_sets(
     one: NDArray[np.int64], other: NDArray[np.int64], n: int
 ) -> tuple[int, NDArray[np.int64]]:
     """Number of connected sets of n items linked in pairs one[i], other[i], and the set of each
@@ -238,7 +238,7 @@ def components(cells: NDArray[np.integer], shared: Facets | None = None) -> NDAr
     """
     sides = (facets(cells) if shared is None else shared).cells
     sides = sides[sides[:, 1] >= 0]
-    _, number = linked(sides[:, 0], sides[:, 1], len(cells))
+    _, number = connected_sets(sides[:, 0], sides[:, 1], len(cells))
     _, first, inverse = np.unique(number, return_index=True, return_inverse=True)
     rank = np.empty(len(first), dtype=np.int64)
     rank[np.argsort(first)] = np.arange(len(first))

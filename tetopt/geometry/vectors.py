@@ -37,7 +37,7 @@ def minus(u: tuple, v: tuple) -> tuple:
 
 
 @njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False)
-def scaled(s: float, u: tuple) -> tuple:
+def scale_vector(s: float, u: tuple) -> tuple:
     """s times u."""
     return s * u[0], s * u[1], s * u[2]
 

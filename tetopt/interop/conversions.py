@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tetopt.errors import InputError
-from tetopt.geometry.simplex import oriented
+from tetopt.geometry.simplex import orient_cells
 from tetopt.interop.notebook import in_kernel
-from tetopt.system.arrays import unmasked
+from tetopt.system.arrays import plain_array
 from tetopt.system.extras import install_hint
 
 if TYPE_CHECKING:
@@ -164,7 +164,7 @@ def simplices_of(
     used, compact = np.unique(cells, return_inverse=True)
     corners, compact = points[used, :n], compact.reshape(cells.shape)
     with np.errstate(invalid="ignore"):  # infinite coordinates, which Mesh rejects with a message
-        turned = oriented(corners, compact)
+        turned = orient_cells(corners, compact)
     return Simplices(corners, turned, used, int((turned != compact).any(axis=1).sum()))
 
 
@@ -211,7 +211,9 @@ def cells_of_rows(
     return cells
 
 
-def _picked(caller: str, points: ArrayLike, cells: Mapping[str, NDArray[np.int64]]) -> Simplices:
+def _pick_cells(
+    caller: str, points: ArrayLike, cells: Mapping[str, NDArray[np.int64]]
+) -> Simplices:
     """Select the tetrahedra, or else the triangles, from cells by type; cells of order 2 by
     their corners.
     """
@@ -269,7 +271,7 @@ def from_pyvista(grid: Any) -> Simplices:
     cells = cells_of_rows(
         vtk_to_numpy(listed.GetConnectivityArray()).astype(np.int64), offsets, rows
     )
-    return _picked("from_pyvista", whole.points, cells)
+    return _pick_cells("from_pyvista", whole.points, cells)
 
 
 def from_meshio(mesh: Any) -> Simplices:
@@ -285,7 +287,7 @@ def from_meshio(mesh: Any) -> Simplices:
         if len(block.data):
             earlier = [cells[block.type]] if block.type in cells else []
             cells[block.type] = np.concatenate([*earlier, block.data])
-    return _picked("from_meshio", mesh.points, cells)
+    return _pick_cells("from_meshio", mesh.points, cells)
 
 
 def from_skfem(mesh: Any) -> Simplices:
@@ -298,15 +300,15 @@ def from_skfem(mesh: Any) -> Simplices:
     ):
         kind = type(mesh).__name__
         raise InputError(f"from_skfem: expected a scikit-fem MeshTri or MeshTet, got {kind}")
-    return _picked("from_skfem", mesh.p.T, {"tetra" if mesh.dim() == 3 else "triangle": mesh.t.T})
+    return _pick_cells(
+        "from_skfem", mesh.p.T, {"tetra" if mesh.dim() == 3 else "triangle": mesh.t.T}
+    )
 
 
 # --- to others
 
 
-def checked_fields(
-    what: str, fields: Fields | None, n_rows: int | None = None
-) -> dict[str, NDArray]:
+def check_fields(what: str, fields: Fields | None, n_rows: int | None = None) -> dict[str, NDArray]:
     """Return arrays of numbers by name; InputError unless each has `n_rows` rows, by default any
     number.
     """
@@ -317,7 +319,7 @@ def checked_fields(
         line = f"{what}: {name!a}: expected an array of numbers"
         line += "" if n_rows is None else f" with {n_rows} rows"
         try:
-            values = unmasked(f"{what}: {name!a}", rows)
+            values = plain_array(f"{what}: {name!a}", rows)
         except InputError:
             raise
         except (TypeError, ValueError) as error:  # rows of different lengths
@@ -391,8 +393,8 @@ def to_pyvista(
 ) -> Any:
     """Convert cells of one VTK type and their data to a `pyvista.UnstructuredGrid`."""
     pyvista = library("pyvista", "to_pyvista")
-    on_cells = checked_fields("cell_data", cell_data, len(cells))
-    on_points = checked_fields("point_data", point_data, len(points))
+    on_cells = check_fields("cell_data", cell_data, len(cells))
+    on_points = check_fields("point_data", point_data, len(points))
     return pyvista.wrap(vtk_grid(points, cells, kind, on_cells, on_points))
 
 
@@ -405,8 +407,8 @@ def to_meshio(
 ) -> Any:
     """Convert cells of one meshio type and their data to a `meshio.Mesh`; arrays are copied."""
     meshio = library("meshio", "to_meshio")
-    on_cells = checked_fields("cell_data", cell_data, len(cells))
-    on_points = checked_fields("point_data", point_data, len(points))
+    on_cells = check_fields("cell_data", cell_data, len(cells))
+    on_points = check_fields("point_data", point_data, len(points))
     return meshio.Mesh(
         points.copy(),
         [(kind, cells.copy())],

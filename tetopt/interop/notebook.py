@@ -52,18 +52,18 @@ def card_html(title: str, rows: Iterable[tuple[str, str]], picture: str = "") ->
     Title and rows may be any text; they are escaped. `picture` is HTML.
     """
     lines = "".join(
-        f'<tr><th style="{CELL_STYLE}">{_escaped(name)}</th><td '
-        f'style="{CELL_STYLE}">{_escaped(value)}</td></tr>'
+        f'<tr><th style="{CELL_STYLE}">{_escape_html(name)}</th><td '
+        f'style="{CELL_STYLE}">{_escape_html(value)}</td></tr>'
         for name, value in rows
     )
     return (
         '<div style="display:flex;flex-wrap:wrap;gap:1em;align-items:flex-start">'
-        f"<div><strong>{_escaped(title)}</strong><table "
+        f"<div><strong>{_escape_html(title)}</strong><table "
         f'style="{TABLE_STYLE}">{lines}</table></div>{picture}</div>'
     )
 
 
-def _escaped(text: str) -> str:
+def _escape_html(text: str) -> str:
     """Escape a text for HTML, on one line."""
     return html.escape("".join(sign if sign.isprintable() else " " for sign in text))
 
@@ -115,11 +115,11 @@ def section_html(
     if len(owner) == 0:  # separate components on both sides of the plane
         return ""
     return _picture_html(
-        _drawn(corners, None if values is None else values[owner]), f"{where}: its cells"
+        _draw_polygons(corners, None if values is None else values[owner]), f"{where}: its cells"
     )
 
 
-def _drawn(corners: NDArray[np.float64], values: NDArray | None) -> PIL.Image.Image:
+def _draw_polygons(corners: NDArray[np.float64], values: NDArray | None) -> PIL.Image.Image:
     """Draw polygons (K, 3 or 4, 2), shaded by their values (K,)."""
     import PIL.Image
     import PIL.ImageDraw
@@ -186,7 +186,7 @@ def _picture_html(picture: PIL.Image.Image, words: str) -> str:
     few.save(file, "PNG", optimize=True)
     data = base64.b64encode(file.getvalue()).decode("ascii")
     return (
-        f'<img alt="{_escaped(words)}" title="{_escaped(words)}" '
+        f'<img alt="{_escape_html(words)}" title="{_escape_html(words)}" '
         f'src="data:image/png;base64,{data}">'
     )
 
@@ -235,7 +235,7 @@ class Bar:
         bar = f'<progress value="{iteration}" max="{most}" style="width:20em"></progress>'
         return {
             "text/plain": f"tetopt: {words}",
-            "text/html": f"<div>{bar} {_escaped(words)}</div>",
+            "text/html": f"<div>{bar} {_escape_html(words)}</div>",
         }
 
 

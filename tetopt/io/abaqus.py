@@ -23,7 +23,7 @@ from tetopt.model.loads import (
     spring_constants,
 )
 from tetopt.model.materials import Materials, cells_of, without_moduli
-from tetopt.model.model import Model, described, element_facets, elements, mass_densities
+from tetopt.model.model import Model, element_facets, elements, header_lines, mass_densities
 from tetopt.model.sets import Sets
 from tetopt.system.incoming import regular_file
 
@@ -136,7 +136,7 @@ def _shared_sets(model: Model) -> set[str]:
 
 
 def _head(model: Model) -> str:
-    lines = described(model) + without_data(model)
+    lines = header_lines(model) + without_data(model)
     short = (part for line in lines for part in textwrap.wrap(plain(line), COMMENT_CHARACTERS))
     return f"{comment_lines(short, '** ')}*HEADING\n{comment_lines(['; '.join(lines[:3])])}"
 
@@ -145,12 +145,12 @@ def _mesh(model: Model) -> list[str]:
     """Return nodes, node sets and elements."""
     points, cells = elements(model)
     return [
-        f"*NODE\n{_numbered(_fitting(points))}",
+        f"*NODE\n{_number_rows(_fitting(points))}",
         *(
             f"*NSET, NSET={name}\n{_list(np.unique(element_facets(cells, members)))}"
             for name, members in model.sets.facets.items()
         ),
-        f"*ELEMENT, TYPE=C3D{cells.shape[1]}, ELSET={ALL_ELEMENTS}\n{_numbered(cells + 1)}",
+        f"*ELEMENT, TYPE=C3D{cells.shape[1]}, ELSET={ALL_ELEMENTS}\n{_number_rows(cells + 1)}",
     ]
 
 
@@ -168,7 +168,9 @@ def _materials(model: Model) -> list[str]:
         parts.append(f"*SOLID SECTION, ELSET={name}, MATERIAL={name}\n")
     if model.node_young is not None:
         temperatures = _temperatures(model, node_field(model.node_young, model.mesh, model.order))
-        parts.append(f"*INITIAL CONDITIONS, TYPE=TEMPERATURE\n{_numbered(_fitting(temperatures))}")
+        parts.append(
+            f"*INITIAL CONDITIONS, TYPE=TEMPERATURE\n{_number_rows(_fitting(temperatures))}"
+        )
     return parts
 
 
@@ -301,7 +303,7 @@ def _list(numbers: NDArray[np.int64]) -> str:
     return blocks(numbers + 1, separator=", ")
 
 
-def _numbered(array: NDArray) -> str:
+def _number_rows(array: NDArray) -> str:
     return rows(np.arange(1, len(array) + 1), array, separator=", ")
 
 
@@ -310,15 +312,15 @@ def _faces(members: NDArray[np.int64], letter: str = "S") -> str:
 
 
 def _number(value: float) -> str:
-    return repr(_shortened(value))
+    return repr(_shorten_number(value))
 
 
 def _fitting(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Round values so that none is longer than `NUMBER_CHARACTERS`."""
-    return np.array([_shortened(x) for x in values.ravel().tolist()]).reshape(values.shape)
+    return np.array([_shorten_number(x) for x in values.ravel().tolist()]).reshape(values.shape)
 
 
-def _shortened(value: float) -> float:
+def _shorten_number(value: float) -> float:
     if len(repr(value)) <= NUMBER_CHARACTERS:
         return value
     texts = (f"{value:.{digits}g}" for digits in range(16, 0, -1))

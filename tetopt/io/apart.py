@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.system.budget import address_bytes
-from tetopt.system.child import limit_self, signal_words, started
+from tetopt.system.child import limit_self, signal_words, start_child
 from tetopt.system.interpreter import python_command, python_environment
 
 # of memory for any file, after loading libraries: their buffers and small files
@@ -108,7 +108,7 @@ def _of_child(job: dict[str, Any], seconds: float) -> tuple[dict[str, Any] | Non
     """Return the answer of a child, None if it is incomplete, and its exit code; kill it after
     some seconds.
     """
-    with started(
+    with start_child(
         python_command("-m", "tetopt.io.apart"),
         python_environment(),
         stdin=subprocess.PIPE,
@@ -124,7 +124,7 @@ def _of_child(job: dict[str, Any], seconds: float) -> tuple[dict[str, Any] | Non
             with contextlib.suppress(BrokenPipeError):  # it ended early; its exit code tells why
                 child.stdin.write(json.dumps(job).encode())
                 child.stdin.close()
-            return _received(child.stdout), child.wait()
+            return _receive_answer(child.stdout), child.wait()
 
 
 # The answer: one line of JSON, followed by the arrays that it has marks for, in order.
@@ -147,7 +147,7 @@ def _sent(stream: IO[bytes], answer: dict[str, Any]) -> None:
     stream.flush()
 
 
-def _received(stream: IO[bytes]) -> dict[str, Any] | None:
+def _receive_answer(stream: IO[bytes]) -> dict[str, Any] | None:
     """Return the child's answer; None if it is incomplete."""
     line, pipe = stream.readline(), SimpleNamespace(read=stream.read)
 

@@ -19,9 +19,9 @@ from tetopt.model.materials import cells_of, density_of
 from tetopt.model.model import (
     STRESS_UNITS,
     Model,
-    described,
     element_facets,
     elements,
+    header_lines,
     mass_densities,
 )
 
@@ -170,7 +170,7 @@ def _parts(model: Model) -> list[_Part]:
 
 def _head(model: Model) -> str:
     return (
-        f'<?xml version="1.0" encoding="UTF-8"?>\n{xml_comment(described(model))}<febio_spec '
+        f'<?xml version="1.0" encoding="UTF-8"?>\n{xml_comment(header_lines(model))}<febio_spec '
         'version="4.0">\n'
         f'<Module type="solid">\n<units>{STUDIO_UNITS[model.units]}</units>\n</Module>\n'
     )

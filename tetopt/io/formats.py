@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tetopt.errors import InputError, warn
-from tetopt.interop.conversions import checked_fields
+from tetopt.interop.conversions import check_fields
 from tetopt.io.abaqus import abaqus
 from tetopt.io.febio import febio
 from tetopt.io.gmsh import gmsh22, gmsh41
@@ -164,7 +164,7 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
     Names of data and of the image are written as `tetopt.io.text.plain` shows them, escaped in XML;
     gmsh files have apostrophes instead of their quotes, and gmsh, legacy VTK and FEBio files only
     their first 240 characters. Names that become equal are numbered, and a warning lists the
-    changes. Replaces an existing file; call `tetopt.system.files.checked_output` first.
+    changes. Replaces an existing file; call `tetopt.system.files.check_output` first.
 
     Parameters
     ----------
@@ -226,7 +226,7 @@ def save_mesh(
     Points are in world coordinates, mm (RAS+); cells are positively oriented and of order 1 or 2.
     In VTK's formats each entry of `about` becomes a string in the field data, as JSON unless it is
     one already. `save_model` also writes sets, materials and loads. Replaces an existing file; call
-    `tetopt.system.files.checked_output` first.
+    `tetopt.system.files.check_output` first.
 
     Parameters
     ----------
@@ -294,20 +294,20 @@ def _ready(path: Path, model: Model, space: str, units: str) -> Model:
     if model.order == 2 and not kind.has_quadratic:
         able = ", ".join(name for name, other in FORMATS.items() if other.has_quadratic)
         raise InputError(f"{path}: only {able} support quadratic cells; omit `order` 2")
-    return _named(path, in_units(in_space(_checked(path, model), space), units))
+    return _rename_data(path, in_units(in_space(_check_model(path, model), space), units))
 
 
-def _checked(path: Path, model: Model) -> Model:
+def _check_model(path: Path, model: Model) -> Model:
     """Return the model with arrays of numbers for all data; InputError for data that do not fit the
     mesh or format.
 
     Models are records that anyone can build, and no writer checks them.
     """
     mesh, n_cells = model.mesh, len(model.mesh.cells)
-    cell_data = checked_fields(f"{path}: cell_data", model.cell_data, n_cells)
+    cell_data = check_fields(f"{path}: cell_data", model.cell_data, n_cells)
     point_data = {
         name: node_field(values, mesh, model.order)
-        for name, values in checked_fields(f"{path}: point_data", model.point_data).items()
+        for name, values in check_fields(f"{path}: point_data", model.point_data).items()
     }
     for name, values in (cell_data | point_data).items():
         most = np.iinfo(np.int64).max if path.suffix.lower() in EXACT_INTEGERS else MOST_OF_FLOATS
@@ -327,10 +327,10 @@ def _checked(path: Path, model: Model) -> Model:
         raise InputError(
             f"{path}: about: expected strings, or values in JSON's types, by name ({error})"
         ) from error
-    facets = _checked_sets(
+    facets = _check_sets(
         path, model.sets.facets, (n_cells, mesh.ndim + 1), "facets as rows (cell, opposite node)"
     )
-    cells = _checked_sets(path, model.sets.cells, (n_cells,), "cells by number")
+    cells = _check_sets(path, model.sets.cells, (n_cells,), "cells by number")
     for load in model.loads:
         if load.set_name:
             known_set(load.set_name, model.sets)
@@ -346,7 +346,7 @@ def _checked(path: Path, model: Model) -> Model:
     return model._replace(cell_data=cell_data, point_data=point_data, sets=Sets(facets, cells))
 
 
-def _checked_sets(
+def _check_sets(
     path: Path, sets: Mapping[str, ArrayLike], ends: tuple[int, ...], what: str
 ) -> dict[str, NDArray[np.int64]]:
     """Return the sets as arrays; InputError unless each has ascending rows of integers from 0 to
@@ -387,7 +387,7 @@ def _check_materials(path: Path, table: Materials, n_cells: int) -> None:
             )
 
 
-def _named(path: Path, model: Model) -> Model:
+def _rename_data(path: Path, model: Model) -> Model:
     """Rename data as the format requires; a warning lists the changed names.
 
     Raises

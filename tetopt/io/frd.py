@@ -130,7 +130,7 @@ def read_frd(path: str | Path, mesh: Mesh) -> Results:
     >>> tetopt.save_mesh("solved.vtu", mesh, point_data=results.point_data)
     """
     path = Path(path)
-    whole = _checked_bytes(path)
+    whole = _check_bytes(path)
     stages = _stages(path, whole)
     # the last increment of each
     of_steps = {stage.step: number for number, stage in enumerate(stages)}
@@ -150,7 +150,7 @@ def read_frd(path: str | Path, mesh: Mesh) -> Results:
     stated = re.findall(rf"units: m+, ({'|'.join(STRESS_UNITS)}),", head)
     units = STRESS_UNITS[stated[0] if stated else "kPa"]
     grid = grid._replace(points=grid.points * units.mm)
-    order, space = _checked_mesh(
+    order, space = _check_mesh(
         path, mesh, grid, tuple(each.lower() for each in spaces[:1]) or SPACES
     )
     notes = [] if stated else [f"{path.name} does not state its units: assuming mm and kPa"]
@@ -175,7 +175,7 @@ def read_frd(path: str | Path, mesh: Mesh) -> Results:
     )
 
 
-def _checked_bytes(path: Path) -> bytes:
+def _check_bytes(path: Path) -> bytes:
     regular_file(path, "file of CalculiX's results (.frd)")
     with path.open("rb") as stream:
         if stream.read(6) != b"    1C":
@@ -221,7 +221,7 @@ def _grid_of(path: str, numbers: list[int]) -> tuple[Any, ...]:
     return np.asarray(grid.points), ids, cells, n_times, arrays
 
 
-def _checked_mesh(path: Path, mesh: Mesh, grid: _Grid, spaces: tuple[str, ...]) -> tuple[int, str]:
+def _check_mesh(path: Path, mesh: Mesh, grid: _Grid, spaces: tuple[str, ...]) -> tuple[int, str]:
     """Return the order of cells and the convention of axes; InputError for another mesh."""
     if mesh.ndim != 3:
         raise InputError(

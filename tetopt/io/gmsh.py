@@ -49,7 +49,7 @@ from tetopt.io.tags import (
     as_columns,
     group_labels,
     group_of_zero,
-    numbered_parts,
+    number_parts,
     remarks,
     renumbered_labels,
     tag_lines,
@@ -120,7 +120,7 @@ def own_comments(lines: list[str]) -> OwnComments | None:
 
 def incomplete_groups(model: Model) -> list[str]:
     """Return the facet sets whose group in 2.2 lacks facets that are also in a smaller set."""
-    _, facets = numbered_parts(model)
+    _, facets = number_parts(model)
     in_several = [groups[1:] for groups in facets.groups_of.values()]
     return [
         facets.names[number]
@@ -269,7 +269,7 @@ def _nodes(model: Model, cells: NDArray[np.int64], part: Part) -> NDArray[np.int
 
 def _parts(model: Model) -> list[Part]:
     """Return the cells and, if they are in sets, the facets."""
-    return [part for part in numbered_parts(model) if len(part.numbers)]
+    return [part for part in number_parts(model) if len(part.numbers)]
 
 
 def _is_of_labels(model: Model, labels: NDArray[np.int64]) -> bool:

@@ -89,7 +89,7 @@ def load_image(
     slice_ : (axis, index), optional
         Return one slice of a 3-D volume as a 2-D image, see `image_slice`.
     crop : sequence of (start, stop), optional
-        Keep a box of voxels, see `cropped`; one range per axis of the volume. Both `slice_` and
+        Keep a box of voxels, see `crop_image`; one range per axis of the volume. Both `slice_` and
         `crop` count voxels of the uncropped volume, and the slice must lie inside the crop.
     spacing_mm : float or sequence of float, optional
         Voxel sizes, mm, of a TIFF stack or a folder of slices that states none, one number or one
@@ -206,7 +206,7 @@ def save_image(path: str | Path, image: Image) -> None:
     float64. An axis with more voxels than NIfTI-1 supports makes it a NIfTI-2 file.
 
     A 2-D image becomes a 2-D file in the plane z = 0, which `load_image` reads back unchanged.
-    Replaces an existing file; call `tetopt.system.files.checked_output` first.
+    Replaces an existing file; call `tetopt.system.files.check_output` first.
     `tetopt.io.zarr_images.save_zarr` writes a Zarr folder (.zarr) of a 3-D image.
 
     Parameters
@@ -327,7 +327,7 @@ def _check_slice(shape: Sequence[int], axis: int, index: int) -> None:
         )
 
 
-def cropped(image: Image, bounds: Bounds) -> Image:
+def crop_image(image: Image, bounds: Bounds) -> Image:
     """Return the voxels inside a box of indices; every voxel keeps its world position.
 
     Parameters
@@ -348,11 +348,11 @@ def cropped(image: Image, bounds: Bounds) -> Image:
     >>> small.shape, small.to_world([0, 0])
     ((20, 50), array([10.,  0.]))
     """
-    return image.box(*zip(*checked_bounds(image.shape, bounds), strict=True))
+    return image.box(*zip(*check_bounds(image.shape, bounds), strict=True))
 
 
 def parse_crop(text: str) -> list[tuple[int | None, int | None]]:
-    """Parse crop bounds from a command line, one start:stop per axis, for `cropped`.
+    """Parse crop bounds from a command line, one start:stop per axis, for `crop_image`.
 
     Raises
     ------
@@ -479,7 +479,7 @@ def folder_checksum(path: Path, is_read: Callable[[Path], bool]) -> str:
     """
     digest, known = hashlib.sha256(), set()
     files: dict[str, Path] = {}
-    for folder, folders, names in os.walk(path, followlinks=True, onerror=_raised):
+    for folder, folders, names in os.walk(path, followlinks=True, onerror=_raise_error):
         status = os.stat(folder)
         if (status.st_dev, status.st_ino) in known:
             folders.clear()
@@ -511,7 +511,7 @@ def _digest_file(digest: Any, file: Path) -> None:
             digest.update(block)
 
 
-def _raised(error: OSError) -> None:
+def _raise_error(error: OSError) -> None:
     raise error
 
 
@@ -594,17 +594,17 @@ def part_of(image: Image, slice_: tuple[int, int] | None, crop: Bounds | None) -
     shift.
     """
     if slice_ is None:
-        return image if crop is None else cropped(image, crop)
+        return image if crop is None else crop_image(image, crop)
     bounds = _box_of(image.shape, slice_, crop)
     plane = image_slice(image, *slice_)
-    return cropped(plane, bounds[: slice_[0]] + bounds[slice_[0] + 1 :])
+    return crop_image(plane, bounds[: slice_[0]] + bounds[slice_[0] + 1 :])
 
 
 def _box_of(
     shape: Sequence[int], slice_: tuple[int, int] | None, crop: Bounds | None
 ) -> list[tuple[int, int]]:
     """Return the box of indices that a crop and a slice have in common."""
-    bounds = [(0, size) for size in shape] if crop is None else checked_bounds(shape, crop)
+    bounds = [(0, size) for size in shape] if crop is None else check_bounds(shape, crop)
     if slice_ is not None:
         axis, index = slice_
         _check_slice(shape, axis, index)
@@ -617,7 +617,7 @@ def _box_of(
     return bounds
 
 
-def checked_bounds(shape: Sequence[int], bounds: Bounds) -> list[tuple[int, int]]:
+def check_bounds(shape: Sequence[int], bounds: Bounds) -> list[tuple[int, int]]:
     """Return the bounds with open ends filled in, after checking them."""
     if len(bounds) != len(shape):
         raise InputError(f"crop: expected {len(shape)} ranges for shape {shape}, got {len(bounds)}")

@@ -93,7 +93,7 @@ class VoxelHeader(NamedTuple):
     n_bytes: int  # of the header itself, if voxels follow
 
 
-def checked_header(path: Path) -> tuple[VoxelHeader, int]:
+def check_header(path: Path) -> tuple[VoxelHeader, int]:
     """Return the header, and the number of bytes of all files of the image.
 
     Raises
@@ -103,14 +103,14 @@ def checked_header(path: Path) -> tuple[VoxelHeader, int]:
         data file is not next to the header, or is not a regular file.
     """
     header = read_header(path)
-    n_bytes = _checked_bytes(path, header)
+    n_bytes = _check_bytes(path, header)
     if header.ratio == DEFLATE_RATIO and path.suffix.lower() not in NRRD_SUFFIXES:
         _check_packed(path, header)
     check_room(header.sizes, header.value_bytes // max(math.prod(header.sizes), 1))
     return header, n_bytes
 
 
-def _checked_bytes(path: Path, header: VoxelHeader) -> int:
+def _check_bytes(path: Path, header: VoxelHeader) -> int:
     """Return the number of bytes of all files of the image; InputError if its header declares
     more, or far fewer.
     """
@@ -152,7 +152,7 @@ def _check_packed(path: Path, header: VoxelHeader) -> None:
 
 def data_files(path: Path) -> list[Path]:
     """Return the data files of a header, empty if the voxels follow it; InputError for reasons
-    of `checked_header`.
+    of `check_header`.
     """
     return _data_files(path, read_header(path))
 
@@ -165,16 +165,16 @@ def _data_files(path: Path, header: VoxelHeader) -> list[Path]:
 
 def header_sizes(path: Path) -> tuple[int, ...]:
     """Return the lengths of the axes in the header; InputError for the reasons of
-    `checked_header` in the header.
+    `check_header` in the header.
     """
     return tuple(read_header(path).sizes)
 
 
 def read_header(path: Path) -> VoxelHeader:
-    """Return the header of a file; InputError for the reasons of `checked_header` in the header."""
+    """Return the header of a file; InputError for the reasons of `check_header` in the header."""
     with path.open("rb") as stream:
         head = stream.read(HEADER_BYTES)
-    header = _parsed(head, path.suffix.lower() in NRRD_SUFFIXES)
+    header = _parse_head(head, path.suffix.lower() in NRRD_SUFFIXES)
     if header.files and len(head) == HEADER_BYTES:  # the rest might name other files
         raise InputError(
             f"{UNREADABLE_FILE} (a header of more than {HEADER_BYTES} bytes with separate data "
@@ -211,7 +211,7 @@ def _n_axes(text: str) -> int:
     return int(text)
 
 
-def _parsed(head: bytes, is_nrrd: bool) -> VoxelHeader:
+def _parse_head(head: bytes, is_nrrd: bool) -> VoxelHeader:
     """Parse the first bytes of a file as a header; `Names` are those of the format's fields."""
     names = NRRD_NAMES if is_nrrd else METAIMAGE_NAMES
     stated, texts, files, n_bytes = _lines(head, names)

@@ -152,17 +152,17 @@ def _entries(path: Path, lines: list[tuple[int, str]]) -> Iterator[LabelEntry]:
     """Yield the labels of the lines, all in the format of the first line."""
     first = lines[0][1]
     if SNAP_LINE.fullmatch(first):
-        yield from _matched(
+        yield from _match_lines(
             path, lines, SNAP_LINE, 'label, red, green, blue, opacity, 1, 1, "name", as in ITK-SNAP'
         )
     elif LUT_LINE.fullmatch(first):
         words = "label, name, red, green, blue, opacity, as in FreeSurfer and 3D Slicer"
-        yield from _matched(path, lines, LUT_LINE, words)
+        yield from _match_lines(path, lines, LUT_LINE, words)
     else:
         yield from _of_columns(path, lines)
 
 
-def _matched(
+def _match_lines(
     path: Path, lines: list[tuple[int, str]], pattern: re.Pattern[str], form: str
 ) -> Iterator[LabelEntry]:
     for number, line in lines:

@@ -1,6 +1,6 @@
 """Meshes for medit (INRIA) and programs that read its files: FreeFEM, Mmg, SfePy, libMeshb.
 
-A tetrahedron (in 2-D a triangle) has one reference, a number of `tetopt.io.tags.numbered_parts`:
+A tetrahedron (in 2-D a triangle) has one reference, a number of `tetopt.io.tags.number_parts`:
 its label, or without labels its material's number. If materials or cell sets divide a label, each
 part has its own reference. Similarly, the reference of a triangle (in 2-D an edge) represents a
 combination of facet sets, also inside the mesh; a facet that two sets hold from opposite sides is
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tetopt.io.tags import (
     all_sets,
     label_lines,
-    numbered_parts,
+    number_parts,
     remarks,
     tag_lines,
     without_data,
@@ -36,11 +36,11 @@ def medit(model: Model) -> bytes:
     Raises
     ------
     InputError
-        For the reasons of `tetopt.io.tags.numbered_parts`.
+        For the reasons of `tetopt.io.tags.number_parts`.
     """
     mesh = model.mesh
     points, nodes = elements(model)
-    in_cells, on_facets = numbered_parts(model)
+    in_cells, on_facets = number_parts(model)
     cells, sides = (
         f"{ELEMENT_KEYWORDS[dim]}{'P2' if model.order == 2 else ''}"
         for dim in (mesh.ndim, mesh.ndim - 1)

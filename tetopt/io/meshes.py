@@ -202,7 +202,7 @@ def _read_vtk(path: Path) -> Raw:
         name: {kind: values[chosen] for kind, chosen in rows_of_kind.items()}
         for name, values in grid.cell_data.items()
     }
-    field_data = {name: _decoded(values) for name, values in grid.field_data.items()}
+    field_data = {name: _decode_text(values) for name, values in grid.field_data.items()}
     # e.g. vtkGhostType
     own = {name: values for name, values in grid.point_data.items() if not name.startswith("vtk")}
     raw = Raw(
@@ -228,7 +228,7 @@ def _space(path: Path, field_data: dict[str, NDArray]) -> str:
     return "lps" if "lps" in words.lower() else "ras"
 
 
-def _decoded(values: NDArray) -> NDArray:
+def _decode_text(values: NDArray) -> NDArray:
     """Decode UTF-8 bytes, as tetopt writes texts, to an array of one string; return other values
     unchanged.
     """

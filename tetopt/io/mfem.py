@@ -1,7 +1,7 @@
 """Meshes for MFEM and programs based on it: mesh format v1.3, with named sets of attributes (read
 by MFEM 4.10).
 
-An element has one attribute, a number of `tetopt.io.tags.numbered_parts`: its label, or without
+An element has one attribute, a number of `tetopt.io.tags.number_parts`: its label, or without
 labels its material's number. If materials or cell sets divide a label, each part has its own
 attribute. The named sets of the labels, "material_1", ... and those of the cell sets list their
 attributes. Similarly, the attribute of a boundary element represents a combination of facet sets.
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from tetopt.io.tags import (
     all_sets,
     label_lines,
-    numbered_parts,
+    number_parts,
     remarks,
     tag_lines,
     without_data,
@@ -53,10 +53,10 @@ def mfem(model: Model) -> bytes:
     Raises
     ------
     InputError
-        For the reasons of `tetopt.io.tags.numbered_parts`.
+        For the reasons of `tetopt.io.tags.number_parts`.
     """
     mesh = model.mesh
-    in_cells, on_facets = numbered_parts(model)
+    in_cells, on_facets = number_parts(model)
     cell_sets = all_sets(in_cells)
     comments = [
         *remarks(model),

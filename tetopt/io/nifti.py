@@ -149,14 +149,14 @@ def _files_of(path: Path) -> tuple[Path, Path]:
     return files[0], files[-1]
 
 
-def _opened(path: Path) -> Any:
+def _open_nifti(path: Path) -> Any:
     return gzip.open(path) if path.name.lower().endswith(PACKED_SUFFIXES) else path.open("rb")
 
 
 def _header_of(path: Path) -> tuple[Any, bytes]:
     """Return nibabel's header, checked and repaired, and the first bytes of the file."""
     try:
-        with _opened(path) as stream:
+        with _open_nifti(path) as stream:
             head = stream.read(NIFTI_HEAD_BYTES)
     except FILE_ERRORS as error:
         raise _of_gzip(error) from error
@@ -274,7 +274,9 @@ def _voxels(
     check_room(sides if is_packed else [stop - start for start, stop in bounds], dtype.itemsize)
     begin += first * step
     if is_packed:
-        size, source = _unpacked(path, begin, begin + (last - first) * step, whole + TRAILING_BYTES)
+        size, source = _unpack_gzip(
+            path, begin, begin + (last - first) * step, whole + TRAILING_BYTES
+        )
         begin = 0
     else:
         source = str(path.absolute())  # nibabel expands a leading ~ to the home folder
@@ -303,7 +305,7 @@ def _voxels(
         raise InputError(f"{DAMAGED_FILE} ({one_line(error)})") from error
 
 
-def _unpacked(path: Path, begin: int, end: int, most: int) -> tuple[int, io.BytesIO]:
+def _unpack_gzip(path: Path, begin: int, end: int, most: int) -> tuple[int, io.BytesIO]:
     """Unpack a gzip file to its end, in blocks; return its size and its bytes from `begin` to
     `end`.
 

@@ -3,8 +3,8 @@ segmentations.
 
 A file has one frame or many; each frame states where it lies, itself or by what the file states of
 all. The frames of one volume, of one file or of a whole series, are sorted by position and checked
-in one place (`_placed`): parallel, evenly spaced, one of each position. A segmentation leaves out
-empty frames, so its slices may be missing.
+in one place (`_place_frames`): parallel, evenly spaced, one of each position. A segmentation leaves
+out empty frames, so its slices may be missing.
 """
 
 from __future__ import annotations
@@ -209,10 +209,10 @@ def image_of(path: str, volume: int | None) -> tuple[NDArray, NDArray[np.float64
     _check_sizes(files)
     _check_world(files)
     frames = _one_volume([frame for file in files for frame in _frames(file, notes)], volume)
-    grid = _placed(frames, notes, is_sparse=is_segmentation)
+    grid = _place_frames(frames, notes, is_sparse=is_segmentation)
     shape = (grid.n_slices, *files[0].size[::-1])
     check_room(shape[::-1], np.dtype(np.float32).itemsize)
-    data = (_segmented if is_segmentation else _rescaled)(frames, grid, shape, notes)
+    data = (_number_segments if is_segmentation else _rescale_frames)(frames, grid, shape, notes)
     return data.T, grid.affine, notes
 
 
@@ -286,7 +286,7 @@ def _srgb(lab: Sequence[int]) -> list[float]:
 def _series(path: Path, notes: list[str]) -> list[DicomFile]:
     """Open the file, or the files of the one series in a folder, in the order of their names."""
     if not path.is_dir():
-        file = _opened(path, "the file")
+        file = _open_dicom(path, "the file")
         if file is None:
             raise InputError(UNREADABLE_FILE)
         if words := _no_voxels(file):
@@ -296,7 +296,7 @@ def _series(path: Path, notes: list[str]) -> list[DicomFile]:
     for each in sorted(
         file for file in path.iterdir() if file.is_file() and file.name.upper() != "DICOMDIR"
     ):
-        file = _opened(each, f"the DICOM file {each.name}") if is_dicom(each) else None
+        file = _open_dicom(each, f"the DICOM file {each.name}") if is_dicom(each) else None
         if file is None:
             continue
         if (words := _no_voxels(file)) and "Rows" in file.tags:
@@ -343,7 +343,7 @@ def is_dicom(path: Path) -> bool:
     return head[128:] == b"DICM" or FIRST_TAGS.match(head) is not None
 
 
-def _opened(path: Path, name: str) -> DicomFile | None:
+def _open_dicom(path: Path, name: str) -> DicomFile | None:
     """Open a file whole; None if it is not DICOM."""
     import pydicom
 
@@ -513,7 +513,7 @@ def _frames(file: DicomFile, notes: list[str]) -> list[Frame]:
                 f"{file.name} has {n} frames, but states where {len(own)} lie; export it again"
             )
         is_plain = not own and n > 1
-        places = _stacked(file, notes) if is_plain and not file.is_segmentation else None
+        places = _stack_frames(file, notes) if is_plain and not file.is_segmentation else None
         frames = [_frame(file, k, (own[k] if own else {}, shared)) for k in range(n)]
         return (
             frames
@@ -595,7 +595,7 @@ def _numbers(name: str, keyword: str, source: Callable[[], Any], count: int) -> 
     return tuple(numbers)
 
 
-def _stacked(file: DicomFile, notes: list[str]) -> list[tuple[float, ...]]:
+def _stack_frames(file: DicomFile, notes: list[str]) -> list[tuple[float, ...]]:
     """Return the places of frames without functional groups, where the file states a distance
     between them.
     """
@@ -658,7 +658,7 @@ def _one_volume(frames: list[Frame], volume: int | None) -> list[Frame]:
 # Places
 
 
-def _placed(frames: list[Frame], notes: list[str], *, is_sparse: bool) -> FrameGrid:
+def _place_frames(frames: list[Frame], notes: list[str], *, is_sparse: bool) -> FrameGrid:
     """Return the grid of frames from their own positions; raise InputError unless they are those of
     a volume.
 
@@ -868,7 +868,7 @@ def _planes(frames: list[Frame]) -> Iterator[NDArray]:
         int(file.tags.BitsAllocated) == 1
         and not file.tags.file_meta.TransferSyntaxUID.is_compressed
     ):
-        yield from _unpacked(file, indices)
+        yield from _unpack_bits(file, indices)
         return
     if low := _low_bits(file):  # pydicom takes the highest bit to be that of the number of bits
         file.tags.BitsStored += low
@@ -886,7 +886,7 @@ def _planes(frames: list[Frame]) -> Iterator[NDArray]:
         )
 
 
-def _unpacked(file: DicomFile, indices: list[int]) -> Iterator[NDArray]:
+def _unpack_bits(file: DicomFile, indices: list[int]) -> Iterator[NDArray]:
     """Yield frames of single bits, which follow each other without padding; pydicom reads bytes
     too few for some.
     """
@@ -908,7 +908,7 @@ def _low_bits(file: DicomFile) -> int:
     )
 
 
-def _rescaled(
+def _rescale_frames(
     frames: list[Frame], grid: FrameGrid, shape: tuple[int, int, int], notes: list[str]
 ) -> NDArray:
     """Return the values of frames, each rescaled as it states."""
@@ -931,7 +931,7 @@ def _rescaled(
     return data
 
 
-def _segmented(
+def _number_segments(
     frames: list[Frame], grid: FrameGrid, shape: tuple[int, int, int], notes: list[str]
 ) -> NDArray:
     """Return the segments' numbers; where segments overlap, the larger number, or the larger
@@ -961,7 +961,7 @@ def _segmented(
             "its segments are fractions: voxels belong to the largest, if it is "
             f"{SEGMENT_FRACTION:g} or more"
         )
-    return _labelled(frames, slices, data, whole, names, notes)
+    return _write_segments(frames, slices, data, whole, names, notes)
 
 
 def _clear(data: NDArray, outside: set[int], names: dict[int, str], notes: list[str]) -> None:
@@ -982,7 +982,7 @@ def _clear(data: NDArray, outside: set[int], names: dict[int, str], notes: list[
     data[np.isin(data, [*outside, *unknown])] = 0
 
 
-def _labelled(
+def _write_segments(
     frames: list[Frame],
     slices: NDArray[np.int64],
     data: NDArray,

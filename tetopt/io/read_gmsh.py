@@ -77,11 +77,11 @@ def _msh(file: meshio.Mesh, text: bytes) -> Raw:
     raw = by_corners(Raw(points, cells, cell_data, point_data, {}, [], "ras"))
     groups = _groups(raw.cells, raw.cell_data, _physical_names(text), _groups_of_entities(text))
     comments = own_comments(_section(text, "Comments").decode("utf-8", "replace").splitlines())
-    raw = _labelled(raw._replace(groups=groups), comments)
+    raw = _label_cells(raw._replace(groups=groups), comments)
     return raw if comments is None else _of_ours(raw, comments)
 
 
-def _labelled(raw: Raw, comments: OwnComments | None) -> Raw:
+def _label_cells(raw: Raw, comments: OwnComments | None) -> Raw:
     """Use the numbers and names of groups as labels of cells, if each cell is in one group.
 
     Not done if there are other labels already, or if the groups of a file of tetopt's are not

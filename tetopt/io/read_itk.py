@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 from tetopt.io.apart import read_apart
 from tetopt.io.contradictions import notes_of_metaimage, notes_of_nrrd, notes_of_rest
-from tetopt.io.itk_headers import NRRD_SUFFIXES, checked_header, data_files, header_sizes
+from tetopt.io.itk_headers import NRRD_SUFFIXES, check_header, data_files, header_sizes
 from tetopt.io.segments import labels_of_layers, segments_of
 from tetopt.io.units import mm_of_axes, notes_of_size
 from tetopt.io.volumes import UNREADABLE_FILE, Reader, Request, one_line, volume_index
@@ -36,7 +36,7 @@ SPATIAL_KINDS = ("domain", "space", "???", "none")
 def read_itk(path: Path, request: Request, notes: list[str]) -> tuple[NDArray, NDArray[np.float64]]:
     """Return data and affine of a file; InputError without a leading path."""
     _check_installed()
-    header, size = checked_header(path)
+    header, size = check_header(path)
     is_nrrd = path.suffix.lower() in NRRD_SUFFIXES
     about = (
         notes_of_nrrd(dict(header.stated), header.sizes)

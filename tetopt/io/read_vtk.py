@@ -29,10 +29,10 @@ def read_vtk(path: Path) -> RawGrid:
         Without a leading path: the file is damaged, or VTK crashes on it; it has another data set,
         or no cells.
     """
-    return checked_grid(*read_apart(arrays_of, path, library="VTK"))
+    return check_grid(*read_apart(arrays_of, path, library="VTK"))
 
 
-def checked_grid(kind: str, errors: str, arrays: dict[str, Any]) -> RawGrid:
+def check_grid(kind: str, errors: str, arrays: dict[str, Any]) -> RawGrid:
     """Convert the result of `arrays_of` to a grid after checking that its arrays are consistent.
 
     Raises

@@ -105,7 +105,7 @@ def labels_of_layers(layers: NDArray, segments: list[Segment], notes: list[str])
         )
     if [each.label for each in segments] != [each.value for each in segments]:
         notes.append(
-            f"its segments share label values; they are numbered in order: {_numbered(names)}"
+            f"its segments share label values; they are numbered in order: {_segment_words(names)}"
         )
     labels = np.zeros(layers.shape[:-1], np.int32)
     is_free = (layers != 0).any(axis=-1)
@@ -134,7 +134,7 @@ def labels_of_layers(layers: NDArray, segments: list[Segment], notes: list[str])
     return labels
 
 
-def _numbered(names: Mapping[int, str]) -> str:
+def _segment_words(names: Mapping[int, str]) -> str:
     shown = [f"{label} {name}" for label, name in names.items()]
     return ", ".join(shown[:8]) + (f" and {len(shown) - 8} more" if len(shown) > 8 else "")
 

@@ -119,10 +119,10 @@ def read_pictures(
     if tiff.voxels is None:
         data, affine = read_picture(path, request.volume)
         affine[:2] *= 1.0 if steps is None else steps[:, None]
-        return _scaled(data, tiff.scale), affine
+        return _scale_values(data, tiff.scale), affine
     if steps is None:
         raise InputError(_no_sizes(f"stack of {tiff.voxels.shape[2]}", tiff))
-    return _scaled(tiff.voxels, tiff.scale), _affine(steps)
+    return _scale_values(tiff.voxels, tiff.scale), _affine(steps)
 
 
 def read_slices(
@@ -148,7 +148,7 @@ def read_slices(
     assert tiff.voxels is not None
     steps = _steps(tiff, 3, request.spacing_mm, notes)
     assert steps is not None
-    return _scaled(tiff.voxels, tiff.scale), _affine(steps)
+    return _scale_values(tiff.voxels, tiff.scale), _affine(steps)
 
 
 PICTURES = Reader(PICTURE_SUFFIXES, read_pictures, has_spacing=False)
@@ -186,7 +186,7 @@ def _no_sizes(what: str, tiff: Tiff) -> str:
     )
 
 
-def _scaled(values: NDArray, scale: Sequence[float]) -> NDArray:
+def _scale_values(values: NDArray, scale: Sequence[float]) -> NDArray:
     slope, intercept = scale
     if (slope, intercept) == (1.0, 0.0):
         return values
@@ -329,7 +329,7 @@ def _stack_of(path: str, is_page: bool) -> Tiff:
         raise InputError(f"{UNREADABLE_FILE} (tifffile: {one_line(error)[:200]})") from error
     with file:
         first = file.pages.first
-        tiff = _stated(first)
+        tiff = _tiff_of(first)
         if is_page:
             return tiff
         series = file.series
@@ -408,7 +408,7 @@ def _stack_of(path: str, is_page: bool) -> Tiff:
         return tiff._replace(voxels=np.flip(data, flips).T, notes=notes)
 
 
-def _stated(page: Any) -> Tiff:
+def _tiff_of(page: Any) -> Tiff:
     """Return what a page states of its voxels."""
     notes = []
     if page.photometric == 0:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.surface import Surface, extract_surface
-from tetopt.interop.conversions import checked_fields
+from tetopt.interop.conversions import check_fields
 from tetopt.io.readback import save_checked
 from tetopt.io.text import plain
 from tetopt.io.vtk import LEGACY_VERSION, written_bytes, xml_bytes
@@ -61,7 +61,7 @@ def save_surface(
 
     The header states the coordinates' convention in 3D Slicer's form. All formats except STL, which
     rounds to float32, keep every bit of the points and their order. Replaces an existing file; call
-    `tetopt.system.files.checked_output` first.
+    `tetopt.system.files.check_output` first.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def save_surface(
             "first a letter, "
             f'got "{plain(odd[0])}"; rename them'
         )
-    surface, labels = _checked(path, surface, labels)
+    surface, labels = _check_arrays(path, surface, labels)
     if space not in SPACES:
         raise InputError(f"space: expected {' or '.join(SPACES)}, got {plain(space)}")
     if space == "lps":
@@ -113,14 +113,14 @@ def save_surface(
     save_checked(path, whole)
 
 
-def _checked(path: Path, surface: Surface, labels: Labels | None) -> tuple[Surface, Labels]:
+def _check_arrays(path: Path, surface: Surface, labels: Labels | None) -> tuple[Surface, Labels]:
     """Return the surface and labels as arrays; InputError for triangles or labels that do not
     fit.
     """
     points, triangles = simplex_arrays(f"{path}: surface", surface.points, surface.triangles, 3)
     if points.shape[1] != 3:
         raise InputError(f"{path}: expected points in space, got shape {points.shape}")
-    arrays, range_ = checked_fields(f"{path}: labels", labels, len(triangles)), np.iinfo(np.int32)
+    arrays, range_ = check_fields(f"{path}: labels", labels, len(triangles)), np.iinfo(np.int32)
     for name, values in arrays.items():
         if (
             values.ndim != 1
@@ -159,7 +159,7 @@ def _boundary(model: Model) -> tuple[Surface, str, str]:
     )
 
 
-def checked_surface(path: str | Path) -> SurfaceCheck:
+def check_surface(path: str | Path) -> SurfaceCheck:
     """Read a surface file, merge nodes in the same place, and check whether it is closed, by
     trimesh.
 

@@ -1,7 +1,7 @@
 """Shared code of mesh formats that have numbers for materials and sets, and comments for other
 data.
 
-`numbered_parts` gives each cell and each facet of a set one number. If cells have labels, the
+`number_parts` gives each cell and each facet of a set one number. If cells have labels, the
 number of a cell is its label; label 0, which formats treat as none, gets the number after the
 largest label. If a label exceeds `LARGEST_GROUP`, labels are numbered from 1, and comments list the
 label of each number. Otherwise it is the number of the cell's material, or without materials that
@@ -28,7 +28,7 @@ from tetopt.io.text import free_text
 from tetopt.mesh import Mesh
 from tetopt.model.labels import TABLE_TEXT, labels_of, table_of_words
 from tetopt.model.loads import load_words
-from tetopt.model.model import Model, described
+from tetopt.model.model import Model, header_lines
 from tetopt.model.sets import (
     BOUNDARY_SET,
     FACE_NAMES,
@@ -69,7 +69,7 @@ class Part(NamedTuple):
     sets: dict[str, list[int]]  # the entities of each set
 
 
-def tagged(sets: dict[str, NDArray[np.int64]]) -> Tagged:
+def tag_sets(sets: dict[str, NDArray[np.int64]]) -> Tagged:
     """Return one tag for each combination of sets that occurs, from 1 in the order of first
     occurrence.
 
@@ -105,7 +105,7 @@ def cell_tags(model: Model, labels: NDArray[np.int64] | None = None) -> Tagged:
         A cell set has the name of a material.
     """
     names = material_names(model, model.sets.cells)
-    combined = tagged(model.sets.cells)
+    combined = tag_sets(model.sets.cells)
     combination = np.zeros(len(model.mesh.cells), dtype=np.int64)
     combination[combined.items] = combined.tags
     material = np.zeros_like(combination) if model.materials is None else model.materials.of_cell
@@ -121,13 +121,13 @@ def cell_tags(model: Model, labels: NDArray[np.int64] | None = None) -> Tagged:
 
 
 def facet_tags(mesh: Mesh, sets: dict[str, NDArray[np.int64]]) -> Tagged:
-    """Return `tagged` for facet sets; a facet that sets hold from both of its sides is one item.
+    """Return `tag_sets` for facet sets; a facet that sets hold from both of its sides is one item.
 
     It is listed as in the first set that contains it; items are in the order of the facets' nodes.
     """
     of_cell = facets(mesh.cells).of_cell
     numbers = {name: of_cell[rows[:, 0], rows[:, 1]] for name, rows in sets.items()}
-    combined = tagged(numbers)
+    combined = tag_sets(numbers)
     if not sets:
         return combined._replace(items=np.empty((0, 2), dtype=np.int64))
     _, first = np.unique(np.concatenate(list(numbers.values())), return_index=True)
@@ -171,7 +171,7 @@ def without_labels(model: Model) -> Model:
     )
 
 
-def numbered_parts(model: Model) -> tuple[Part, Part]:
+def number_parts(model: Model) -> tuple[Part, Part]:
     """Return the cells, and the facets in sets; the module describes their numbers.
 
     Raises
@@ -348,10 +348,10 @@ def check_apart(names: list[str], taken: dict[str, NDArray[np.int64]]) -> None:
 
 
 def remarks(model: Model) -> list[str]:
-    """Return lines for the header of a mesh file: `described`, each material's constants, the
+    """Return lines for the header of a mesh file: `header_lines`, each material's constants, the
     loads.
     """
-    lines = described(model)
+    lines = header_lines(model)
     if model.materials is not None:
         pairs = zip(model.materials.young.tolist(), model.materials.nu.tolist(), strict=True)
         density = [] if model.materials.density is None else model.materials.density.tolist()

@@ -53,17 +53,19 @@ def plain(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(
-        letter if letter.isprintable() or unicodedata.category(letter) == "Zs" else _escaped(letter)
+        letter
+        if letter.isprintable() or unicodedata.category(letter) == "Zs"
+        else _escape_letter(letter)
         for letter in text
     )
 
 
-def counted(number: int, noun: str) -> str:
+def count_text(number: int, noun: str) -> str:
     """Format a number of things."""
     return f"{number} {noun}{'s' * (number != 1)}"
 
 
-def _escaped(letter: str) -> str:
+def _escape_letter(letter: str) -> str:
     return letter.encode("unicode_escape").decode("ascii")
 
 

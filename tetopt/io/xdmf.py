@@ -6,7 +6,7 @@ The domain has one grid, "mesh", as meshio requires, with cell data: first `mate
 are such sets, with one integer for each facet or cell in any set. A tag represents one combination
 of sets, so that a set has several tags: <Information Name="superior" Value="2 5"> in the grid lists
 them. The tag of a cell is its label, or another number if sets divide the label
-(`tetopt.io.tags.numbered_parts`). This program reads all data, on any number of processes::
+(`tetopt.io.tags.number_parts`). This program reads all data, on any number of processes::
 
     from xml.etree import ElementTree
 
@@ -97,11 +97,11 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.topology import facets
-from tetopt.io.tags import Tagged, as_columns, group_labels, numbered_parts, tagged
+from tetopt.io.tags import Tagged, as_columns, group_labels, number_parts, tag_sets
 from tetopt.io.text import rows, xml_attribute
 from tetopt.model.fields import NODE_MODULI, node_field
 from tetopt.model.loads import load_words
-from tetopt.model.model import Model, described, element_facets, elements
+from tetopt.model.model import Model, element_facets, elements, header_lines
 from tetopt.model.sets import Sets
 
 # By dimension and order, with VTK's order of nodes; lines must state their number of nodes.
@@ -160,7 +160,7 @@ def _mesh_grid(model: Model, others: str) -> str:
     references, and `others`.
     """
     fields = model.cell_data
-    named = [("about", line) for line in described(model)] + [
+    named = [("about", line) for line in header_lines(model)] + [
         ("load", load_words(load)) for load in model.loads
     ]
     if model.materials is not None:
@@ -169,7 +169,7 @@ def _mesh_grid(model: Model, others: str) -> str:
         if model.materials.density is not None:
             own["density"] = model.materials.density[of_cell]
         fields = own | {name: values for name, values in fields.items() if name not in own}
-        named += [("young", _listed(young)), ("nu", _listed(nu))]
+        named += [("young", _values_text(young)), ("nu", _values_text(nu))]
     points, cells = elements(model)
     nodal = {} if model.node_young is None else {NODE_MODULI: model.node_young}
     nodal |= model.point_data
@@ -204,9 +204,9 @@ def _columns(fields: dict[str, NDArray]) -> dict[str, NDArray]:
 
 def _cell_grid(model: Model) -> str:
     """Return the grid of cells in sets; if they have labels, a tag is the label."""
-    combined = tagged(model.sets.cells)
+    combined = tag_sets(model.sets.cells)
     if group_labels(model) is not None:
-        part, _ = numbered_parts(model._replace(materials=None, sets=Sets({}, model.sets.cells)))
+        part, _ = number_parts(model._replace(materials=None, sets=Sets({}, model.sets.cells)))
         combined = Tagged(combined.items, part.entities[combined.items], part.sets)
     return _tag_grid("cells", model, model.mesh.ndim, elements(model)[1][combined.items], combined)
 
@@ -222,7 +222,7 @@ def _facet_grid(model: Model) -> str:
         ]
         for name, members in sets.items()
     }
-    combined = tagged(number | {name: those for name, those in turned.items() if len(those)})
+    combined = tag_sets(number | {name: those for name, those in turned.items() if len(those)})
     nodes = element_facets(elements(model)[1], listed)
     return _tag_grid("facets", model, model.mesh.ndim - 1, nodes, combined)
 
@@ -281,5 +281,5 @@ def _information(name: str, value: str) -> str:
     )
 
 
-def _listed(values: NDArray[np.float64]) -> str:
+def _values_text(values: NDArray[np.float64]) -> str:
     return " ".join(map(repr, values.tolist()))

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from tetopt.errors import InputError
-from tetopt.image import check_kind, checked_affine, shifted_affine
+from tetopt.image import check_affine, check_kind, shifted_affine
 from tetopt.io.apart import read_apart
 from tetopt.io.text import plain
 from tetopt.io.units import mm_of_axes, notes_of_size
@@ -252,7 +252,7 @@ def save_zarr(
     Parameters
     ----------
     path : Path
-        Replaces an existing Zarr folder; call `tetopt.system.files.checked_output` first.
+        Replaces an existing Zarr folder; call `tetopt.system.files.check_output` first.
     affine : (4, 4) array
         Placement of the voxels.
     voxels : Any
@@ -382,7 +382,7 @@ def _level(path: Path, dataset: dict[str, Any], after: Sequence[dict], axes: _Ax
     affine[axes.rows, 3] = axes.steps * shift[axes.space]
     affine[3, 3] = 1.0
     return ZarrLevel(
-        path / array.path, array, axes.names, tuple(axes.space), checked_affine(affine, 3)
+        path / array.path, array, axes.names, tuple(axes.space), check_affine(affine, 3)
     )
 
 
@@ -448,7 +448,7 @@ def _unusable(what: str, value: object, expected: str) -> InputError:
 def _own_affine(array: Any) -> NDArray[np.float64] | None:
     """Return the attribute "affine" of an array, (4, 4), for its spatial axes in order."""
     affine = array.attrs.asdict().get("affine")
-    return None if affine is None else checked_affine(affine, 3)
+    return None if affine is None else check_affine(affine, 3)
 
 
 def _check_array(array: Any) -> None:

@@ -14,8 +14,8 @@ from tetopt.contents.labels import BACKGROUND_LABEL
 from tetopt.engine.loop import MeshingResult
 from tetopt.engine.meshing import Mode
 from tetopt.engine.surface import MOST_MEETING
-from tetopt.job.events import note, violated, warning
-from tetopt.job.inputs import listed
+from tetopt.job.events import note, report_violation, warning
+from tetopt.job.inputs import list_names
 from tetopt.job.options import Method
 from tetopt.measure.fidelity import LabelFidelity, MaskFidelity
 from tetopt.measure.interfaces import LabelInterface
@@ -65,7 +65,7 @@ class Problem(NamedTuple):
         return f"{self.text}; {self.remedy}" if self.remedy else self.text
 
 
-def agreed(problems: Iterable[Problem]) -> list[Problem]:
+def order_problems(problems: Iterable[Problem]) -> list[Problem]:
     """Return problems with the worst first: the violated, then the others in their order.
 
     The first one that wants smaller or larger cells decides: those that want the opposite lose
@@ -95,7 +95,7 @@ def tell(problems: Iterable[Problem]) -> None:
         if each.name is None:
             warning(each.words)
         else:
-            violated(each.words, None if each.is_failure else each.name)
+            report_violation(each.words, None if each.is_failure else each.name)
 
 
 def failures(failed: Mapping[str, str], known: Iterable[Problem]) -> Iterator[Problem]:
@@ -112,7 +112,7 @@ def failures(failed: Mapping[str, str], known: Iterable[Problem]) -> Iterator[Pr
         yield Problem(f"{name} could not be {verb}: {reason}; {left}", name=own, is_failure=True)
 
 
-def unmet(
+def unmet_requirements(
     requirements: Mapping[str, str], measured: dict[str, Any], word: str = "mask"
 ) -> Iterator[Problem]:
     """Yield violated `requirements` (`tetopt.measure.judge`), and lesser deviations from mask and
@@ -120,7 +120,7 @@ def unmet(
     """
     for name, words in requirements.items():
         yield Problem(words, name=name, wants=SMALLER_CELLS.get(name))
-    yield from _lost(measured, word)
+    yield from _lost_labels(measured, word)
     yield from _of_mask(measured.get("mask"), word)
     if n_dropped := measured.get("dropped_components"):
         text = (
@@ -138,11 +138,11 @@ def _dropped_words(measured: dict[str, Any]) -> str:
     voxels = {int(label): volume * mask.voxels / mask.volume for label, volume in volumes.items()}
     names = measured.get("label_names", {})
     rows = [f"label {label_words(label, names)} {size:.3g}" for label, size in voxels.items()]
-    of_labels = f" ({listed(rows)})" if measured.get("labels") else ""
+    of_labels = f" ({list_names(rows)})" if measured.get("labels") else ""
     return f", as large as {sum(voxels.values()):.3g} voxels{of_labels}"
 
 
-def _lost(measured: dict[str, Any], word: str) -> Iterator[Problem]:
+def _lost_labels(measured: dict[str, Any], word: str) -> Iterator[Problem]:
     """Yield small labels without a cell, and labels of poor volume or overlap, beyond those that
     violate the requirement.
     """
@@ -173,7 +173,7 @@ def _lost(measured: dict[str, Any], word: str) -> Iterator[Problem]:
         yield Problem(f"{text} (ratio in brackets): {worst}", **smaller(far, "allow more nodes"))
     poor = [row for row in others if row.voxels >= LABEL_VOXELS and row.dice < LABEL_DICE]
     if poor:
-        names = listed([words[row.label] for row in poor], 5)
+        names = list_names([words[row.label] for row in poor], 5)
         remedy = "allow more nodes, or check that these are labels, not intensities"
         yield Problem(f"Dice below {LABEL_DICE} for label {names}", **smaller(poor, remedy))
 
@@ -220,7 +220,7 @@ def beyond_requirements(measured: Mapping[str, Any], word: str = "mask") -> dict
                 )
     n_all = count_of_labels([row.label for row in rows])
     texts = [
-        f"{len(some)} {what}: {listed([each for _, each in sorted(some)], 5)}"
+        f"{len(some)} {what}: {list_names([each for _, each in sorted(some)], 5)}"
         for what, some in of_labels.items()
     ]
     return beyond | (
@@ -430,7 +430,7 @@ def of_layers(
             f"{label_words(row.label, names)} {row.cells_across:.2g} (edges {row.edge:.2g} mm)"
             for row in sorted(thin, key=lambda row: row.cells_across)
         ]
-        text = f"fewer than {cells_across:g} cells across: {listed(rows, 5)}"
+        text = f"fewer than {cells_across:g} cells across: {list_names(rows, 5)}"
         yield Problem(text, "allow more nodes", wants="smaller")
 
 

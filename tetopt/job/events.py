@@ -68,7 +68,7 @@ _LISTENER: ContextVar[Listener] = ContextVar("listener", default=_unheard)
 
 
 @contextmanager
-def listened(listener: Listener | None) -> Iterator[None]:
+def listen_with(listener: Listener | None) -> Iterator[None]:
     """Send events to a listener within this context; None keeps the current listener."""
     token = _LISTENER.set(_LISTENER.get() if listener is None else listener)
     try:
@@ -108,7 +108,7 @@ def time_words(seconds: float) -> str:
     return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"
 
 
-def started(
+def start_stage(
     stage: str, text: str = "", number: int | None = None, most_seconds: float | None = None
 ) -> None:
     """Report that a stage begins, which ends the previous one; `number` and `most_seconds` as in
@@ -132,7 +132,7 @@ def warning(text: str) -> None:
     _LISTENER.get()(Event("warning", text))
 
 
-def violated(text: str, name: str | None = None) -> None:
+def report_violation(text: str, name: str | None = None) -> None:
     """Report a violation; `name` is that of a run's requirement."""
     words = text if name is None else f"requirement violated: {name}: {text}"
     _LISTENER.get()(Event("violated", words, name))

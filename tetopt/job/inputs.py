@@ -16,7 +16,7 @@ import numpy as np
 from tetopt.contents.align import (
     SAME_BOX_VOXELS,
     SAME_GRID_VOXELS,
-    divided,
+    divide_voxels,
     divisions,
     in_box,
     is_same_grid,
@@ -25,7 +25,7 @@ from tetopt.contents.align import (
     resample_mask,
 )
 from tetopt.contents.domain import INSIDE_FRACTION
-from tetopt.contents.labels import checked_labels
+from tetopt.contents.labels import check_labels
 from tetopt.contents.probabilities import resample_tissue
 from tetopt.errors import InputError, Remark
 from tetopt.image import Image
@@ -58,7 +58,7 @@ from tetopt.model.labels import (
 )
 from tetopt.model.mappings import named_file
 from tetopt.start.label_sizes import EVERY_LABEL, LabelSize, parse_label_sizes
-from tetopt.system.files import checked_output
+from tetopt.system.files import check_output
 from tetopt.system.incoming import rows_of
 
 # of a mask's or labels' voxels: grids' differences do not explain more outside the image
@@ -110,7 +110,7 @@ def image_and_others(image: Image, path: Path, part: ImagePart, originals: Origi
     finer = {other: each for (other, _), each in originals.items()}
     factors = _divisions(whole, finer, None if slice_ is None else slice_[0])
     if max(factors) > 1:
-        whole = divided(whole, factors)
+        whole = divide_voxels(whole, factors)
         if crop is not None:
             crop = [
                 (None if a is None else a * f, None if b is None else b * f)
@@ -124,7 +124,7 @@ def image_and_others(image: Image, path: Path, part: ImagePart, originals: Origi
         # A contrast is divided like the image, so that on the same voxels it keeps its values.
         grid = coarse if aligned is resample_contrast else whole
         moved = aligned(original, grid, str(other))
-        moved = divided(moved, factors) if aligned is resample_contrast else moved
+        moved = divide_voxels(moved, factors) if aligned is resample_contrast else moved
         is_cropped = slice_ is None and crop is not None
         if not is_same_grid(original, grid, is_cropped=is_cropped):
             is_linear = aligned in (resample_contrast, resample_tissue)
@@ -162,7 +162,7 @@ def _divisions(image: Image, others: Mapping[Path, Image], across: int | None) -
     while max(factors) > 1 and prod((*image.shape, *factors)) > MOST_DIVIDED:
         factors[int(np.argmax(factors))] -= 1
     if max(needed) > 1:
-        names = listed(
+        names = list_names(
             [path for path, other in finer.items() if max(divisions(image, [other])) > 1]
         )
         note(
@@ -299,7 +299,8 @@ def read_mesh(path: Path) -> MeshFile:
         note(f"{path}: {line}")
     if violated := loaded.table("violated"):
         warning(
-            f"{path}: the run that built this mesh violated requirements: {listed(list(violated))}"
+            f"{path}: the run that built this mesh violated requirements: "
+            f"{list_names(list(violated))}"
         )
     return loaded
 
@@ -350,7 +351,7 @@ def read_mask(
     mask = read_companion(path, getattr(options, "spacing_mm", None))
     if words is None:
         return {(path, resample_mask): mask}
-    mask, table = checked_labels(str(path), mask, is_map=True), names_of
+    mask, table = check_labels(str(path), mask, is_map=True), names_of
     if table is None and str(path).lower().endswith((".seg.nrrd", ".dcm")):
         table = path
     names, present = (
@@ -364,7 +365,7 @@ def read_mask(
         except InputError as error:
             raise InputError(f"`mask_label`: {error}") from error
         if not np.isin(labels, present).any():
-            listed_words = listed(
+            listed_words = list_names(
                 [label_words(label, names) for label in present.tolist()], MASK_LABELS_LISTED
             )
             raise InputError(
@@ -391,7 +392,8 @@ def label_table(
         labels = None if loaded is None else labels_of(loaded.cell_data, len(loaded.mesh.cells))
         if labels is not None and not np.isin(labels, [*table.names, *table.colours]).any():
             warning(
-                f"{path}: contains none of the mesh's labels, {listed(np.unique(labels).tolist())}"
+                f"{path}: contains none of the mesh's labels, "
+                f"{list_names(np.unique(labels).tolist())}"
             )
         return table
     table = NO_TABLE if loaded is None else loaded.label_table
@@ -426,7 +428,7 @@ def _by_number(sizes: dict[int | str, LabelSize], table: LabelTable) -> dict[int
     if unknown := [name for name in sizes if name not in known]:
         raise InputError(
             f'label_size: no label has the name "{unknown[0]}"; '
-            f"{listed([*numbers]) or 'the labels have no names'}"
+            f"{list_names([*numbers]) or 'the labels have no names'}"
         )
     by_label: dict[int | str, LabelSize] = {}
     for name, size in known.items():
@@ -437,7 +439,7 @@ def _by_number(sizes: dict[int | str, LabelSize], table: LabelTable) -> dict[int
     return by_label
 
 
-def listed(names: Sequence[object], most: int = NAMES_LISTED) -> str:
+def list_names(names: Sequence[object], most: int = NAMES_LISTED) -> str:
     """Return the first names as a text, with the number of further ones."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(map(str, names[:most])) + more
@@ -472,9 +474,9 @@ def warn_of_other_image(
     return is_other
 
 
-def checked_outputs(folder: Path, names: Iterable[str], force: bool) -> dict[str, Path]:
-    """Return files in a folder by name; raise InputError as `checked_output`."""
-    return {name: checked_output(folder / name, (Path(name).suffix,), force) for name in names}
+def check_outputs(folder: Path, names: Iterable[str], force: bool) -> dict[str, Path]:
+    """Return files in a folder by name; raise InputError as `check_output`."""
+    return {name: check_output(folder / name, (Path(name).suffix,), force) for name in names}
 
 
 def set_threads(threads: int | None) -> None:

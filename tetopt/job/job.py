@@ -18,7 +18,7 @@ import numpy as np
 
 from tetopt.errors import InputError
 from tetopt.job.options import JobOptions, SizeOptions, kinds_of, near_hint, option_of
-from tetopt.job.plan import resolved
+from tetopt.job.plan import plan_job
 from tetopt.model.mappings import MAPPED_OPTIONS
 from tetopt.system.incoming import json_of
 
@@ -72,7 +72,7 @@ class Job(JobOptions):
         """Convert values to the types of their fields, and reject invalid ones."""
         for name in kinds_of(Job):
             object.__setattr__(self, name, _of_field(Job, name, getattr(self, name)))
-        resolved(self, reads_files=False)
+        plan_job(self, reads_files=False)
 
     def given(self) -> dict[str, Any]:
         """Return options that differ from the default, by name; paths as strings.
@@ -233,7 +233,8 @@ def _of_kind(name: str, kind: Any, value: Any) -> Any:
         many = [value] if isinstance(value, str | Path) else value
         if not isinstance(many, list | tuple) or not many:
             raise InputError(
-                f"`{name}`: expected {KIND_WORDS[of_each]} or a list of them, got {_shown(value)}"
+                f"`{name}`: expected {KIND_WORDS[of_each]} or a list of them, "
+                f"got {_value_text(value)}"
             )
         return [_of_kind(name, of_each, each) for each in many]
     is_number = isinstance(value, Real) and not isinstance(value, bool)
@@ -263,7 +264,7 @@ def _of_kind(name: str, kind: Any, value: Any) -> Any:
     if get_origin(own) is Literal and value in choices:
         return value
     expected = " or ".join(map(str, choices)) if choices else KIND_WORDS[own]
-    raise InputError(f"`{name}`: expected {expected}, got {_shown(value)}")
+    raise InputError(f"`{name}`: expected {expected}, got {_value_text(value)}")
 
 
 def _number_text(value: Any) -> str:
@@ -271,7 +272,7 @@ def _number_text(value: Any) -> str:
     return str(int(value)) if isinstance(value, Integral) else repr(float(value))
 
 
-def _shown(value: Any) -> str:
+def _value_text(value: Any) -> str:
     """Format a value for a message."""
     text = repr(value)
     return text if len(text) <= SHOWN_LETTERS else f"{text[:SHOWN_LETTERS]}..."

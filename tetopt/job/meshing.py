@@ -28,7 +28,7 @@ from tetopt.engine.meshing import (
 )
 from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import squared_edges
-from tetopt.job.events import KERNEL_WORDS, ended_words, note, progress, started, time_words
+from tetopt.job.events import KERNEL_WORDS, ended_words, note, progress, start_stage, time_words
 from tetopt.job.model import check_early, keep_early
 from tetopt.job.options import SolverOptions, has_model
 from tetopt.job.plan import kind_of
@@ -60,7 +60,7 @@ PACE_OF = 2  # iterations: the last ones, by which it is estimated
 START_WORDS = "building the initial mesh"
 
 
-def meshed(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
+def mesh_task(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
     """Build the optimised mesh; `begin` is the run's start time by `time.perf_counter`."""
     job, content, options = task.plan.job, task.source.content, task.plan.engine_options
     ends = None if job.max_seconds is None else begin + job.max_seconds
@@ -80,14 +80,14 @@ def meshed(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
         place = keep_early(mesh, labels, early[-1:] or (job.output, *beside))
         early.extend([] if place is None else [place])
 
-    started("start", START_WORDS)
+    start_stage("start", START_WORDS)
     search, first = MeshSearch(content, _aim(task), task.source.required, **options), 0.0
     for number, (initial, run, predicted) in enumerate(search, 1):
         if number == 1:
             _check_initial(task, initial)
         check_space(job.output, CELL_BYTES * len(initial.cells))
         first = first or time.perf_counter()
-        started("kernels", KERNEL_WORDS)
+        start_stage("kernels", KERNEL_WORDS)
         nodes = (
             max(job.nodes or 0, len(initial.points))
             if task.plan.order == 1
@@ -95,21 +95,21 @@ def meshed(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
         )
         if predicted is not None and result is not None:
             _say_predicted(task, result, predicted, most_bytes(predicted))
-        note(f"{_described(task, initial)}; about {memory_words(most_bytes(nodes))} of memory")
+        note(f"{_start_words(task, initial)}; about {memory_words(most_bytes(nodes))} of memory")
         _prepare(task)
-        started(
+        start_stage(
             "optimise",
             "optimising",
             options["iterations"],
             None if ends is None else ends - time.perf_counter(),
         )
         kept = run if task.plan.mode == "paper" else partial(run, keep=keep)
-        result = watched(
+        result = watch_run(
             kept, initial, options["iterations"], ends, stop, limit, task.source.surface_words
         )
         _say_search(task, number, result)
         if job.target_error is not None or job.order == 2:  # a next run may follow
-            started("start", START_WORDS)
+            start_stage("start", START_WORDS)
         search.tell(result)
     result = search.result
     if result.curving is not None:
@@ -187,7 +187,7 @@ def _prepare(task: Task) -> None:
     )
 
 
-def watched(
+def watch_run(
     run: Run,
     initial: Mesh,
     iterations: int,
@@ -219,7 +219,7 @@ def watched(
     if result.ended == "stopped" and not stop():
         result = result._replace(ended="max_gb")
     if result.ended != "iterations":
-        started("optimised", "optimised")
+        start_stage("optimised", "optimised")
         words = ended_words(result.ended, "the current mesh", followed)
         note(f"{words} (iteration {result.history[-1].iteration} of {iterations})")
     return result
@@ -280,7 +280,7 @@ def _say_predicted(task: Task, last: MeshingResult, corners: int, n_bytes: float
     note(words)
 
 
-def _described(task: Task, initial: Mesh) -> str:
+def _start_words(task: Task, initial: Mesh) -> str:
     source = task.source
     image = source.contrasts[0]
     size = " x ".join(str(s) for s in image.shape)

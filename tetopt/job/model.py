@@ -127,8 +127,8 @@ def check_model_options(
         if options.young is None and not has_materials:
             raise InputError(f"`{name}`: needs `young`")
     parse_average(options.average or DEFAULT_AVERAGE)
-    parsed_bins(options.bins)
-    parsed_groups(options.written_sets)
+    parse_bins(options.bins)
+    parse_groups(options.written_sets)
     if options.order not in (None, 1, 2):
         raise InputError(f"`order`: expected 1 or 2, got {options.order}")
 
@@ -141,7 +141,7 @@ def _check_mapping(text: str, name: str) -> None:
         raise InputError(f"`{name}`: {str(error).removeprefix('mapping: ')}") from error
 
 
-def parsed_bins(text: str | None) -> tuple[int | None, Spacing]:
+def parse_bins(text: str | None) -> tuple[int | None, Spacing]:
     """Parse "K", "K:quantile" or "K:log" into the number and spacing of bins."""
     if text is None:
         return None, "equal"
@@ -154,7 +154,7 @@ def parsed_bins(text: str | None) -> tuple[int | None, Spacing]:
     return int(count), cast(Spacing, spacing)
 
 
-def parsed_groups(text: str | None) -> tuple[str, ...]:
+def parse_groups(text: str | None) -> tuple[str, ...]:
     """Parse the `SET_GROUPS` to write, from "labels,interfaces,boundary", "all", or "none"."""
     if text in (None, "all"):
         return SET_GROUPS
@@ -169,7 +169,7 @@ def parsed_groups(text: str | None) -> tuple[str, ...]:
 
 def choices_of(options: ModelOptions) -> Choices:
     """Return what the options choose for a model."""
-    bins, spacing = parsed_bins(options.bins)
+    bins, spacing = parse_bins(options.bins)
     return Choices(
         options.young,
         options.nu,
@@ -218,7 +218,7 @@ def with_chosen_sets(model: Model, output: Path, options: ModelOptions) -> Model
     more than `MANY_INTERFACES` interfaces in a VTK file. Other sets, and those that loads name, are
     always written.
     """
-    groups = set(parsed_groups(options.written_sets))
+    groups = set(parse_groups(options.written_sets))
     labels = labels_of(model.cell_data, len(model.mesh.cells))
     names = table_of_words(model.about.get(TABLE_TEXT)).names
     of_label = {} if labels is None else label_set_names(np.unique(labels).tolist(), names)
@@ -253,7 +253,7 @@ def with_chosen_sets(model: Model, output: Path, options: ModelOptions) -> Model
     return model._replace(sets=Sets(facets, cells))
 
 
-def converted_model(
+def convert_model(
     loaded: MeshFile,
     image: Image | None,
     options: ModelOptions,
@@ -434,7 +434,7 @@ def save_anyway(
         If the user can fix `error`; the message says where the mesh is.
     """
     places = chain([] if early is None else [early], kept_places(output, ".vtu"))
-    kept = _kept_mesh(
+    kept = _keep_mesh(
         places, (lambda path: save_model(path, build()), lambda path: save_mesh(path, mesh))
     )
     where = (
@@ -447,7 +447,7 @@ def save_anyway(
     note(f"the optimised mesh {where}")
 
 
-def _kept_mesh(places: Iterable[Path], ways: Sequence[Callable[[Path], None]]) -> Path | None:
+def _keep_mesh(places: Iterable[Path], ways: Sequence[Callable[[Path], None]]) -> Path | None:
     """Return the first place where one of the ways to save a mesh succeeds, or where it was
     saved before.
     """

@@ -24,9 +24,9 @@ from tetopt.engine.meshing import (
 from tetopt.engine.paper import default_n_t
 from tetopt.errors import InputError
 from tetopt.io.formats import FORMATS
-from tetopt.io.images import checked_bounds, file_shape, parse_crop, parse_slice, smaller_words
+from tetopt.io.images import check_bounds, file_shape, parse_crop, parse_slice, smaller_words
 from tetopt.io.label_tables import NO_TABLE, LabelTable
-from tetopt.job.inputs import balance_of, checked_outputs, label_sizes_of, number_of, read_companion
+from tetopt.job.inputs import balance_of, check_outputs, label_sizes_of, number_of, read_companion
 from tetopt.job.model import check_solver_options
 from tetopt.job.options import JobOptions, Method, stated_part
 from tetopt.model.mappings import named_file
@@ -37,7 +37,7 @@ from tetopt.start.memory import BOUND_MARGIN, CHANNEL_BYTES, meshing_bytes
 from tetopt.start.octree import nodes_of_sizes
 from tetopt.start.sizes import Sizes
 from tetopt.system.budget import check_memory
-from tetopt.system.files import checked_output, results_folder
+from tetopt.system.files import check_output, results_folder
 
 VOXEL_BYTES = 16.0  # of an image that is read whole, in addition to meshing
 FEWEST_NODES = 5  # of the smallest mesh, an octree in 2-D: a square's corners and its middle
@@ -122,7 +122,7 @@ def check_volume(plan: Plan) -> None:
     crop = [(None, None)] * 3 if job.crop is None else parse_crop(job.crop)
     if len(shape) < 3 or len(crop) != 3:  # the reader rejects such a crop
         return
-    bounds = checked_bounds(shape, crop)
+    bounds = check_bounds(shape, crop)
     n_voxels = prod(stop - start for start, stop in bounds)
     fixed = meshing_bytes(0, 0, job.nodes or DEFAULT_NODES[3])
     each = VOXEL_BYTES + BOUND_MARGIN * CHANNEL_BYTES * len(job.images)
@@ -186,13 +186,13 @@ def plan(job: JobOptions) -> Plan:
     >>> plan.mode, plan.job.iterations, plan.job.boundary
     ('uniform', 20, 'slide')
     """
-    checked_output(job.output, tuple(FORMATS), job.force)
+    check_output(job.output, tuple(FORMATS), job.force)
     if job.json_path is not None:
-        checked_output(job.json_path, (".json",), job.force)
-    return resolved(job, reads_files=True)._replace(pictures=_pictures(job))
+        check_output(job.json_path, (".json",), job.force)
+    return plan_job(job, reads_files=True)._replace(pictures=_pictures(job))
 
 
-def resolved(job: JobOptions, *, reads_files: bool) -> Plan:
+def plan_job(job: JobOptions, *, reads_files: bool) -> Plan:
     """Plan a job; of all files, those of mappings and sizes alone are read, and only if
     `reads_files`.
 
@@ -211,7 +211,7 @@ def resolved(job: JobOptions, *, reads_files: bool) -> Plan:
                 f"`{name}`: needs a graded mesh; leave out `uniform`, `spacing`, `lattice`, "
                 "`method`, `start`"
             )
-    completed = _completed(job, mode)
+    completed = _complete_options(job, mode)
     is_plain = len(job.images) == 1 and not (has_region(job) or job.labels or job.tissues)
     if mode == "paper" and not is_plain:
         raise InputError(
@@ -221,7 +221,7 @@ def resolved(job: JobOptions, *, reads_files: bool) -> Plan:
     return Plan(mode, completed, job)
 
 
-def changed(job: JobOptions, **values: Any) -> JobOptions:
+def changed_options(job: JobOptions, **values: Any) -> JobOptions:
     """Return the options with values of a plan, which are not checked."""
     return JobOptions(**(vars(job) | values))
 
@@ -289,7 +289,7 @@ def _check_numbers(job: JobOptions, reads_files: bool) -> None:
         raise InputError(
             "`nodes_max`: needs `target_error`; without it, `nodes` is the number of nodes"
         )
-    _limits(changed(job, sizing=None, label_size=None))
+    _limits(changed_options(job, sizing=None, label_size=None))
     if job.label_size is not None and (reads_files or named_file(job.label_size) is None):
         label_sizes_of(job.label_size)
 
@@ -335,7 +335,7 @@ def _mode(job: JobOptions) -> Mode:
     return "uniform" if is_lattice else "graded"
 
 
-def _completed(job: JobOptions, mode: Mode) -> JobOptions:
+def _complete_options(job: JobOptions, mode: Mode) -> JobOptions:
     """Return the engine's options with the mode's defaults; raise InputError for invalid ones."""
     default = MODE_DEFAULTS[mode]
     k_D = default.k_D if job.k_D is None else job.k_D
@@ -352,16 +352,18 @@ def _completed(job: JobOptions, mode: Mode) -> JobOptions:
         if job.nodes_max is None and job.target_error is not None
         else job.nodes_max
     )
-    job = changed(job, k_D=k_D, iterations=iterations, boundary=boundary, nodes_max=nodes_max)
+    job = changed_options(
+        job, k_D=k_D, iterations=iterations, boundary=boundary, nodes_max=nodes_max
+    )
     _check_method(job, "paper", ("n_t", "retessellate"))
     _check_method(job, "fast", ("shape_power", "min_dihedral"))
     if mode == "paper":
         n_t = default_n_t(k_D, iterations) if job.n_t is None else job.n_t
-        return changed(job, n_t=n_t, retessellate=job.retessellate or "first")
+        return changed_options(job, n_t=n_t, retessellate=job.retessellate or "first")
     shape_power = SHAPE_POWER if job.shape_power is None else job.shape_power
     min_dihedral = MIN_DIHEDRAL if job.min_dihedral is None else job.min_dihedral
     check_options(k_D, iterations, shape_power, min_dihedral, boundary)
-    return changed(job, shape_power=shape_power, min_dihedral=min_dihedral)
+    return changed_options(job, shape_power=shape_power, min_dihedral=min_dihedral)
 
 
 def _check_method(job: JobOptions, method: Method, names: tuple[str, ...]) -> None:
@@ -379,7 +381,7 @@ def _pictures(job: JobOptions) -> list[Path]:
     names += ["boundary.png"] if has_region(job) else []
     names += [] if job.labels is None and job.tissues is None else ["labels.png"]
     names += ["thumbnail.png"]
-    return list(checked_outputs(results_folder(job.figures), names, job.force).values())
+    return list(check_outputs(results_folder(job.figures), names, job.force).values())
 
 
 def with_numbers(
@@ -397,7 +399,7 @@ def with_numbers(
         return plan, None, None
     if plan.mode != "graded":
         nodes = job.nodes if is_counted else DEFAULT_NODES[image.ndim]
-        return plan._replace(job=changed(job, nodes=nodes)), None, None
+        return plan._replace(job=changed_options(job, nodes=nodes)), None, None
     order, nodes, limits, by_label = plan.order, job.nodes, _limits(job, table), None
     if limits is not None:
         limits, by_label = with_label_sizes(limits, content, nodes, order)
@@ -408,7 +410,7 @@ def with_numbers(
     if longest is None and nodes is not None:
         longest = (limits or Sizes()).longest_edge(image, nodes, content.volume)
         longest = longest if longest < np.inf else None
-    return plan._replace(job=changed(job, nodes=nodes, edge_max=longest)), limits, by_label
+    return plan._replace(job=changed_options(job, nodes=nodes, edge_max=longest)), limits, by_label
 
 
 def nodes_of_targets(plan: Plan, content: Content, sizes: Sizes | None) -> int | None:

@@ -12,11 +12,18 @@ from tetopt.geometry.simplex import centroids
 from tetopt.image import Image
 from tetopt.io.formats import format_of
 from tetopt.job.advice import tell_label_sizes
-from tetopt.job.events import note, started, warning
+from tetopt.job.events import note, start_stage, warning
 from tetopt.job.inputs import label_table, read_mesh, set_threads, warn_of_other_image
 from tetopt.job.job import Job
-from tetopt.job.plan import Plan, changed, check_volume, nodes_of_targets, plan, with_numbers
-from tetopt.job.request import requested
+from tetopt.job.plan import (
+    Plan,
+    changed_options,
+    check_volume,
+    nodes_of_targets,
+    plan,
+    with_numbers,
+)
+from tetopt.job.request import job_request
 from tetopt.job.source import read_source
 from tetopt.job.task import Task
 from tetopt.mesh import Mesh
@@ -55,7 +62,7 @@ def read(job: Job) -> Task:
     """
     checked = plan(job)
     set_threads(job.threads)
-    started("read", "reading and preparing the image, with its mask and labels")
+    start_stage("read", "reading and preparing the image, with its mask and labels")
     check_volume(checked)
     return read_planned(checked)
 
@@ -69,7 +76,7 @@ def read_planned(plan: Plan) -> Task:
         _check_place(start.mesh, image, str(path))
         warn_of_other_image(start, path, source.paths[0], image, is_registered=True)
         if plan.job.order is None and start.order == 2 and format_of(plan.job.output).has_quadratic:
-            plan = plan._replace(job=changed(plan.job, order=2))
+            plan = plan._replace(job=changed_options(plan.job, order=2))
         if source.labels is not None and not source.table.names:
             source = source.with_table(label_table(None, start))
     plan, sizes, by_label = with_numbers(plan, source.content, source.table)
@@ -78,7 +85,7 @@ def read_planned(plan: Plan) -> Task:
     elif (needed := nodes_of_targets(plan, source.content, sizes)) is not None:
         note(f"sizes require about {needed} nodes")
     # With the files' current checksums.
-    return Task(plan, source, start, sizes, requested(plan.bare), by_label)
+    return Task(plan, source, start, sizes, job_request(plan.bare), by_label)
 
 
 def _check_place(mesh: Mesh, image: Image, path: str) -> None:

@@ -27,7 +27,7 @@ from tetopt.model.mappings import FILES_IN_TEXTS, named_file
 OPTIONS_IGNORED = ("threads", *(each.name for each in fields(OutputOptions)))
 
 
-def requested(job: JobOptions) -> dict[str, Any]:
+def job_request(job: JobOptions) -> dict[str, Any]:
     """Return all that determines the outputs of a run: options, the files' names and checksums, the
     version.
 

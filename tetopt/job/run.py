@@ -12,25 +12,25 @@ from tetopt.errors import error_words
 from tetopt.geometry.quadratic import node_count
 from tetopt.job.advice import (
     Problem,
-    agreed,
     failures,
     has_most_empty,
     of_empty,
     of_layers,
     of_result,
     of_sizes,
+    order_problems,
     sentences,
     tell,
-    unmet,
+    unmet_requirements,
 )
-from tetopt.job.events import Listener, listened, started
+from tetopt.job.events import Listener, listen_with, start_stage
 from tetopt.job.job import Job
-from tetopt.job.meshing import meshed
+from tetopt.job.meshing import mesh_task
 from tetopt.job.read import read
 from tetopt.job.task import Meshed, Shapes, Task
-from tetopt.job.write import draw, measured_of, numbers_of, saved
+from tetopt.job.write import draw, measures_of, numbers_of, save_outcome
 from tetopt.measure.judge import judge
-from tetopt.measure.measures import measured_each
+from tetopt.measure.measures import measure_each
 from tetopt.measure.quality import quality
 from tetopt.mesh import Mesh
 from tetopt.model.model import Model
@@ -133,20 +133,20 @@ def run(job: Job, on: Listener | None = None, stop: Callable[[], bool] | None = 
     (300, {}, 'iterations')
     """
     begin = time.perf_counter()
-    with listened(on), outputs_of_run(vars(job).values()):
+    with listen_with(on), outputs_of_run(vars(job).values()):
         task = read(job)
-        outcome = meshed(task, stop or (lambda: False), begin)
-        started("write", "writing and measuring the mesh")
+        outcome = mesh_task(task, stop or (lambda: False), begin)
+        start_stage("write", "writing and measuring the mesh")
         failed: dict[str, str] = {}
-        model, about = saved(task, outcome, failed)
+        model, about = save_outcome(task, outcome, failed)
         # Only now, as nothing may fail before the mesh is written.
         shapes = _shapes(outcome, failed)
-        measured = measured_of(task, outcome.result, model, failed)
+        measured = measures_of(task, outcome.result, model, failed)
         numbers = numbers_of(task, outcome, shapes, model, about, time.perf_counter() - begin)
         missing = {name: None for name in (*failed, "cells_without_voxel") if name != "fields"}
         numbers |= missing | measured | model_summary(model)
         result = Result(outcome.result.mesh, model, numbers, {}, task, outcome, shapes, measured)
-        undrawn = _undrawn(result, failed)
+        undrawn = _draw_pictures(result, failed)
         # One list for all: what is told, the exit code, run.json and a cohort's table.
         problems = _problems(result, failed)
         result = result._replace(violated=sentences(problems))
@@ -159,7 +159,7 @@ def run(job: Job, on: Listener | None = None, stop: Callable[[], bool] | None = 
         return result
 
 
-def _undrawn(result: Result, failed: dict[str, str]) -> Exception | None:
+def _draw_pictures(result: Result, failed: dict[str, str]) -> Exception | None:
     """Draw the pictures; return the error if that fails, which the numbers state, too, as they
     are written first.
     """
@@ -174,7 +174,7 @@ def _undrawn(result: Result, failed: dict[str, str]) -> Exception | None:
 
 def _shapes(outcome: Meshed, failed: dict[str, str]) -> Shapes:
     meshes = {"quality_initial": outcome.initial, "quality": outcome.result.mesh}
-    shapes = measured_each(
+    shapes = measure_each(
         {
             name: partial(quality, each.points, each.cells, each.midpoints)
             for name, each in meshes.items()
@@ -191,7 +191,7 @@ def _problems(result: Result, failed: dict[str, str]) -> list[Problem]:
     if outcome.result.labels is None:  # but its file gives each cell that of most voxels
         of_labels = {name: rows for name, rows in measured.items() if name == "labels"}
         required |= judge(of_labels, task.source.required)
-    problems = list(unmet(required, measured, task.source.mask_word))
+    problems = list(unmet_requirements(required, measured, task.source.mask_word))
     problems += failures(failed, problems)
     job, mode = task.plan.job, task.plan.mode
     expected = job.nodes if mode == "graded" and job.target_error is None else None
@@ -218,4 +218,4 @@ def _problems(result: Result, failed: dict[str, str]) -> list[Problem]:
         problems += of_sizes(
             sizes, edges.min_edge, edges.max_edge, measured.get("edges_over_target")
         )
-    return agreed(problems if is_most else [*problems, *empty])
+    return order_problems(problems if is_most else [*problems, *empty])

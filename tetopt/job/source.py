@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from tetopt.contents.align import (
     KEEP_PIECES,
     background_level,
-    filled_holes,
+    fill_holes,
     foreground,
     resample_contrast,
     resample_labels,
 )
-from tetopt.contents.content import Content, content, continued
+from tetopt.contents.content import Content, content, continue_image
 from tetopt.contents.domain import INSIDE_FRACTION, mask_text
 from tetopt.contents.labels import BACKGROUND_LABEL, LARGEST_LABEL
 from tetopt.contents.probabilities import resample_tissue, tissue_labels
@@ -26,7 +26,7 @@ from tetopt.energy.sampling import cell_moments
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io.label_tables import NO_TABLE, LabelTable
-from tetopt.io.text import counted
+from tetopt.io.text import count_text
 from tetopt.job.advice import required_of
 from tetopt.job.events import note, warning
 from tetopt.job.inputs import (
@@ -38,7 +38,7 @@ from tetopt.job.inputs import (
     file_and_volume,
     image_and_others,
     label_table,
-    listed,
+    list_names,
     mask_for,
     number_of,
     read_companion,
@@ -63,7 +63,7 @@ from tetopt.model.labels import (
     table_words,
 )
 from tetopt.model.sets import box_of, box_text
-from tetopt.model.tissues import is_preset, merge_labels, numbers_by_name, renumbered
+from tetopt.model.tissues import is_preset, merge_labels, numbers_by_name, renumber_labels
 
 
 class Source(NamedTuple):
@@ -83,7 +83,7 @@ class Source(NamedTuple):
         """The first contrast on its own voxels, continued beyond the mask, around which alone
         voxels are kept.
         """
-        return continued(self.contrasts[0], self.content.continuation)
+        return continue_image(self.contrasts[0], self.content.continuation)
 
     @property
     def mask_word(self) -> str:
@@ -121,12 +121,14 @@ class Source(NamedTuple):
         """
         fields = cell_fields(mesh, self.image)
         for number, contrast in enumerate(self.contrasts[1:], 2):
-            moments = cell_moments(continued(contrast, self.content.continuation), mesh)
+            moments = cell_moments(continue_image(contrast, self.content.continuation), mesh)
             fields |= {f"mean_{number}": moments.mean, f"variance_{number}": moments.variance}
         if labels is not None:
             fields["label"] = labels
         elif self.labels is not None:
-            fields["label"] = cell_labels(continued(self.labels, self.content.continuation), mesh)
+            fields["label"] = cell_labels(
+                continue_image(self.labels, self.content.continuation), mesh
+            )
         return fields
 
     def with_table(self, table: LabelTable) -> Source:
@@ -182,7 +184,7 @@ def read_source(
         image = labels
     contrasts = [image, *(beside(path, resample_contrast) for path in paths[1:])]
     mask, level = _region(options, image, labels, beside, loaded)
-    labels, mask, kept = _chosen(options, labels, mask, table, kept)
+    labels, mask, kept = _choose_labels(options, labels, mask, table, kept)
     del finest, beside  # the files as read: their memory is needed
     balance = _balance(options, is_own)
     combined = content(
@@ -275,7 +277,7 @@ def _without_holes(
         return labels, None
     assert labels is not None, "the plan requires labels"
     label = _label_of_holes(options.fill_holes, table)
-    filled, sizes, around = filled_holes(labels, label)
+    filled, sizes, around = fill_holes(labels, label)
     if len(sizes):
         volumes = sizes * float(np.prod(labels.spacing))
         by_label = sorted(
@@ -283,7 +285,7 @@ def _without_holes(
             reverse=True,
         )
         words = (
-            f"{counted(len(sizes), 'hole')} of {volumes.sum():.4g} mm{labels.ndim}, the "
+            f"{count_text(len(sizes), 'hole')} of {volumes.sum():.4g} mm{labels.ndim}, the "
             f"largest {volumes.max():.4g}"
         )
         note(f"label 0: {words}, filled by {label_words(label, table.names)}")
@@ -291,7 +293,7 @@ def _without_holes(
             f"{label_words(each, table.names)} {size:.4g} mm{labels.ndim}"
             for size, each in by_label
         ]
-        note(f"labels around most of each hole: {listed(parts)}")
+        note(f"labels around most of each hole: {list_names(parts)}")
     else:
         warning(
             "`fill_holes`: no voxel of label 0 is enclosed: all are connected by faces to the "
@@ -313,7 +315,7 @@ def _label_of_holes(text: str, table: LabelTable) -> int:
     return label
 
 
-def _chosen(
+def _choose_labels(
     options: SourceOptions,
     labels: Image | None,
     mask: Image | None,
@@ -332,7 +334,7 @@ def _chosen(
     is_kept = np.isin(labels.data, kept)
     if not (is_kept if mask is None else is_kept & (mask.data >= INSIDE_FRACTION)).any():
         raise InputError(
-            f"labels that stay, {listed(kept)}: no voxel within the mask has one of them"
+            f"labels that stay, {list_names(kept)}: no voxel within the mask has one of them"
         )
     mask = Image(is_kept if mask is None else np.where(is_kept, mask.data, 0.0), labels.affine)
     # Those left out on purpose are not reported as missing.
@@ -379,7 +381,7 @@ def _labelling(
     labels = beside(options.labels, _align_of_labels(options, numbers))
     is_own = is_alone and np.array_equal(labels.data, image.data)
     labels = image if is_own else labels  # kept once
-    return ReadLabels(*_merged(labels, table, options, numbers), is_own=is_own)
+    return ReadLabels(*_merge_labels(labels, table, options, numbers), is_own=is_own)
 
 
 def _align_of_labels(options: SourceOptions, numbers: Mapping[int, int] | None) -> Align:
@@ -393,14 +395,14 @@ def _some_labels(labels: Image, image: Image, name: str) -> Image:
     return resample_labels(labels, image, name, may_miss=True)
 
 
-def _merged(
+def _merge_labels(
     labels: Image, table: LabelTable, options: SourceOptions, numbers: Mapping[int, int] | None
 ) -> tuple[Image, LabelTable, Mapping[int, int]]:
     """Merge labels by the options, or by shared names; return them, their table, and their new
     numbers.
     """
     if numbers is not None:
-        return renumbered(labels, numbers), table, numbers
+        return renumber_labels(labels, numbers), table, numbers
     if options.merge is not None:
         try:
             merged = merge_labels(labels, options.merge, table.names)
@@ -410,19 +412,21 @@ def _merged(
             name for label, name in merged.names.items() if label not in merged.numbers.values()
         ]
         if missing and not is_preset(options.merge):
-            warning(f"`merge`: {options.labels} has no label for {listed(missing)}")
+            warning(f"`merge`: {options.labels} has no label for {list_names(missing)}")
         sizes = sorted(Counter(merged.numbers.values()).items())
-        parts = [f"{counted(n, 'label')} into {label_words(new, merged.names)}" for new, n in sizes]
-        note(f"merged: {listed(parts)}")
+        parts = [
+            f"{count_text(n, 'label')} into {label_words(new, merged.names)}" for new, n in sizes
+        ]
+        note(f"merged: {list_names(parts)}")
         return merged.labels, LabelTable(merged.names, {}), merged.numbers
     present = np.unique(labels.data)
     numbers = {old: new for old, new in numbers_by_name(table.names).items() if old in present}
     if not numbers:
         return labels, table, numbers
     words = [f"{old} into {label_words(new, table.names)}" for old, new in sorted(numbers.items())]
-    note(f"merged labels with the same name: {listed(words)}")
+    note(f"merged labels with the same name: {list_names(words)}")
     left = set(table.names) - set(numbers_by_name(table.names))
-    return renumbered(labels, numbers), table_of_labels(table, left), numbers
+    return renumber_labels(labels, numbers), table_of_labels(table, left), numbers
 
 
 def whose_variance(content: Content) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.contents.content import continued
+from tetopt.contents.content import continue_image
 from tetopt.engine.interfaces import crowded_nodes
 from tetopt.engine.loop import MeshingResult
 from tetopt.errors import Note, warn
@@ -28,11 +28,11 @@ from tetopt.job.options import SolverOptions
 from tetopt.job.plan import nodes_of_targets, stated_options
 from tetopt.job.source import Source
 from tetopt.job.task import Meshed, Shapes, Task
-from tetopt.measure.measures import fidelity, measured_each
+from tetopt.measure.measures import fidelity, measure_each
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields, is_result
 from tetopt.model.file import MASK_TEXT, MeshFile
-from tetopt.model.labels import TABLE_TEXT, LabelTable, coloured, table_of_labels, table_words
+from tetopt.model.labels import TABLE_TEXT, LabelTable, colour_labels, table_of_labels, table_words
 from tetopt.model.model import Model
 from tetopt.model.sets import Sets, box_of, label_set_names, surviving_sets
 from tetopt.report.summary import run_summary
@@ -84,7 +84,9 @@ def _warn_of_losses(started: MeshFile, own: Sets, has_labels: bool) -> None:
         warn(f"{words}; pass `young` and `loads`", Note)
 
 
-def saved(task: Task, outcome: Meshed, failed: dict[str, str]) -> tuple[Model, dict[str, Any]]:
+def save_outcome(
+    task: Task, outcome: Meshed, failed: dict[str, str]
+) -> tuple[Model, dict[str, Any]]:
     """Write the mesh, or save it elsewhere; return the model, and the files' statements about the
     run.
 
@@ -129,14 +131,14 @@ def _measured_fields(
     """Return the fields of the result's cells; only shapes and labels if the image's cannot be
     computed.
     """
-    if measured := measured_each(
+    if measured := measure_each(
         {"fields": partial(source.fields, result.mesh, result.labels)}, failed
     ):
         return dict(measured["fields"])
     return cell_fields(result.mesh) | ({} if result.labels is None else {"label": result.labels})
 
 
-def measured_of(
+def measures_of(
     task: Task, result: MeshingResult, model: Model, failed: dict[str, str]
 ) -> dict[str, Any]:
     """Measure the fit to mask, labels, contrasts and sizes."""
@@ -152,7 +154,7 @@ def measured_of(
     )
     if (table := _table_of(source)) is not None and table.names:
         measured["label_names"] = table.names
-    counted = measured_each(_counts(task, result, model), failed)
+    counted = measure_each(_counts(task, result, model), failed)
     return measured | {name: value for name, value in counted.items() if value is not None}
 
 
@@ -161,7 +163,7 @@ def _table_of(source: Source) -> LabelTable | None:
     if source.labels is None:
         return None
     labels = np.unique(source.labels.data).astype(np.int64)
-    return coloured(table_of_labels(source.table, labels.tolist()), labels)
+    return colour_labels(table_of_labels(source.table, labels.tolist()), labels)
 
 
 def numbers_of(
@@ -222,7 +224,7 @@ def draw(task: Task, outcome: Meshed, model: Model) -> None:
 
     pictures, mesh, source = task.plan.pictures, outcome.result.mesh, task.source
     image = source.contrasts[0]
-    own = continued(image, source.content.continuation)
+    own = continue_image(image, source.content.continuation)
     figures.save_run_figures(
         pictures[:3],
         own,

@@ -25,7 +25,7 @@ from tetopt.contents.labels import (
     BACKGROUND_LABEL,
     LARGEST_LABEL,
     LostComponent,
-    checked_labels,
+    check_labels,
     voxel_components,
 )
 from tetopt.energy.sampling import Overlap, cell_moments, cell_of_voxel, nearest_values, overlap_of
@@ -35,9 +35,9 @@ from tetopt.geometry.manifold import OUTSIDE_LABEL
 from tetopt.geometry.nearest import triangle_distances
 from tetopt.geometry.simplex import centroids, volumes
 from tetopt.geometry.topology import Facets, components, facets, lexicographic_order
-from tetopt.image import Image, transformed
+from tetopt.image import Image, transform_vectors
 from tetopt.mesh import Mesh
-from tetopt.system.arrays import unmasked
+from tetopt.system.arrays import plain_array
 from tetopt.system.kernel_cache import njit
 from tetopt.system.slabs import count_pairs, over_slabs, sum_over_slabs
 
@@ -274,7 +274,7 @@ def cell_labels(labels: Image, mesh: Mesh) -> NDArray[np.int64]:
     >>> np.bincount(of_cell).tolist()
     [1063, 137]
     """
-    labels = checked_labels("labels", labels)
+    labels = check_labels("labels", labels)
     nearest = nearest_values(labels, centroids(mesh.points, mesh.cells)).astype(np.int64)
     values, rows, nearest = by_row(labels_in_mask(labels, None), nearest)
     return values[_most_frequent(rows, cell_of_voxel(labels, mesh), nearest)]
@@ -329,10 +329,10 @@ def label_fidelity(
     label 0: Dice 1.00, off by 0.5 mm
     label 1: Dice 1.00, off by 0.5 mm
     """
-    labels, (pieces, n_pieces) = checked_labels("labels", labels), mesh.straight_pieces()
+    labels, (pieces, n_pieces) = check_labels("labels", labels), mesh.straight_pieces()
     owner = voxel_cells(labels, mesh) if owner is None else owner
     label_of_cell = (
-        cell_labels(labels, mesh) if of_cell is None else checked_cell_labels(of_cell, mesh)
+        cell_labels(labels, mesh) if of_cell is None else check_cell_labels(of_cell, mesh)
     )
     values, true, label_of_cell = by_row(labels_in_mask(labels, mask), label_of_cell)
     outside = BACKGROUND_LABEL if mask is None else OUTSIDE_LABEL
@@ -590,7 +590,7 @@ def half_level_surface(level: NDArray, affine: NDArray[np.float64]) -> FacetSurf
         np.asarray(surface.points, dtype=np.float64)[:, :n], -0.5, np.array(level.shape) - 0.5
     )
     return FacetSurface(
-        transformed(index, affine[:-1, :-1]) + affine[:-1, -1],
+        transform_vectors(index, affine[:-1, :-1]) + affine[:-1, -1],
         nodes.reshape(-1, n).astype(np.int64),
     )
 
@@ -725,11 +725,11 @@ def _voxel_dice(
     return 2.0 * both / np.maximum(n_true + _voxel_counts(painted, len(n_true)), 1)
 
 
-def checked_cell_labels(of_cell: ArrayLike, mesh: Mesh) -> NDArray[np.int64]:
+def check_cell_labels(of_cell: ArrayLike, mesh: Mesh) -> NDArray[np.int64]:
     """One label for each cell, (M,) int64; raise InputError unless all are whole numbers from 0
     to `LARGEST_LABEL`.
     """
-    values = unmasked("of_cell", of_cell)
+    values = plain_array("of_cell", of_cell)
     if values.shape != (len(mesh.cells),):
         raise InputError(
             f"of_cell: expected one label for each of the mesh's {len(mesh.cells)} cells, got "

@@ -21,7 +21,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from tetopt.contents.labels import checked_labels, component_runs
+from tetopt.contents.labels import check_labels, component_runs
 from tetopt.geometry.manifold import (
     LabelSurfaces,
     Ridges,
@@ -30,12 +30,12 @@ from tetopt.geometry.manifold import (
     surface_ridges,
 )
 from tetopt.geometry.quadratic import edge_ends
-from tetopt.geometry.topology import Facets, facets, linked
-from tetopt.image import Image, transformed
+from tetopt.geometry.topology import Facets, connected_sets, facets
+from tetopt.image import Image, transform_vectors
 from tetopt.measure.fidelity import (
     FacetSurface,
     by_row,
-    checked_cell_labels,
+    check_cell_labels,
     facet_vectors,
     labels_in_mask,
     surface_areas,
@@ -156,10 +156,8 @@ def label_interfaces(
     >>> ball.nonmanifold_edges, ball.nonmanifold_nodes, ball.mesh_euler  # without handles
     (0, 0, 2)
     """
-    labels = checked_labels("labels", labels)
-    values, voxels, of_cell = by_row(
-        labels_in_mask(labels, mask), checked_cell_labels(of_cell, mesh)
-    )
+    labels = check_labels("labels", labels)
+    values, voxels, of_cell = by_row(labels_in_mask(labels, mask), check_cell_labels(of_cell, mesh))
     boxes = scipy.ndimage.find_objects(voxels + 1)
     present = np.array([row for row, box in enumerate(boxes) if box is not None])
     shared = facets(mesh.cells)
@@ -263,7 +261,9 @@ def smooth_surface(is_label: NDArray[np.bool_], affine: NDArray[np.float64]) -> 
         (surface.GetPolys() if n == 3 else surface.GetLines()).GetConnectivityArray()
     )
     points = np.asarray(pyvista.wrap(surface).points, dtype=np.float64)[:, :n]
-    return FacetSurface(transformed(points, affine[:n, :n]), nodes.reshape(-1, n).astype(np.int64))
+    return FacetSurface(
+        transform_vectors(points, affine[:n, :n]), nodes.reshape(-1, n).astype(np.int64)
+    )
 
 
 def area_at_volume(surface: FacetSurface, volume: float) -> float:
@@ -398,12 +398,12 @@ def _cell_cavities(
         return np.zeros(n_labels, dtype=np.int64)
     near, far = shared.cells.T
     is_inner = (shared.n_cells == 2) & (of_cell[near] == of_cell[far])
-    n_pieces, piece = linked(near[is_inner], far[is_inner], len(cells))
+    n_pieces, piece = connected_sets(near[is_inner], far[is_inner], len(cells))
     row, side = np.nonzero((shared.cells >= 0) & ~is_inner[:, None])
     cell = shared.cells[row, side]
     corners = piece[cell][:, None] + n_pieces * shared.nodes[row]
     corner = np.unique(corners, return_inverse=True)[1].reshape(corners.shape)
-    n_surfaces, surface = linked(
+    n_surfaces, surface = connected_sets(
         corner[:, [0, 0]].ravel(), corner[:, 1:].ravel(), int(corner.max()) + 1
     )
     of_piece, of_surface = np.empty(n_pieces, dtype=np.int64), np.empty(n_surfaces, dtype=np.int64)

@@ -27,7 +27,7 @@ from tetopt.contents.labels import (
     voxel_components,
 )
 from tetopt.contents.memberships import supersampling
-from tetopt.energy.discretization import content_E_D, unexplained
+from tetopt.energy.discretization import content_E_D, unexplained_variance
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.errors import InputError, warn
 from tetopt.geometry.box import ON_SIDE_VOXELS
@@ -35,7 +35,7 @@ from tetopt.geometry.check import beyond_box, manifold_problems
 from tetopt.geometry.manifold import OUTSIDE_LABEL
 from tetopt.geometry.simplex import dihedral_angles, edge_pairs, squared_edges
 from tetopt.geometry.topology import components
-from tetopt.image import Image, transformed
+from tetopt.image import Image, transform_vectors
 from tetopt.mesh import Mesh
 
 # least Dice of a mesh with its mask, below which cells are too large for the mask's detail
@@ -182,11 +182,11 @@ def measure(
     if labels is not None and members is not None:
         measures["labels"] = lambda: _label_fits(content, mesh, labels, owner())
     measures["error"] = lambda: unexplained_by(content, mesh, E_D, n_voxels)
-    taken = {name: _taken(each) for name, each in measures.items() if name not in known}
+    taken = {name: _take_measure(each) for name, each in measures.items() if name not in known}
     return {**taken, **known}
 
 
-def _taken(measure: Callable[[], Any]) -> Any:
+def _take_measure(measure: Callable[[], Any]) -> Any:
     """Return a measure, or the error for which it cannot be taken."""
     try:
         return measure()
@@ -277,10 +277,12 @@ def _say_components(parts: MaskComponents, required: Requirements) -> str:
         )
     if large := [(each, "") for each in parts.lost if _is_large(each)]:
         texts.append(
-            f"components of the {word} {LARGE_COMPONENTS} without a cell: {_listed(large)}"
+            f"components of the {word} {LARGE_COMPONENTS} without a cell: {_list_components(large)}"
         )
     elif far := [(each, "") for each in parts.bare if _is_large(each)]:
-        texts.append(f"parts of the {word} {LARGE_COMPONENTS} with no cell near: {_listed(far)}")
+        texts.append(
+            f"parts of the {word} {LARGE_COMPONENTS} with no cell near: {_list_components(far)}"
+        )
     return "; ".join([*texts, MORE_NODES]) if texts else ""
 
 
@@ -336,7 +338,9 @@ def _say_labels(rows: Iterable[Any], required: Requirements) -> str:
             f"voxels: {ratios}"
         )
     if pieces := [(each, f" of label {words(row.label)}") for row in rows for each in _pieces(row)]:
-        texts.append(f"components of labels {LARGE_COMPONENTS} without a cell: {_listed(pieces)}")
+        texts.append(
+            f"components of labels {LARGE_COMPONENTS} without a cell: {_list_components(pieces)}"
+        )
     if not set(faulty_labels(rows)) <= required.unhelped:
         texts.append(PIECES_REMEDY if pieces else LABEL_REMEDY)
     return "; ".join(texts)
@@ -382,12 +386,12 @@ def nodes_ratio(fraction: float, target_error: float, rate: float = ERROR_RATE) 
 
 def unexplained_by(content: Content, mesh: Mesh, E_D: float, n_voxels: int) -> float:
     """Return the unexplained variance of a mesh with this E_D and number of voxels in its cells,
-    `tetopt.energy.discretization.unexplained`; or 0.
+    `tetopt.energy.discretization.unexplained_variance`; or 0.
     """
     # also if the voxels stay in their file
     if content.region is None and n_voxels == content.n_voxels:
         return E_D / (content.variance * content.volume or 1.0)
-    return unexplained(content, mesh) or 0.0
+    return unexplained_variance(content, mesh) or 0.0
 
 
 def _cover(mesh: Mesh, image: Image, n_voxels: int, initial: Mesh | None, n_initial: int) -> Cover:
@@ -424,14 +428,14 @@ def _bare_parts(
     ends, longest = mesh.cells[:, edge_pairs(mesh.ndim)], np.zeros(len(mesh.points))
     np.maximum.at(longest, ends, np.sqrt(squared_edges(mesh.points, mesh.cells))[:, :, None])
     index = np.argwhere(is_bare)
-    places = transformed(index.astype(np.float64), affine[:-1, :-1]) + affine[:-1, -1]
+    places = transform_vectors(index.astype(np.float64), affine[:-1, :-1]) + affine[:-1, -1]
     distance, node = scipy.spatial.cKDTree(mesh.points).query(places)
     is_far = np.zeros_like(is_bare)
     is_far[tuple(index[distance > longest[node]].T)] = True
     return voxel_components(is_far, np.zeros_like(is_far), affine)[1]
 
 
-def _listed(pieces: list[tuple[LostComponent, str]]) -> str:
+def _list_components(pieces: list[tuple[LostComponent, str]]) -> str:
     """List the largest components, each with words on it."""
     ranked = sorted(pieces, key=lambda piece: -piece[0].voxels)
     rows = [

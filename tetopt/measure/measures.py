@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.contents.content import Content, content, continued
+from tetopt.contents.content import Content, content, continue_image
 from tetopt.contents.domain import INSIDE_FRACTION
 from tetopt.errors import InputError
 from tetopt.image import Image
@@ -40,7 +40,7 @@ def fidelity(
     `LabelInterface` in `interfaces`; for each pair of labels a `LabelContact` in `contacts`, and
     their sums in `contact_totals`. Entries of missing images are omitted. With a mask, labels count
     only inside it. `of_cell` (M,) is the label of each cell, by default that of most of its voxels;
-    for `failed` see `measured_each`; `what` is the content with the levels of these labels, if
+    for `failed` see `measure_each`; `what` is the content with the levels of these labels, if
     known.
     """
     measures: dict[str, Callable[[], Any]] = {}
@@ -52,7 +52,7 @@ def fidelity(
         measures["mask"] = lambda: mask_fidelity(mask, mesh, owner())
     if labels is not None:
         own = (
-            _once(lambda: cell_labels(continued(labels, mask), mesh))
+            _once(lambda: cell_labels(continue_image(labels, mask), mesh))
             if of_cell is None
             else lambda: of_cell
         )
@@ -63,8 +63,8 @@ def fidelity(
         measures["contacts"] = lambda: label_contacts(labels, mesh, own(), mask)
     # First and alone: it takes all threads, and the most memory.
     alone = {name: measures.pop(name) for name in ("thickness",) if name in measures}
-    thickness = measured_each(alone, failed).get("thickness", {})
-    measured = measured_each(measures, failed)
+    thickness = measure_each(alone, failed).get("thickness", {})
+    measured = measure_each(measures, failed)
     if "labels" in measured:
         columns = ("thickness_voxels", "thickness_mesh", "edge", "cells_across")
         measured["labels"] = [
@@ -123,7 +123,7 @@ def _with_levels(what: Content | None, labels: Image | None, mask: Image | None)
     return content(labels, labels, mask)
 
 
-def measured_each(
+def measure_each(
     measures: Mapping[str, Callable[[], Any]], failed: dict[str, str] | None
 ) -> dict[str, Any]:
     """Compute measures in parallel; return their results by name.

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.contents.content import Content, own_image
-from tetopt.contents.labels import checked_labels
+from tetopt.contents.labels import check_labels
 from tetopt.contents.otsu import class_thresholds
 from tetopt.energy.sampling import cell_moments, cell_of_voxel
 from tetopt.errors import InputError
@@ -68,7 +68,7 @@ def segment(image: Image | Content, mesh: Mesh, classes: int) -> Image:
     return Image(np.where(owner >= 0, class_of_cell[owner], 0), whole.affine)
 
 
-def thresholded(image: Image, classes: int, inside: NDArray[np.bool_] | None = None) -> Image:
+def threshold_image(image: Image, classes: int, inside: NDArray[np.bool_] | None = None) -> Image:
     """Segment an image's voxels, by default all, into the same classes without a mesh; those not
     `inside` get 0.
     """
@@ -116,7 +116,7 @@ def _table(
         )
     named = {"labels": labels, "truth": truth}
     of_each = [
-        np.unique(checked_labels(name, image).data, return_inverse=True)
+        np.unique(check_labels(name, image).data, return_inverse=True)
         for name, image in named.items()
     ]
     (classes, row), (true, column) = of_each

@@ -15,7 +15,7 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from tetopt.contents.content import Content
-from tetopt.contents.labels import LARGEST_LABEL, checked_labels
+from tetopt.contents.labels import LARGEST_LABEL, check_labels
 from tetopt.contents.thickness import (
     BEYOND_REGION,
     THICKNESS_PERCENTILES,
@@ -30,7 +30,7 @@ from tetopt.image import Image
 from tetopt.measure.fidelity import (
     FacetSurface,
     Thickness,
-    checked_cell_labels,
+    check_cell_labels,
     labels_in_mask,
     painted_voxels,
     surface_areas,
@@ -114,8 +114,8 @@ def label_contacts(
     ...     print(each.labels, f"{each.ratio:.2f}")
     (0, 1) 1.03
     """
-    labels = checked_labels("labels", labels)
-    of_cell = checked_cell_labels(of_cell, mesh)
+    labels = check_labels("labels", labels)
+    of_cell = check_cell_labels(of_cell, mesh)
     pieces, n_pieces = mesh.straight_pieces()
     shared = facets(pieces.cells)
     sides = np.repeat(of_cell, n_pieces)[shared.cells]
@@ -231,7 +231,7 @@ def label_layers(what: Content, mesh: Mesh, of_cell: ArrayLike) -> dict[int, Lay
     """Measure the local thickness of each label as `label_thickness` does, in mm and in edges of
     the cells there.
     """
-    of_cell = checked_cell_labels(of_cell, mesh)
+    of_cell = check_cell_labels(of_cell, mesh)
     members, grid = what.memberships, what.image
     if members is None:
         raise InputError(

@@ -126,7 +126,7 @@ def cell_young(
     parsed = parse_average(average)
     if parsed.place == "nodes":
         return gauss_young(node_young(image, mesh, mapping), mesh, 1)[:, 0]
-    seen, owner = _seen(image, mesh)
+    seen, owner = _see_voxels(image, mesh)
     field = young_image(seen, mapping)
     _check_above_zero(parsed, image, field, owner)
     return _of_cells(field, mesh, owner, parsed.power)
@@ -142,7 +142,7 @@ def cell_values(image: Image, mesh: Mesh, mapping: ModulusMapping) -> NDArray[np
         For the reasons of `mapped_values` and `tetopt.energy.sampling.cell_of_voxel`; values that
         are not finite.
     """
-    seen, owner = _seen(image, mesh)
+    seen, owner = _see_voxels(image, mesh)
     values = mapped_values(mapping, seen.data)
     if not np.isfinite(values).all():
         at = seen.data[~np.isfinite(values)].ravel()[0]
@@ -167,7 +167,7 @@ def node_young(image: Image, mesh: Mesh, mapping: ModulusMapping = None) -> NDAr
         For the reasons of `young_from` and `tetopt.energy.sampling.cell_of_voxel`; a modulus of 0
         in the mesh.
     """
-    seen, owner = _seen(image, mesh)
+    seen, owner = _see_voxels(image, mesh)
     field = young_image(seen, mapping)
     _check_above_zero(parse_average("nodes"), image, field, owner)
     n_nodes = len(mesh.points)
@@ -211,7 +211,7 @@ def element_young(
         return gauss_young(node_young(image, mesh, mapping), mesh, order)
     if place == "cells" or order == 1:
         return cell_young(image, mesh, mapping, average)
-    seen, owner = _seen(image, mesh)
+    seen, owner = _see_voxels(image, mesh)
     field = young_image(seen, mapping)
     _check_above_zero(parse_average(average), image, field, owner)
     places, _ = gauss_rule(mesh.ndim, order)
@@ -237,7 +237,7 @@ def gauss_young(node_young: NDArray[np.float64], mesh: Mesh, order: int) -> NDAr
     return np.clip(np.einsum("qa,ca->cq", places, corners), low, high)
 
 
-def _seen(image: Image, mesh: Mesh) -> tuple[Image, NDArray[np.int64]]:
+def _see_voxels(image: Image, mesh: Mesh) -> tuple[Image, NDArray[np.int64]]:
     """Return the image with unused values replaced, and the cell of each voxel, (V,), -1 outside.
 
     Averages use voxels in cells, and those nearest to nodes and centroids, which stand in for cells

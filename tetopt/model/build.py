@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.contents.content import Content, continued
+from tetopt.contents.content import Content, continue_image
 from tetopt.contents.domain import mask_text
 from tetopt.engine.loop import MeshingResult
 from tetopt.errors import InputError, Note, warn
@@ -29,7 +29,7 @@ from tetopt.model.file import (
     MASK_TEXT,
     MATERIAL_FIELDS,
     MeshFile,
-    completed,
+    complete_model,
     count_of_other_voxels,
     loads_in,
     moduli_in,
@@ -42,7 +42,7 @@ from tetopt.model.file import (
 from tetopt.model.labels import (
     TABLE_TEXT,
     LabelTable,
-    coloured,
+    colour_labels,
     labels_of,
     table_of_words,
     table_words,
@@ -60,14 +60,14 @@ from tetopt.model.materials import (
     DEFAULT_NU,
     Materials,
     Spacing,
-    binned,
+    bin_moduli,
     by_label,
     density_of,
     materials,
 )
 from tetopt.model.model import Model
 from tetopt.model.sets import Box, Sets, box_of, box_text, standard_sets, with_requested
-from tetopt.system.arrays import unmasked
+from tetopt.system.arrays import plain_array
 
 
 def build_model(
@@ -122,7 +122,7 @@ def build_model(
         See `tetopt.model.loads.parse_loads`.
     bins : int, optional
         Group cells into at most this many materials; the resulting error is stored in the
-        materials. See `tetopt.model.materials.binned`.
+        materials. See `tetopt.model.materials.bin_moduli`.
     spacing : {"equal", "quantile", "log"}
         The spacing of the bins.
     order : {1, 2}, optional
@@ -261,7 +261,7 @@ def model_of_file(
     is_of_file = choices.young is None and choices.bins is None
     choices = choices._replace(young=young, nu=nu, density=density)
     model = _model(cells, choices, fields, about, known_sets)
-    return completed(model, loaded, is_of_file=is_of_file)
+    return complete_model(model, loaded, is_of_file=is_of_file)
 
 
 def _model(
@@ -282,7 +282,7 @@ def _model(
         nodal, at_gauss = _varying_moduli(cells, choices)
         table = _materials(cells, choices)
         if bins is not None:
-            table = binned(table, volumes(mesh.points, mesh.cells), bins, choices.spacing)
+            table = bin_moduli(table, volumes(mesh.points, mesh.cells), bins, choices.spacing)
     elif bins is not None:
         raise InputError("bins: the model has no moduli to group; give `young`")
     elif choices.density is not None:
@@ -350,7 +350,7 @@ def _voxels(
             )
         return image.own, whole, {MASK_TEXT: mask_text(mask), **about}
     within = None if whole is None or isinstance(mesh, Mesh) else own_mask(mesh, whole)
-    return (whole if whole is None else continued(whole, within)), whole, about
+    return (whole if whole is None else continue_image(whole, within)), whole, about
 
 
 def _table_of(about: dict[str, Any]) -> LabelTable:
@@ -366,7 +366,9 @@ def _with_table_in_words(about: dict[str, Any], labels: NDArray[np.int64] | None
     if about.get(TABLE_TEXT) is None and labels is None:
         return dict(about)
     table = _table_of(about)
-    return about | {TABLE_TEXT: table_words(table if labels is None else coloured(table, labels))}
+    return about | {
+        TABLE_TEXT: table_words(table if labels is None else colour_labels(table, labels))
+    }
 
 
 def _materials(cells: _ModelCells, choices: Choices) -> Materials:
@@ -438,7 +440,7 @@ def _values(
             "tetopt.ByLabel(dict)"
         )
     if not callable(mapping) and not isinstance(mapping, ByLabel) and np.ndim(mapping) < 2:
-        return unmasked(name, mapping).astype(np.float64)
+        return plain_array(name, mapping).astype(np.float64)
     if isinstance(mapping, ByLabel):
         return by_label(mapping, cells.labels, cells.names)
     if cells.image is not None:  # map each voxel, then average, as in Eq. (2)

@@ -21,9 +21,9 @@ from tetopt.mesh import Mesh
 from tetopt.model.fields import GAUSS_MODULI, NODE_MODULI, is_result
 from tetopt.model.labels import TABLE_TEXT, LabelTable, labels_of, table_of_words
 from tetopt.model.loads import load_words, parse_load
-from tetopt.model.mappings import checked_young
+from tetopt.model.mappings import check_young
 from tetopt.model.materials import BinningError
-from tetopt.model.model import STRESS_UNITS, Model, half_turned, scaled
+from tetopt.model.model import STRESS_UNITS, Model, half_turned, scale_load
 from tetopt.model.sets import (
     Box,
     Sets,
@@ -300,7 +300,7 @@ def loads_in(loaded: MeshFile) -> list[str]:
         return []
     units = STRESS_UNITS.get(loaded.text("units") or "", STRESS_UNITS["kPa"])
     turned = [half_turned(load) if loaded.space == "lps" else load for load in loads]
-    return [load_words(scaled(load, units.kPa, units.mm)) for load in turned]
+    return [load_words(scale_load(load, units.kPa, units.mm)) for load in turned]
 
 
 def moduli_in(
@@ -318,7 +318,7 @@ def moduli_in(
     return np.asarray(cell_data["young"], dtype=np.float64), stated["nu"], stated["density"]
 
 
-def completed(model: Model, loaded: MeshFile, *, is_of_file: bool) -> Model:
+def complete_model(model: Model, loaded: MeshFile, *, is_of_file: bool) -> Model:
     """Add the data that only the mesh's file has: data of nodes and, if the moduli are the
     file's, moduli that vary within cells and the binning error. Warn of data that do not fit.
     """
@@ -328,7 +328,7 @@ def completed(model: Model, loaded: MeshFile, *, is_of_file: bool) -> Model:
     if (table := model.materials) is None or not is_of_file:
         return model
     if (moduli := loaded.point_data.get(NODE_MODULI)) is not None:
-        model = model._replace(node_young=checked_young(moduli[: len(model.mesh.points)]))
+        model = model._replace(node_young=check_young(moduli[: len(model.mesh.points)]))
     table = table._replace(binning=_binning_error(loaded))
     at_gauss = _gauss_moduli(model, loaded)
     if at_gauss is None and model.order == 2 and GAUSS_MODULI in loaded.cell_data:
@@ -365,7 +365,7 @@ def _gauss_moduli(model: Model, loaded: MeshFile) -> NDArray[np.float64] | None:
         if ((1.0 - MODULUS_ROUNDING) * low <= of_cell).all() and (
             of_cell <= (1.0 + MODULUS_ROUNDING) * high
         ).all():
-            checked_young(low)
+            check_young(low)
             return np.asarray(moduli, dtype=np.float64)
     return None
 

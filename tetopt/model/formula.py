@@ -58,13 +58,13 @@ def parse_formula(text: str) -> Callable[[NDArray[np.float64]], NDArray[np.float
     if len(text) > MOST_FORMULA_LETTERS:
         raise InputError(
             f"formula: expected at most {MOST_FORMULA_LETTERS} characters, got "
-            f'"{_shown(text[:1000])}"'
+            f'"{_formula_text(text[:1000])}"'
         )
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # for "1if h" Python only issues a warning
             tree = ast.parse(text.strip(), mode="eval").body
-        value = _compiled(tree, text, 0)
+        value = _compile_node(tree, text, 0)
     except (
         SyntaxError,
         SyntaxWarning,
@@ -75,7 +75,9 @@ def parse_formula(text: str) -> Callable[[NDArray[np.float64]], NDArray[np.float
     ) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f'formula: expected {FORMULA_PARTS}, got "{_shown(text)}"') from error
+        raise InputError(
+            f'formula: expected {FORMULA_PARTS}, got "{_formula_text(text)}"'
+        ) from error
 
     def mapping(h: NDArray[np.float64]) -> NDArray[np.float64]:
         with np.errstate(all="ignore"):  # undefined values are rejected where the modulus is used
@@ -84,13 +86,13 @@ def parse_formula(text: str) -> Callable[[NDArray[np.float64]], NDArray[np.float
     return mapping
 
 
-def _shown(text: str) -> str:
+def _formula_text(text: str) -> str:
     """Format a formula on one line, truncated."""
     line = " ".join(text.split())
     return line if len(line) <= 60 else f"{line[:57]}..."
 
 
-def _compiled(node: ast.expr, text: str, depth: int) -> Callable[[NDArray[np.float64]], Any]:
+def _compile_node(node: ast.expr, text: str, depth: int) -> Callable[[NDArray[np.float64]], Any]:
     """Convert a syntax tree to a function of h.
 
     InputError if the tree contains anything not allowed, or is deeper than
@@ -99,7 +101,7 @@ def _compiled(node: ast.expr, text: str, depth: int) -> Callable[[NDArray[np.flo
     if depth > MOST_NESTED_OPERATIONS:
         raise InputError(
             f"formula: expected at most {MOST_NESTED_OPERATIONS} nested operations, got "
-            f'"{_shown(text)}"'
+            f'"{_formula_text(text)}"'
         )
     match node:
         case ast.Constant(value=float() | int() as value) if not isinstance(value, bool):
@@ -118,10 +120,12 @@ def _compiled(node: ast.expr, text: str, depth: int) -> Callable[[NDArray[np.flo
             if len(operands) != count:
                 raise InputError(
                     f"formula: {name} takes {count} arguments, got {len(operands)} in "
-                    f'"{_shown(text)}"'
+                    f'"{_formula_text(text)}"'
                 )
         case _:
             part = ast.get_source_segment(text.strip(), node) or text
-            raise InputError(f'formula: expected {FORMULA_PARTS}; cannot use "{_shown(part)}"')
-    values = [_compiled(operand, text, depth + 1) for operand in operands]
+            raise InputError(
+                f'formula: expected {FORMULA_PARTS}; cannot use "{_formula_text(part)}"'
+            )
+    values = [_compile_node(operand, text, depth + 1) for operand in operands]
     return lambda h: function(*(value(h) for value in values))

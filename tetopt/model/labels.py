@@ -176,7 +176,7 @@ def table_of_words(words: Any) -> LabelTable:
     return LabelTable(names, colours)
 
 
-def coloured(table: LabelTable, labels: NDArray[np.int64]) -> LabelTable:
+def colour_labels(table: LabelTable, labels: NDArray[np.int64]) -> LabelTable:
     """Add the colours that labels have in pictures to the table; 0, the background, is light
     grey.
     """

@@ -190,7 +190,7 @@ def parse_load(text: str, ndim: int) -> Load:
     form, size, unit = LOAD_FORMS[kind]
     name, _, numbers_text = rest.rpartition(":") if "SET" in form else ("", "", rest)
     count = ndim if size == "n" else 1
-    numbers = _moved(numbers_text) if kind == "move" else finite_numbers(numbers_text)
+    numbers = _parse_movement(numbers_text) if kind == "move" else finite_numbers(numbers_text)
     if len(numbers) != count or (kind == "move" and np.isnan(numbers).all()):
         what = f"{count} finite number{'s' * (count > 1)} in {unit}"
         raise InputError(f'load: expected {kind}:{form} with {what}, got "{text}"')
@@ -234,7 +234,7 @@ def _step_of(text: str) -> tuple[int, str]:
     return int(prefix), words
 
 
-def _moved(text: str) -> NDArray[np.float64]:
+def _parse_movement(text: str) -> NDArray[np.float64]:
     """Parse comma-separated numbers, NaN for the word free; empty for any other text."""
     parts = [part.strip() for part in text.split(",")]
     is_free = np.array([part == FREE_WORD for part in parts])
@@ -432,7 +432,7 @@ def facet_forces(
     rows = sets.facets[load.set_name]
     if load.kind == "pressure" and order == 2 and mesh.midpoints is not None:
         nodes, shapes, normals = _curved_facets(mesh, rows)
-        return _summed(
+        return _sum_rows(
             nodes.ravel(),
             -load.numbers * np.einsum("qa,qki->kai", shapes, normals).reshape(-1, mesh.ndim),
         )
@@ -443,7 +443,7 @@ def facet_forces(
     else:
         stress = np.broadcast_to(load.numbers, (len(rows), mesh.ndim))
     forces = weights[:, :, None] * stress[:, None, :]
-    return _summed(nodes[weights != 0.0], forces[weights != 0.0])
+    return _sum_rows(nodes[weights != 0.0], forces[weights != 0.0])
 
 
 def spring_constants(
@@ -453,11 +453,11 @@ def spring_constants(
     load in kPa/mm.
     """
     nodes, weights = facet_weights(mesh, sets.facets[load.set_name], order)
-    which, total = _summed(nodes[weights != 0.0], weights[weights != 0.0][:, None])
+    which, total = _sum_rows(nodes[weights != 0.0], weights[weights != 0.0][:, None])
     return which, load.numbers[0] * total[:, 0]
 
 
-def _summed(
+def _sum_rows(
     nodes: NDArray[np.int64], values: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the distinct nodes, ascending, and the sum of the rows of each, (P, w)."""

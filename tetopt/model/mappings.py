@@ -75,7 +75,7 @@ def mapped_values(mapping: ModulusMapping, intensities: ArrayLike) -> NDArray[np
     if mapping is None:
         return intensities.copy()
     if not callable(mapping):
-        table = _checked_table(mapping)
+        table = _check_table(mapping)
         return np.interp(intensities, table[:, 0], table[:, 1])
     values = np.asarray(mapping(intensities), dtype=np.float64)
     if values.shape != intensities.shape:
@@ -240,7 +240,7 @@ def parse_any_mapping(text: str, quantity: str = "young") -> ModulusMapping | By
     with contextlib.suppress(ValueError):
         if np.isfinite(value := float(text)):
             return value
-    return _checked_pairs(parse_table(text)) if ":" in text else parse_formula(text)
+    return _check_pairs(parse_table(text)) if ":" in text else parse_formula(text)
 
 
 def named_file(text: str) -> Path | None:
@@ -286,7 +286,7 @@ def load_mapping(path: Path, quantity: str = "young") -> ModulusMapping | ByLabe
             return _by_label(
                 [(str(label), value) for label, value in zip(columns[keys[0]], values, strict=True)]
             )
-        return _checked_pairs(
+        return _check_pairs(
             [(_number(h), value) for h, value in zip(columns["intensity"], values, strict=True)]
         )
     except InputError as error:
@@ -352,12 +352,12 @@ def _csv_columns(path: Path) -> dict[str, list[Any]]:
     return {name: [row[number] for row in rows[1:]] for number, name in enumerate(names)}
 
 
-def _checked_pairs(pairs: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    _checked_table(pairs)
+def _check_pairs(pairs: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    _check_table(pairs)
     return pairs
 
 
-def checked_young(young: NDArray[np.float64]) -> NDArray[np.float64]:
+def check_young(young: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the moduli of cells, (M,); InputError unless all are above 0."""
     bad = np.flatnonzero(~(np.isfinite(young) & (young > 0.0)))
     if len(bad):
@@ -370,7 +370,7 @@ def checked_young(young: NDArray[np.float64]) -> NDArray[np.float64]:
     return young
 
 
-def _checked_table(mapping: ArrayLike) -> NDArray[np.float64]:
+def _check_table(mapping: ArrayLike) -> NDArray[np.float64]:
     """Return the (K, 2) table as float64; InputError unless finite and increasing."""
     try:
         table = np.asarray(mapping, dtype=np.float64)

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from tetopt.energy.sampling import ranges_of
 from tetopt.errors import InputError, Remark, warn
 from tetopt.model.labels import label_words, labels_named
-from tetopt.model.mappings import ByLabel, checked_young
+from tetopt.model.mappings import ByLabel, check_young
 
 # Poisson's ratio of soft tissue that linear cells still represent: they lock closer to 0.5
 DEFAULT_NU = 0.45
@@ -98,7 +98,7 @@ def materials(
         Values are out of range, or their number is not that of the cells.
     """
     columns = [_of_cells("young", young, n_cells), _of_cells("nu", nu, n_cells)]
-    checked_young(columns[0])
+    check_young(columns[0])
     outside = np.flatnonzero(~((columns[1] > -1.0) & (columns[1] < 0.5)))
     if len(outside):
         raise InputError(
@@ -107,14 +107,14 @@ def materials(
             "use 0.45 to 0.49"
         )
     if density is not None:
-        columns.append(_checked_density(_of_cells("density", density, n_cells)))
+        columns.append(_check_density(_of_cells("density", density, n_cells)))
     kinds, of_cell = np.unique(np.column_stack(columns), axis=0, return_inverse=True)
     values = [column.copy() for column in kinds.T]
     masses = values[2] if len(values) == 3 else None
     return Materials(values[0], values[1], of_cell.ravel().astype(np.int64), density=masses)
 
 
-def _checked_density(density: NDArray[np.float64]) -> NDArray[np.float64]:
+def _check_density(density: NDArray[np.float64]) -> NDArray[np.float64]:
     bad = np.flatnonzero(~(np.isfinite(density) & (density > 0.0)))
     if len(bad):
         raise InputError(
@@ -207,7 +207,7 @@ def by_label(
     )[which.ravel()]
 
 
-def binned(
+def bin_moduli(
     exact: Materials, volumes: NDArray[np.float64], count: int, spacing: Spacing = "equal"
 ) -> Materials:
     """Group moduli into at most `count` bins.

@@ -295,7 +295,7 @@ def in_units(model: Model, units: str) -> Model:
     return model._replace(
         mesh=mesh,
         materials=None if table is None else table._replace(young=table.young * stress),
-        loads=tuple(scaled(load, stress, length) for load in model.loads),
+        loads=tuple(scale_load(load, stress, length) for load in model.loads),
         node_young=None if model.node_young is None else model.node_young * stress,
         gauss_young=None if model.gauss_young is None else model.gauss_young * stress,
         cell_data=scaled_fields(model.cell_data, stress, length, mesh.ndim),
@@ -304,7 +304,7 @@ def in_units(model: Model, units: str) -> Model:
     )
 
 
-def scaled(load: Load, stress: float, length: float) -> Load:
+def scale_load(load: Load, stress: float, length: float) -> Load:
     """Convert a load to other units; `stress` and `length` are the numbers of new units per
     present unit.
     """
@@ -361,7 +361,7 @@ def locking_words(model: Model) -> str:
     )
 
 
-def described(model: Model) -> list[str]:
+def header_lines(model: Model) -> list[str]:
     """Return lines for a file's header: the writer, coordinates, units and inputs."""
     units = STRESS_UNITS[model.units]
     space = f"{model.space.upper()}+" if model.mesh.ndim == 3 else "of the slice's plane"

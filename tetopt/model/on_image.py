@@ -15,7 +15,7 @@ from tetopt.geometry.quadratic import edge_ends, of_order, shape_slopes, shape_v
 from tetopt.geometry.simplex import volume_gradients, volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.system.arrays import unmasked
+from tetopt.system.arrays import plain_array
 from tetopt.system.slabs import over_slabs
 
 # whose nodes' values are gathered: 30 numbers each for a vector field of order 2
@@ -76,7 +76,7 @@ def field_on_image(
     >>> bool(np.allclose(height[5, 7], image.to_world(np.argwhere(image.data > -1))[:16, 2]))
     True
     """
-    rows = unmasked("values", values)
+    rows = plain_array("values", values)
     if at not in (None, "cells", "nodes"):
         raise InputError(f'at: expected "cells" or "nodes", got {at!r}')
     if rows.ndim == 0 or rows.dtype.kind not in "biuf":
@@ -223,7 +223,7 @@ def warped_image(
     if not np.isfinite(outside):
         raise InputError(f"outside: expected a finite number in a moved image, got {outside}")
     u, like, n_nodes = (
-        unmasked("displacement", displacement).astype(np.float64),
+        plain_array("displacement", displacement).astype(np.float64),
         image if like is None else like,
         len(mesh.points),
     )

@@ -19,8 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides, facets_on_sides, world_axes
 from tetopt.geometry.simplex import area_normals, outward_facet_nodes
-from tetopt.geometry.topology import facets, largest_component, linked
-from tetopt.image import Image, transformed
+from tetopt.geometry.topology import connected_sets, facets, largest_component
+from tetopt.image import Image, transform_vectors
 from tetopt.mesh import Mesh
 
 BOUNDARY_SET = "boundary"  # all facets that belong to only one cell
@@ -198,7 +198,7 @@ def label_sets(
     InputError
         Labels are not one whole number from 0 for each cell.
     """
-    labels = _checked_labels(labels, mesh)
+    labels = _check_labels(labels, mesh)
     of_label = label_set_names(np.unique(labels).tolist(), names or {})
     facet_rows = _interfaces(mesh, labels)
     of_pair = interface_names(facet_rows, of_label)
@@ -279,7 +279,7 @@ def face_sets(
         axes, directions = tuple(range(n)), np.ones(n)
     else:
         inverse = np.asarray(np.linalg.inv(box.affine[:n, :n]), dtype=np.float64)
-        places = transformed(mesh.points - box.affine[:n, n], inverse)
+        places = transform_vectors(mesh.points - box.affine[:n, n], inverse)
         faces, tolerance = box_sides(box.shape), ON_SIDE_VOXELS
         axes = world_axes(box.affine)
         directions = box.affine[list(axes), range(n)]
@@ -340,7 +340,7 @@ def _interfaces(mesh: Mesh, labels: NDArray[np.int64]) -> dict[tuple[int, int], 
     return dict(zip(kinds, parts, strict=True))
 
 
-def _checked_labels(labels: ArrayLike, mesh: Mesh) -> NDArray[np.int64]:
+def _check_labels(labels: ArrayLike, mesh: Mesh) -> NDArray[np.int64]:
     array = np.asarray(labels)
     if array.shape != (len(mesh.cells),):
         raise InputError(
@@ -543,7 +543,7 @@ def _is_inner(mesh: Mesh, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
     order = np.argsort(of_side.ravel(), kind="stable")
     facet, side = order // n, of_side.ravel()[order]
     is_same = side[1:] == side[:-1]
-    n_parts, part = linked(facet[:-1][is_same], facet[1:][is_same], len(rows))
+    n_parts, part = connected_sets(facet[:-1][is_same], facet[1:][is_same], len(rows))
     centres, vectors = mesh.points[nodes].mean(axis=1), area_vectors(mesh, rows)
     areas = np.linalg.norm(vectors, axis=1)
     middle = np.stack(

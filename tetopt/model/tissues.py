@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.contents.labels import LARGEST_LABEL, checked_labels
+from tetopt.contents.labels import LARGEST_LABEL, check_labels
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.model.labels import labels_named
@@ -95,7 +95,7 @@ def merge_labels(labels: Image, merge: str, names: Mapping[int, str] | None = No
     >>> merged.labels.data.tolist(), merged.names
     ([[0.0, 1.0, 1.0, 2.0, 5.0]], {1: 'white', 2: 'grey', 5: 'soft'})
     """
-    labels = checked_labels("labels", labels)
+    labels = check_labels("labels", labels)
     groups, present = groups_of(merge), np.unique(labels.data).astype(np.int64)
     owner, rest = _members(groups, names or {}, present)
     owner.setdefault(0, 0)
@@ -111,11 +111,11 @@ def merge_labels(labels: Image, merge: str, names: Mapping[int, str] | None = No
         )
     numbers = {label: owner.get(label, rest or 0) for label in present.tolist()}
     return Merged(
-        renumbered(labels, numbers), {group.label: group.name for group in groups}, numbers
+        renumber_labels(labels, numbers), {group.label: group.name for group in groups}, numbers
     )
 
 
-def renumbered(labels: Image, numbers: Mapping[int, int]) -> Image:
+def renumber_labels(labels: Image, numbers: Mapping[int, int]) -> Image:
     """Renumber labels; labels without a new number are unchanged."""
     present = np.unique(labels.data)
     new = np.array(
@@ -154,7 +154,7 @@ def groups_of(merge: str) -> list[LabelGroup]:
             ) from error
     if is_preset(merge):
         return _of_rows([(name, [labels]) for name, labels in _presets()[merge.strip()].items()])
-    return _checked([_of_words(words) for words in merge.split(";") if words.strip()])
+    return _check_groups([_of_words(words) for words in merge.split(";") if words.strip()])
 
 
 def _of_rows(rows: Sequence[tuple[str, Sequence[object]]]) -> list[LabelGroup]:
@@ -162,7 +162,7 @@ def _of_rows(rows: Sequence[tuple[str, Sequence[object]]]) -> list[LabelGroup]:
     groups: dict[str, list[object]] = {}
     for name, labels in rows:
         groups.setdefault(name, []).extend(labels)
-    return _checked(
+    return _check_groups(
         [_of_words(f"{name}={','.join(map(str, labels))}") for name, labels in groups.items()]
     )
 
@@ -180,7 +180,7 @@ def _of_words(words: str) -> tuple[str | None, str, tuple[str, ...]]:
     return match[1], " ".join(match[2].split()), members
 
 
-def _checked(rows: list[tuple[str | None, str, tuple[str, ...]]]) -> list[LabelGroup]:
+def _check_groups(rows: list[tuple[str | None, str, tuple[str, ...]]]) -> list[LabelGroup]:
     """Return the groups with their numbers; numbers and names must be unique."""
     rows = rows or [_of_words("")]  # raises InputError
     groups = [

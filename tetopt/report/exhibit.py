@@ -155,7 +155,7 @@ def exhibit(
     skipped = [name for name in cell_data if name not in scalars] + others
     if len(displacements) > 1:
         skipped = list(dict.fromkeys(STEP_NAME.sub(r"\1", name) for name in skipped))
-    checked = _checked_sets(mesh, facet_sets or {})
+    checked = _check_sets(mesh, facet_sets or {})
     forces = {
         step if len(displacements) > 1 else 0: by_set for step, by_set in (reactions or {}).items()
     }
@@ -320,7 +320,7 @@ def _categories(values: NDArray[np.float64], table: LabelTable) -> list[tuple[in
     )
 
 
-def _checked_sets(mesh: Mesh, facet_sets: dict[str, NDArray]) -> dict[str, NDArray]:
+def _check_sets(mesh: Mesh, facet_sets: dict[str, NDArray]) -> dict[str, NDArray]:
     """Return the sets as arrays; InputError unless each consists of triples (K, 3) of the mesh's
     nodes.
     """

@@ -13,7 +13,7 @@ import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.fem.reference import averaged
+from tetopt.fem.reference import average_voxels
 from tetopt.geometry.box import box_sides
 from tetopt.image import Image
 from tetopt.io.text import plain
@@ -27,7 +27,14 @@ from tetopt.report.exhibit import (
     first_axis,
     warp_factors,
 )
-from tetopt.report.page import data_html, packed, policy_html, printed, rendered, script_html
+from tetopt.report.page import (
+    data_html,
+    encode_numbers,
+    escape_unprintable,
+    policy_html,
+    render_page,
+    script_html,
+)
 from tetopt.system.files import save_text
 
 PAGE_IMAGE_VOXELS = 2**24  # 16 MB, one byte each: larger images are averaged
@@ -44,7 +51,7 @@ def colour_table() -> NDArray[np.uint8]:
 def save_explorer(path: str | Path, shown: Exhibit) -> None:
     """Write `explorer_html` as one file, whole or not at all.
 
-    Replaces an existing file; call `tetopt.system.files.checked_output` first.
+    Replaces an existing file; call `tetopt.system.files.check_output` first.
     """
     save_text(path, explorer_html(shown))
 
@@ -62,19 +69,22 @@ def explorer_html(shown: Exhibit) -> str:
     centre = (mesh.points.min(axis=0) + mesh.points.max(axis=0)) / 2.0
     data = {
         "centre": centre.tolist(),
-        "points": packed(mesh.points - centre, "<f4"),
-        "cells": packed(mesh.cells, "<u4"),
+        "points": encode_numbers(mesh.points - centre, "<f4"),
+        "cells": encode_numbers(mesh.cells, "<u4"),
         # of curved cells
-        "volumes": None if mesh.midpoints is None else packed(mesh.cell_volumes, "<f4"),
+        "volumes": None if mesh.midpoints is None else encode_numbers(mesh.cell_volumes, "<f4"),
         "labelField": LABEL_FIELD,
         "fields": [_packed_field(field) for field in fields],
         "skipped": skipped,
-        "colours": packed(colour_table(), "u1"),
+        "colours": encode_numbers(colour_table(), "u1"),
         "image": None if image is None else _packed_image(image, centre),
-        "sets": [{"name": name, "triangles": packed(nodes, "<u4")} for name, nodes in sets.items()],
+        "sets": [
+            {"name": name, "triangles": encode_numbers(nodes, "<u4")}
+            for name, nodes in sets.items()
+        ],
         "noValue": NO_VALUE,
         "displacements": [
-            {"step": step, "u": packed(u, "<f4")} for step, u in displacements.items()
+            {"step": step, "u": encode_numbers(u, "<f4")} for step, u in displacements.items()
         ],
         "nNodes": n_nodes,
         "reactions": reactions,
@@ -86,12 +96,14 @@ def explorer_html(shown: Exhibit) -> str:
         "data": data_html("data", data),
         "script": script_html("explorer"),
     }
-    return printed(f"{rendered('report/explore.html', title=plain(title), **markup)}\n")
+    return escape_unprintable(
+        f"{render_page('report/explore.html', title=plain(title), **markup)}\n"
+    )
 
 
 def _packed_field(field: Field) -> dict[str, Any]:
-    nodes = None if field.nodes is None else packed(field.nodes, "<f4")
-    return {**field._asdict(), "values": packed(field.values, "<f4"), "nodes": nodes}
+    nodes = None if field.nodes is None else encode_numbers(field.nodes, "<f4")
+    return {**field._asdict(), "values": encode_numbers(field.values, "<f4"), "nodes": nodes}
 
 
 def _packed_image(image: Image, centre: NDArray[np.float64]) -> dict[str, Any]:
@@ -99,7 +111,7 @@ def _packed_image(image: Image, centre: NDArray[np.float64]) -> dict[str, Any]:
     `centre` to indices.
     """
     shape = _shown_shape(image.shape)
-    shown = image if shape == image.shape else averaged(image, shape)
+    shown = image if shape == image.shape else average_voxels(image, shape)
     low, high = grey_limits([shown.data.astype(np.float64)])
     greys = np.rint(255.0 * np.clip((shown.data - low) / (high - low), 0.0, 1.0)).astype(np.uint8)
     to_index = np.linalg.inv(shown.affine)
@@ -109,7 +121,7 @@ def _packed_image(image: Image, centre: NDArray[np.float64]) -> dict[str, Any]:
     return {
         "shape": shown.shape,
         "original": image.shape,
-        "voxels": packed(greys.ravel(order="F"), "u1"),
+        "voxels": encode_numbers(greys.ravel(order="F"), "u1"),
         "toIndex": to_index.T.ravel().tolist(),  # by columns, as WebGL expects
         "box": [world.min(axis=0).tolist(), world.max(axis=0).tolist()],
         "limits": [low, high],

@@ -241,8 +241,8 @@ def label_figure(
     views = _middle_views(Image(np.searchsorted(values, labels.data), labels.affine))
     pixels = [view.pixels.astype(np.int64) for view in views]
     cuts = [view.section(mesh) for view in views]
-    shown = _counted(pixels, len(colours)) + (
-        _counted([of_cell[cells] for _, cells in cuts], len(colours)) > 0
+    shown = _count_rows(pixels, len(colours)) + (
+        _count_rows([of_cell[cells] for _, cells in cuts], len(colours)) > 0
     )
     width, heights = max(view.size[0] for view in views), [view.size[1] for view in views]
     inches = min(SLICE_WIDTH_INCHES / width, SLICES_HEIGHT_INCHES / sum(heights))  # per mm
@@ -313,7 +313,7 @@ def _draw_interfaces(
         view.frame(axes)
 
 
-def _counted(arrays: Sequence[NDArray[np.int64]], n: int) -> NDArray[np.int64]:
+def _count_rows(arrays: Sequence[NDArray[np.int64]], n: int) -> NDArray[np.int64]:
     """Count the rows of labels, 0 to n - 1, in all arrays together."""
     return np.bincount(np.concatenate([array.ravel() for array in arrays]), minlength=n)
 

@@ -45,7 +45,7 @@ def package_text(name: str) -> str:
     return resources.files("tetopt").joinpath(name).read_text(encoding="utf-8")
 
 
-def rendered(template: str, **values: Any) -> Markup:
+def render_page(template: str, **values: Any) -> Markup:
     """Render a template in the package; all values except markup are escaped.
 
     See https://jinja.palletsprojects.com/ for the language of the templates.
@@ -60,14 +60,14 @@ def write_page(path: Path, title: str, content: str, style: str = "") -> None:
     characters, such as marks that reverse the direction of writing, which are shown as Python
     escapes; `title` is text. See `policy_html`.
     """
-    page = rendered(
+    page = render_page(
         "report/page.html",
         policy=policy_html(),
         title=plain(title),
         style=Markup(style),
         content=Markup(content),
     )
-    save_text(path, printed(f"{page}\n"))
+    save_text(path, escape_unprintable(f"{page}\n"))
 
 
 def picture_html(path: str | Path, caption: str) -> Markup:
@@ -85,7 +85,7 @@ def picture_html(path: str | Path, caption: str) -> Markup:
     ).format(shape, caption, width, height, data, caption)
 
 
-def packed(numbers: NDArray, kind: str) -> str:
+def encode_numbers(numbers: NDArray, kind: str) -> str:
     """Encode an array as Base64, as numbers of a `kind` such as "<f4"."""
     return base64.b64encode(numbers.astype(kind).tobytes()).decode("ascii")
 
@@ -93,16 +93,16 @@ def packed(numbers: NDArray, kind: str) -> str:
 def data_html(name: str, data: Any) -> Markup:
     """Return data for a script as markup: JSON in the element `name`."""
     # An HTML parser ends a script at any "</script", even within a string.
-    text = json.dumps(_shown(data), allow_nan=False).replace("<", "\\u003c")
+    text = json.dumps(_plain_texts(data), allow_nan=False).replace("<", "\\u003c")
     return Markup(f'<script type="application/json" id="{name}">{text}</script>')
 
 
-def _shown(data: Any) -> Any:
+def _plain_texts(data: Any) -> Any:
     """Make all texts in the data `plain`: a page shows names literally."""
     if isinstance(data, dict):
-        return {plain(str(key)): _shown(value) for key, value in data.items()}
+        return {plain(str(key)): _plain_texts(value) for key, value in data.items()}
     if isinstance(data, list | tuple):
-        return [_shown(value) for value in data]
+        return [_plain_texts(value) for value in data]
     return plain(data) if isinstance(data, str) else data
 
 
@@ -138,6 +138,6 @@ def policy_html() -> Markup:
     return Markup(f'<meta http-equiv="Content-Security-Policy" content="{"; ".join(rules)}">')
 
 
-def printed(markup: str) -> str:
+def escape_unprintable(markup: str) -> str:
     """Replace unprintable characters in markup, except line breaks, by Python escapes."""
     return "\n".join(map(plain, markup.split("\n")))

@@ -116,13 +116,15 @@ def thumbnail_png(
             _at(place, axis, _fullest(mesh, axis))
             for place, axis in zip(places, (2, 0), strict=True)
         ]
-    pixels = [_sampled(image, place, axes, half) for place, axes in zip(places, views, strict=True)]
+    pixels = [
+        _sample_square(image, place, axes, half) for place, axes in zip(places, views, strict=True)
+    ]
     inside = cell_of_voxel(image, mesh) >= 0
     covered = Image(
         inside if mask is None else inside & (mask.data >= INSIDE_FRACTION), image.affine
     )
     is_in = [
-        _sampled(covered, place, axes, half) > 0.5
+        _sample_square(covered, place, axes, half) > 0.5
         for place, axes in zip(places, views, strict=True)
     ]
     seen = [each[np.isfinite(each) & within] for each, within in zip(pixels, is_in, strict=True)]
@@ -144,7 +146,7 @@ def thumbnail_png(
             shown.T, origin="lower", extent=extent, cmap="gray", vmin=limits[0], vmax=limits[1]
         )
         if mask is not None:
-            inside = np.nan_to_num(_sampled(mask, place, axes, half), nan=0.0)
+            inside = np.nan_to_num(_sample_square(mask, place, axes, half), nan=0.0)
             if inside.min() < 0.5 <= inside.max():
                 panel.contour(
                     inside.T, levels=[0.5], extent=extent, colors=MASK_LINE, linewidths=1.0
@@ -192,7 +194,7 @@ def _fullest(mesh: Mesh, axis: int) -> float:
     return float(ends[slab : slab + 2].mean())
 
 
-def _sampled(
+def _sample_square(
     image: Image, place: NDArray[np.float64], axes: Sequence[int], half: float
 ) -> NDArray[np.float64]:
     """Sample the image in a square around a place, along two world axes; NaN outside the image."""

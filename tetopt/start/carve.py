@@ -32,7 +32,7 @@ class Carved(NamedTuple):
     volumes: dict[int, float]  # mm^n of these, by label; all of label 0 without labels
 
 
-def carved(
+def carve_mesh(
     mesh: Mesh,
     image: Image,
     region: Region,
@@ -48,7 +48,7 @@ def carved(
     most of a label's volume stays, too.
     """
     size = volumes(mesh.points, mesh.cells)
-    is_kept = manifold_part(_welded(mesh), size)
+    is_kept = manifold_part(_weld_cells(mesh), size)
     chosen = np.flatnonzero(is_kept)
     number = components(mesh.cells[chosen])
     volume = np.bincount(number, size[chosen])
@@ -76,7 +76,7 @@ def carved(
     )
 
 
-def _welded(mesh: Mesh) -> NDArray[np.int64]:
+def _weld_cells(mesh: Mesh) -> NDArray[np.int64]:
     """The cells with one number for coincident nodes, where parts of a boundary may touch
     without sharing a node.
     """

@@ -33,7 +33,7 @@ LEAST_RISE = 0.3
 BISECTION_ROUNDS = 20  # along an edge that crosses the surface: to 1e-6 of its length
 
 
-def clipped(mesh: Mesh, image: Image, region: Region) -> Mesh:
+def clip_cells(mesh: Mesh, image: Image, region: Region) -> Mesh:
     """The part of a mesh of the image's box within the region, with nodes on its surface and whole
     cells.
 
@@ -51,7 +51,7 @@ def clipped(mesh: Mesh, image: Image, region: Region) -> Mesh:
     is_touched = np.zeros(len(level), dtype=bool)
     is_touched[mesh.cells[is_inside & is_outside]] = True
     near = np.flatnonzero(is_touched[mesh.cells].any(axis=1))
-    index, level = _snapped(index, level, mesh.cells[near], image, region)
+    index, level = _snap_nodes(index, level, mesh.cells[near], image, region)
     index, level, cells = _cut(index, level, mesh.cells, near, region)
     is_inside, is_outside = _sides(level, cells)
     is_flat = ~(is_inside | is_outside)
@@ -132,21 +132,21 @@ def lattice_within(
     Raises
     ------
     InputError
-        As for `tetopt.lattice_mesh` and `clipped`.
+        As for `tetopt.lattice_mesh` and `clip_cells`.
     """
     if region is None or nodes is None:
         mesh = lattice_mesh(image, kind, nodes=nodes, spacing=spacing)
-        return mesh if region is None else clipped(mesh, image, region)
+        return mesh if region is None else clip_cells(mesh, image, region)
     # nodes of a lattice of the box
     in_box, nearest = nodes * region.inside.size / region.inside.sum(), list[Mesh]()
     for _ in range(LATTICE_TRIALS):
-        mesh = clipped(lattice_mesh(image, kind, nodes=int(in_box)), image, region)
+        mesh = clip_cells(lattice_mesh(image, kind, nodes=int(in_box)), image, region)
         nearest = [min([*nearest, mesh], key=lambda each: abs(len(each.points) - nodes))]
         in_box *= nodes / len(mesh.points)
     return nearest[0]
 
 
-def _snapped(
+def _snap_nodes(
     index: NDArray[np.float64],
     level: NDArray[np.float64],
     cells: NDArray[np.int64],

@@ -6,8 +6,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from tetopt.geometry.simplex import oriented
-from tetopt.image import transformed
+from tetopt.geometry.simplex import orient_cells
+from tetopt.image import transform_vectors
 
 TIE_BREAK = 1e-7  # of the squared typical edge
 
@@ -38,7 +38,7 @@ def delaunay(index: NDArray[np.float64], affine: NDArray[np.float64]) -> NDArray
     """
     n = index.shape[1]
     centred = index - 0.5 * (index.min(axis=0) + index.max(axis=0))
-    world = transformed(centred, affine[:-1, :-1])
+    world = transform_vectors(centred, affine[:-1, :-1])
     extent = float(np.abs(world).max())
     typical_edge = extent / len(index) ** (1.0 / n)
     weights = np.random.default_rng(len(index)).random(len(index)) * TIE_BREAK * typical_edge**2
@@ -51,7 +51,7 @@ def delaunay(index: NDArray[np.float64], affine: NDArray[np.float64]) -> NDArray
         return None
     # 0, up to rounding, for faces of the box, which are vertical
     is_lower = hull.equations[:, n] < -1e-9
-    cells = oriented(world, hull.simplices[is_lower])
+    cells = orient_cells(world, hull.simplices[is_lower])
     # Qhull's order of cells depends on its version; a sorted one does not.
     cells = cells[np.lexsort(np.sort(cells, axis=1).T[::-1])]
     return cells if len(np.unique(cells)) == len(index) else None

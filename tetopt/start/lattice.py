@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.geometry.simplex import oriented
+from tetopt.geometry.simplex import orient_cells
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.system.budget import at_most, check_memory
@@ -96,15 +96,15 @@ def lattice_mesh(
         blocks = near_cubes(kind, lengths, index(nodes))
     elif spacing is not None:
         blocks = _blocks_for_spacing(lengths, spacing)
-    blocks = _checked_blocks(kind, blocks, n)
+    blocks = _check_blocks(kind, blocks, n)
     unit_points, cells = {"criss-cross": _criss_cross, "five-tet": _five_tet, "bcc": _bcc}[kind](
         blocks
     )
     points = image.to_world(unit_points / np.array(blocks) * image.shape - 0.5)
-    return Mesh(points, oriented(points, cells))
+    return Mesh(points, orient_cells(points, cells))
 
 
-def _checked_blocks(kind: str, counts: tuple[int, ...] | None, n: int) -> tuple[int, ...]:
+def _check_blocks(kind: str, counts: tuple[int, ...] | None, n: int) -> tuple[int, ...]:
     try:
         blocks = tuple(index(b) for b in (() if counts is None else counts))
     except TypeError:

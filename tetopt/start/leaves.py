@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.geometry.simplex import oriented
+from tetopt.geometry.simplex import orient_cells
 
 # Around a square, in halves of its edge: corners, alternating with the middles of its edges.
 FACE_RING = np.array([[0, 0], [1, 0], [2, 0], [2, 1], [2, 2], [1, 2], [0, 2], [0, 1]])
@@ -107,7 +107,7 @@ def leaf_cells(
         for start in range(0, len(leaves), LEAVES_AT_A_TIME):
             some = leaves[start : start + LEAVES_AT_A_TIME]
             pieces = (_cells_in_plane if len(roots) == 2 else _cells)(some, nodes, d)
-            cells += [oriented(points, piece) for piece in pieces]
+            cells += [orient_cells(points, piece) for piece in pieces]
     joined = np.concatenate(cells)
     del cells
     return joined[np.argsort(joined.min(axis=1), kind="stable")]

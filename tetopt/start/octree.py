@@ -33,7 +33,7 @@ from tetopt.contents.smoothing import largest_around
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.start.clip import clipped, lost_fraction
+from tetopt.start.clip import clip_cells, lost_fraction
 from tetopt.start.lattice import MAX_NODES, near_cubes
 from tetopt.start.leaves import leaf_cells, leaf_nodes
 from tetopt.start.sizes import (
@@ -45,7 +45,14 @@ from tetopt.start.sizes import (
     Sizes,
     equilateral_nodes,
 )
-from tetopt.start.sums import BlockSums, Channels, block_starts, block_sums, channels_of, halved
+from tetopt.start.sums import (
+    BlockSums,
+    Channels,
+    block_starts,
+    block_sums,
+    channels_of,
+    halve_totals,
+)
 from tetopt.system.budget import MemoryShortage, at_most, check_memory
 
 # Ratios of the undivided blocks' nodes to the requested number, tried in turn, the largest blocks
@@ -150,7 +157,7 @@ def octree_mesh(image: Image | Content, nodes: int, sizes: Sizes | None = None) 
         return mesh
     raise InputError(
         f"octree: {nodes} nodes are too {'many' if count < nodes else 'few'} for "
-        f"{_given(content, sizes)}; the "
+        f"{_input_words(content, sizes)}; the "
         f"nearest octree found has {count}: use about as many, or a uniform mesh"
     )
 
@@ -161,7 +168,7 @@ def _check_enough(content: Content, nodes: int, sizes: Sizes | None, limits: _Bl
     if least > (1.0 + LARGEST_MISS) * nodes + LARGEST_MISS_NODES:
         enough = max(_coarsest_nodes(content, nodes, limits), SIZED_OVER_EQUILATERAL * by_target)
         raise InputError(
-            f"octree: {nodes} nodes are too few for {_given(content, sizes)}, which need at "
+            f"octree: {nodes} nodes are too few for {_input_words(content, sizes)}, which need at "
             f"least {least:.4g}; "
             f"use {np.ceil(enough):.0f}, or allow longer edges"
         )
@@ -178,7 +185,7 @@ def _coarsest_nodes(content: Content, nodes: int, limits: _BlockLimits) -> float
     )
 
 
-def _given(content: Content, sizes: Sizes | None) -> str:
+def _input_words(content: Content, sizes: Sizes | None) -> str:
     """The image and the sizes, in words."""
     limited = "" if sizes is None or sizes == Sizes() else " and these limits on sizes"
     return f"{' x '.join(map(str, content.image.shape))} voxels{limited}"
@@ -361,7 +368,7 @@ def _clipped_octree(content: Content, nodes: int, limits: _BlockLimits, region: 
                 raise
             break
         try:
-            mesh = clipped(tree, image, region)
+            mesh = clip_cells(tree, image, region)
         except InputError:  # the region is thinner than the cells
             if not nearest and trial == MASK_TRIALS - 1:
                 raise
@@ -392,7 +399,9 @@ def _lighter(content: Content, nodes: int, limits: _BlockLimits) -> _BlockLimits
         regions = [
             at_depth.is_in_region for at_depth in blocks if at_depth.is_in_region is not None
         ]
-        count = len(leaf_nodes(_divided(blocks, np.inf, limits.n_rings), roots, regions).codes)
+        count = len(
+            leaf_nodes(_divide_blocks(blocks, np.inf, limits.n_rings), roots, regions).codes
+        )
         if count <= (1.0 + TARGET_MISS) * nodes:
             break
         limits = limits._replace(
@@ -456,7 +465,7 @@ def _blocks_by_depth(
         blocks.append(_Blocks(error, is_too_large, is_in_region))
         if 0 < d <= summed:
             sums = sums.coarser()
-        target = None if target is None or d == 0 else halved(target, np.minimum)
+        target = None if target is None or d == 0 else halve_totals(target, np.minimum)
     return blocks[::-1]
 
 
@@ -479,7 +488,7 @@ def _errors(sums: BlockSums, channels: Channels, spread: float) -> NDArray[np.fl
         if sums.inside is not None:
             error += channels.step * count * (voxels - count) / np.maximum(voxels, 1.0)
         place = np.ogrid[layers, *others]
-        errors[layers] = (error + spread * count) * _uneven(*place)
+        errors[layers] = (error + spread * count) * _uneven_factors(*place)
     return errors
 
 
@@ -541,17 +550,17 @@ def _divided_for(target: NDArray, edge: float) -> NDArray[np.bool_]:
     mm.
 
     A divided block has 2^n times the nodes. For k times as many, one in (2^n - 1) / (k - 1) is
-    divided, selected by `_uneven`.
+    divided, selected by `_uneven_factors`.
     """
     n = target.ndim
     more = (USUAL_IN_BLOCK[n] * edge / target) ** n - 1.0
     fraction = (
-        _uneven(*np.ogrid[tuple(slice(0, size) for size in target.shape)]) - 1.0
+        _uneven_factors(*np.ogrid[tuple(slice(0, size) for size in target.shape)]) - 1.0
     ) / TIE_SPREAD
     return np.asarray(more > np.maximum((2**n - 1) * fraction, TARGET_SLACK))
 
 
-def _uneven(*index: NDArray[np.int64]) -> NDArray[np.float64]:
+def _uneven_factors(*index: NDArray[np.int64]) -> NDArray[np.float64]:
     """Distinct factors from 1 to 1 + `TIE_SPREAD`, so that blocks that are alike are not all
     divided at once.
 
@@ -684,7 +693,7 @@ def _division(
     best_count, best, is_bound = -1, [], False
     for _ in range(BISECTION_STEPS):
         middle = np.sqrt(max(low, 1e-300) * high)
-        divided = _divided(blocks, middle, n_rings)
+        divided = _divide_blocks(blocks, middle, n_rings)
         # For far too many leaves, each with its centre, a bound of the nodes suffices: it is no
         # nearer than any counted number, and it rises as the threshold falls.
         n_leaves = prod(roots) + (2 ** len(roots) - 1) * sum(
@@ -704,7 +713,9 @@ def _division(
     return len(leaf_nodes(best, roots).codes) if is_bound else best_count, best
 
 
-def _divided(blocks: list[_Blocks], threshold: float, n_rings: int) -> list[NDArray[np.bool_]]:
+def _divide_blocks(
+    blocks: list[_Blocks], threshold: float, n_rings: int
+) -> list[NDArray[np.bool_]]:
     """Masks of the blocks to divide at each depth, if those above the threshold or too large are
     divided.
 

@@ -175,7 +175,11 @@ class Sizes(NamedTuple):
             )
         if self.field is not None and not (self.field.data > 0.0).any():
             raise InputError("field: expected lengths above 0 mm, got none")
-        return self if self.field is None else self._replace(field=_graded(self.field, self.slope))
+        return (
+            self
+            if self.field is None
+            else self._replace(field=_grade_field(self.field, self.slope))
+        )
 
     def longest_edge(self, image: Image, nodes: int, volume: float | None = None) -> float:
         """The longest edge that any cell may have, mm.
@@ -423,7 +427,7 @@ def edge_ratios(points: NDArray, cells: NDArray, sizes: Sizes) -> EdgeRatios | N
     return EdgeRatios(float(ratio.mean()), above, below, RATIO_BINS, (counts / len(ratio)).tolist())
 
 
-def _graded(field: Image, gradation: float) -> Image:
+def _grade_field(field: Image, gradation: float) -> Image:
     """Limit the field so that no value exceeds a face neighbour's by more than gradation x
     distance.
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.contents.content import Content, undivided
+from tetopt.contents.content import Content, undivide_voxels
 from tetopt.contents.noise import NoiseSample, noise_planes, noise_sample, sampled_noise
 from tetopt.errors import InputError
 from tetopt.system.kernel_cache import njit
@@ -63,11 +63,11 @@ def channels_of(content: Content) -> Channels:
     )
     # The noise is estimated on scaled values, too, as the estimate would round differently
     # otherwise.
-    inside = None if content.inside is None else undivided(content, content.inside)
+    inside = None if content.inside is None else undivide_voxels(content, content.inside)
     planes = None if inside is None else noise_planes(inside)
     within, noise = None if inside is None else noise_sample(inside, planes), 0.0
     for channel in range(content.n_contrasts):
-        sample = noise_sample(undivided(content, content.channel(channel)), planes)
+        sample = noise_sample(undivide_voxels(content, content.channel(channel)), planes)
         parts = zip(sample, (None, None) if within is None else within, strict=True)
         scaled = NoiseSample(*(result.scaled(part, channel, mask) for part, mask in parts))
         noise += sampled_noise(scaled, None if within is None else within.near) ** 2
@@ -101,14 +101,14 @@ class BlockSums(NamedTuple):
     def coarser(self) -> BlockSums:
         """The sums over blocks of twice the edge."""
         return BlockSums(
-            [halved(length, np.add) for length in self.lengths],
-            None if self.inside is None else halved(self.inside, np.add),
-            halved(self.second, np.add),
-            [halved(first, np.add) for first in self.firsts],
+            [halve_totals(length, np.add) for length in self.lengths],
+            None if self.inside is None else halve_totals(self.inside, np.add),
+            halve_totals(self.second, np.add),
+            [halve_totals(first, np.add) for first in self.firsts],
         )
 
 
-def halved(totals: NDArray, total_of: np.ufunc) -> NDArray:
+def halve_totals(totals: NDArray, total_of: np.ufunc) -> NDArray:
     """Totals over blocks of twice the edge: of pairs along each axis in turn."""
     for axis in range(totals.ndim):
         pairs = np.moveaxis(totals, axis, 0)

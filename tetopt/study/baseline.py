@@ -17,7 +17,7 @@ from tetopt.model.fields import cell_fields
 from tetopt.study.child import run_in_child
 from tetopt.study.options import BaselineOptions
 from tetopt.study.pipelines import PIPELINES, PipelineInput
-from tetopt.system.files import checked_output, save_json
+from tetopt.system.files import check_output, save_json
 
 
 class Baseline(NamedTuple):
@@ -43,8 +43,8 @@ def baseline(
         An output may not be written, a file cannot be read, or the pipeline fails or is not
         installed.
     """
-    output = checked_output(output, (".vtu",), force)
-    json_path = None if json_path is None else checked_output(json_path, (".json",), force)
+    output = check_output(output, (".vtu",), force)
+    json_path = None if json_path is None else check_output(json_path, (".json",), force)
     image, labels = image_and_labels(image_path, options.labels, options.part)
     title, function = PIPELINES[options.pipeline].title, PIPELINES[options.pipeline].function
     made = run_in_child(

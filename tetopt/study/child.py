@@ -29,7 +29,7 @@ from tetopt.mesh import Mesh
 from tetopt.study.endings import AFTER_CRASHES, Crashed
 from tetopt.study.pipelines import PipelineInput, Produced
 from tetopt.system.budget import family_peak_bytes
-from tetopt.system.child import POLL_SECONDS, family_bytes, signal_words, started, watched
+from tetopt.system.child import POLL_SECONDS, family_bytes, signal_words, start_child, watch_child
 from tetopt.system.interpreter import python_command, python_environment
 
 SMOOTHING_FACTOR = 2.0  # `smoothing` of the run that follows a crash
@@ -124,10 +124,10 @@ def _run_once(
         command = python_command("-m", "tetopt.study.child", str(folder))
         with open(folder / "stderr.txt", "wb") as errors:
             environment = python_environment(TMPDIR=name)
-            with started(
+            with start_child(
                 command, environment, folder, stdout=subprocess.DEVNULL, stderr=errors
             ) as child:
-                peak, limit = watched(child, POLL_SECONDS, family_bytes, passed)
+                peak, limit = watch_child(child, POLL_SECONDS, family_bytes, passed)
         return _outcome(folder, child.returncode, peak, limit)
 
 

@@ -23,12 +23,12 @@ from tetopt.fem.conditioning import conditioning
 from tetopt.fem.elasticity import box_faces, check_fills_box, compression, push_of
 from tetopt.fem.reference import (
     Reference,
-    averaged,
+    average_voxels,
     compare,
     nearest,
     reference,
     reference_shape,
-    refined,
+    refine_voxels,
 )
 from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import dihedral_angles
@@ -93,7 +93,9 @@ def default_mapping(image: Image) -> tuple[ModulusMapping, str]:
     return [(low, 1.0), (high, 10.0)], words
 
 
-def prepared(image: Image, labels: Image, mapping: ModulusMapping, settings: Settings) -> Standard:
+def prepare_references(
+    image: Image, labels: Image, mapping: ModulusMapping, settings: Settings
+) -> Standard:
     """Compute the reference solutions, which may take minutes.
 
     Raises
@@ -103,7 +105,7 @@ def prepared(image: Image, labels: Image, mapping: ModulusMapping, settings: Set
     """
     fine = young_image(image, mapping)
     dofs = settings.reference_dofs or DEFAULT_REFERENCE_DOFS
-    modulus = averaged(fine, reference_shape(image.shape, image.spacing, dofs))
+    modulus = average_voxels(fine, reference_shape(image.shape, image.spacing, dofs))
     references = {}
     for nu in settings.nus:
         note(f"reference: {' x '.join(map(str, modulus.shape))} voxels, nu = {nu:g}")
@@ -112,7 +114,7 @@ def prepared(image: Image, labels: Image, mapping: ModulusMapping, settings: Set
         image,
         labels,
         modulus,
-        refined(modulus, fine.shape),
+        refine_voxels(modulus, fine.shape),
         nearest(labels, modulus).data,
         references,
         settings.average,
@@ -123,7 +125,7 @@ def prepared(image: Image, labels: Image, mapping: ModulusMapping, settings: Set
 # Measures of one mesh.
 
 
-def measured(
+def measure_mesh(
     standard: Standard,
     mesh: Mesh,
     percent: float,
@@ -217,7 +219,7 @@ def run(comparison: Comparison, classes: Image) -> tuple[Report, dict[int, dict[
     Raises
     ------
     InputError
-        As `prepared`.
+        As `prepare_references`.
     """
     begin = time.perf_counter()
     settings = comparison.settings
@@ -225,7 +227,7 @@ def run(comparison: Comparison, classes: Image) -> tuple[Report, dict[int, dict[
     for name in settings.pipelines:  # before the hours that the others may take
         if (words := known[name].missing) is not None:
             warning(words)
-    standard = prepared(comparison.image, classes, comparison.mapping, settings)
+    standard = prepare_references(comparison.image, classes, comparison.mapping, settings)
     results: dict[int, list[records.PipelineResult]] = {1: [], 2: []}
     made: dict[int, dict[str, MadeMesh]] = {1: {}, 2: {}}
     for name, order in product(settings.pipelines, results):
@@ -312,7 +314,7 @@ def _attempt(
     )
     if made.mesh is not None:
         try:
-            measurement = measured(standard, made.mesh, settings.percent, order, made.labels)
+            measurement = measure_mesh(standard, made.mesh, settings.percent, order, made.labels)
         except (
             InputError,
             RuntimeError,

@@ -130,7 +130,7 @@ def histograms_figure(report: Report) -> Figure:
         ),
     )
     for axes, (name, across, up) in zip(panels, names, strict=True):
-        for number, pipeline, run in _finished(report):
+        for number, pipeline, run in _pipelines_with_mesh(report):
             edges, fraction = getattr(run.measurement, name)
             style = _style(number)
             if pipeline.kind == "tetopt":
@@ -153,7 +153,7 @@ def labels_figure(report: Report) -> Figure:
     Filled marks are of labels of most voxels, open ones of the mesh's own. A lost label has Dice 0
     and no distance. Grey bars separate labels.
     """
-    finished = _finished(report)
+    finished = _pipelines_with_mesh(report)
     voxels = {row.label: row.voxels for _, _, run in finished for row in run.measurement.labels}
     order = sorted(voxels, key=lambda label: -voxels[label])
     figure = Figure(figsize=(max(8.0, 2.0 + 0.32 * len(order)), 7.2), layout="constrained")
@@ -246,7 +246,7 @@ def timing_figure(report: Report) -> Figure:
     return figure
 
 
-def _finished(report: Report) -> list[tuple[int, PipelineResult, PipelineRun]]:
+def _pipelines_with_mesh(report: Report) -> list[tuple[int, PipelineResult, PipelineRun]]:
     """Return the pipelines with a mesh: their places in the list, which select colours, and
     their median runs.
     """

@@ -13,8 +13,8 @@ from tetopt.image import Image
 from tetopt.io.formats import save_mesh
 from tetopt.io.images import sha256
 from tetopt.job.events import note
-from tetopt.job.inputs import checked_outputs, label_table
-from tetopt.measure.segmentation import thresholded
+from tetopt.job.inputs import check_outputs, label_table
+from tetopt.measure.segmentation import threshold_image
 from tetopt.model.fields import cell_fields
 from tetopt.model.labels import table_of_labels
 from tetopt.model.mappings import parse_mapping
@@ -56,7 +56,7 @@ def compare_image(
     """Compare, write report.json, report.html, the pictures and the meshes into a folder; return
     report.json's content.
 
-    Notes report the progress to the listener of `tetopt.job.events.listened`.
+    Notes report the progress to the listener of `tetopt.job.events.listen_with`.
 
     Parameters
     ----------
@@ -94,8 +94,8 @@ def compare_image(
         image, labels, mapping, settings, source, of_labels, words, command
     )
     mesh_names = [_mesh_name(name, order) for name in settings.pipelines for order in ORDER_WORDS]
-    paths = checked_outputs(results_folder(output), [*COMPARE_FILES, *mesh_names], force)
-    classes = thresholded(image, settings.classes) if labels is None else labels
+    paths = check_outputs(results_folder(output), [*COMPARE_FILES, *mesh_names], force)
+    classes = threshold_image(image, settings.classes) if labels is None else labels
     report, made = compare.run(comparison, classes)
     if not made[1]:
         how = "; ".join(f"{each.title}: {each.failure}" for each in report.pipelines)

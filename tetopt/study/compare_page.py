@@ -9,7 +9,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from tetopt.report.page import package_text, rendered, write_page
+from tetopt.report.page import package_text, render_page, write_page
 from tetopt.study.compare_report import Report
 from tetopt.study.compare_table import columns_of, number_text, rows_of
 
@@ -30,7 +30,7 @@ def save_compare_page(path: Path, report: Report, pictures: Sequence[tuple[Path,
         (name, len(list(members)))
         for name, members in groupby(columns, key=lambda column: column.group)
     ]
-    content = rendered(
+    content = render_page(
         "study/compare.html",
         report=report,
         columns=columns,

@@ -91,7 +91,9 @@ def columns_of(report: Report) -> list[Column]:
         _measure("Cost", "cells", lambda mesh: mesh.n_cells, 0),
     ]
     return [
-        column for column in columns if any(_known(column.value(run)) is not None for run in runs)
+        column
+        for column in columns
+        if any(_finite_value(column.value(run)) is not None for run in runs)
     ]
 
 
@@ -116,7 +118,7 @@ def _label_columns(
     """Return columns over the judged labels. A lost label has no surface, so that their mean has
     no number.
     """
-    judged = judged_labels(report)
+    judged = labels_of_table(report)
 
     def over(
         of: Callable[[list[float]], float], value: Callable[[LabelFidelity], float]
@@ -147,7 +149,7 @@ def _label_columns(
     ]
 
 
-def judged_labels(report: Report) -> set[int]:
+def labels_of_table(report: Report) -> set[int]:
     """Return the labels of the table: the large ones if any, without a given segmentation's
     background.
     """
@@ -185,13 +187,13 @@ def _cell(pipeline: PipelineResult, value: Value) -> tuple[str, str]:
     """Return the number of the pipeline's median run, and the range of all its runs if it is
     one.
     """
-    known = sorted(each for run in pipeline.runs if (each := _known(value(run))) is not None)
+    known = sorted(each for run in pipeline.runs if (each := _finite_value(value(run))) is not None)
     ends = [number_text(each) for each in (known[:1] + known[-1:])]
     text = "–" if pipeline.median is None else number_text(value(pipeline.median))
     return text, " to ".join(ends) if len(set(ends)) > 1 else ""
 
 
-def _known(value: float | None) -> float | None:
+def _finite_value(value: float | None) -> float | None:
     return None if value is None or not math.isfinite(value) else value
 
 

@@ -15,7 +15,7 @@ class Crashed(InputError):
     """A signal ended a program of a pipeline; another run may succeed."""
 
 
-def imported(package: str) -> Any:
+def import_peer(package: str) -> Any:
     """Return the module of a peer; raise InputError if it is not installed or cannot be
     imported.
     """

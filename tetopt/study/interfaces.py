@@ -90,11 +90,11 @@ def interfaces(
     else:
         pieces, notes = _label_surface(labels.data, image.spacing, size, smoothing)
     low, high = box_sides(image.shape).T * image.spacing
-    cut = [_cut_by_box(_decimated(piece, size), low, high) for piece in pieces]
+    cut = [_cut_by_box(_decimate_surface(piece, size), low, high) for piece in pieces]
     soup = [(points, triangles) for points, triangles in cut if len(triangles)]
     if not soup:
         notes.append("no interface remains: only the box is meshed")
-    points, triangles = _stacked([*soup, _box(low, high)])
+    points, triangles = _stack_parts([*soup, _box(low, high)])
     return Surfaces(points, triangles, 12, low, high, notes)
 
 
@@ -136,7 +136,7 @@ def _isosurfaces(
                 f"threshold {threshold:.4g}: dropped the whole surface, as every piece is a speck"
             )
             continue
-        pieces.append(_smoothed(large, smoothing))
+        pieces.append(_smooth_surface(large, smoothing))
     return pieces, notes
 
 
@@ -163,7 +163,7 @@ def _label_surface(
     lost = [f"{value:g}" for number, value in enumerate(values, 1) if number not in seen]
     if lost and n_dropped:
         notes.append(f"lost labels, as every piece of their surface is a speck: {', '.join(lost)}")
-    return ([_smoothed(large, smoothing)] if large.n_cells else []), notes
+    return ([_smooth_surface(large, smoothing)] if large.n_cells else []), notes
 
 
 def _padded_grid(volume: NDArray, spacing: NDArray[np.float64], size: float) -> pyvista.ImageData:
@@ -187,14 +187,14 @@ def _without_specks(surface: pyvista.PolyData, size: float) -> tuple[pyvista.Pol
     areas = np.bincount(region, 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
     is_large = areas >= SPECK_AREA * size**2
     kept = is_large[region]
-    points, triangles = compacted(surface.points, triangles[kept])
+    points, triangles = compact_points(surface.points, triangles[kept])
     large = pyvista.PolyData.from_regular_faces(points, triangles)
     if "boundary_labels" in surface.cell_data:
         large.cell_data["boundary_labels"] = surface.cell_data["boundary_labels"][kept]
     return large, int((~is_large).sum())
 
 
-def _smoothed(surface: pyvista.PolyData, smoothing: float) -> pyvista.PolyData:
+def _smooth_surface(surface: pyvista.PolyData, smoothing: float) -> pyvista.PolyData:
     return surface.smooth_taubin(
         n_iter=SINC_ITERATIONS,
         pass_band=PASS_BAND / smoothing,
@@ -203,7 +203,7 @@ def _smoothed(surface: pyvista.PolyData, smoothing: float) -> pyvista.PolyData:
     )
 
 
-def _decimated(surface: pyvista.PolyData, size: float) -> pyvista.PolyData:
+def _decimate_surface(surface: pyvista.PolyData, size: float) -> pyvista.PolyData:
     n_triangles = surface.area / (np.sqrt(3.0) / 4.0 * (EDGE_FRACTION * size) ** 2)
     reduction = 1.0 - max(n_triangles, 4.0) / surface.n_cells
     bare = pyvista.PolyData.from_regular_faces(surface.points, surface.regular_faces)
@@ -224,7 +224,7 @@ def _cut_by_box(
                 surface = surface.clip(normal, origin=place, invert=False).triangulate()
     if surface.n_cells == 0:
         return np.empty((0, 3)), np.empty((0, 3), dtype=np.int64)
-    points, triangles = compacted(
+    points, triangles = compact_points(
         np.asarray(surface.points, dtype=np.float64), surface.regular_faces
     )
     near = 1e-6 * (high - low)
@@ -246,7 +246,7 @@ def _box(
     return corners, triangles.reshape(-1)[box.regular_faces].astype(np.int64)
 
 
-def _stacked(
+def _stack_parts(
     parts: list[tuple[NDArray[np.float64], NDArray[np.int64]]],
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     offsets = np.cumsum([0] + [len(points) for points, _ in parts])
@@ -256,7 +256,7 @@ def _stacked(
     )
 
 
-def compacted(points: NDArray, cells: NDArray) -> tuple[NDArray, NDArray[np.int64]]:
+def compact_points(points: NDArray, cells: NDArray) -> tuple[NDArray, NDArray[np.int64]]:
     """Remove the points that no cell (or triangle) uses; the others keep their order."""
     used, compact = np.unique(cells, return_inverse=True)
     return points[used], compact.reshape(cells.shape).astype(np.int64)

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides
 from tetopt.geometry.quadratic import node_count
-from tetopt.geometry.simplex import oriented
+from tetopt.geometry.simplex import orient_cells
 from tetopt.image import Image
 from tetopt.measure.fidelity import cell_labels
 from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice_mesh
-from tetopt.study.endings import imported
+from tetopt.study.endings import import_peer
 from tetopt.study.search import Response, corners_for, is_near, tries
 from tetopt.study.tetwild import Filled, node_spacing
 
@@ -31,7 +31,7 @@ FIRST_FACTOR = 2.0  # interfaces take more nodes
 MMG_RESPONSE = Response(-2.5, -4.0, -1.0, step=1.5, after_failure=0.83)
 
 
-def remeshed(
+def remesh_image(
     image: Image, labels: Image, nodes: int, order: int = 1, smoothing: float = 1.0
 ) -> tuple[Filled, NDArray[np.int64]]:
     """Fill the image's box with about `nodes` nodes, and with cells that keep labels.
@@ -61,7 +61,7 @@ def remeshed(
     InputError
         mmgpy is not installed; Mmg built no mesh.
     """
-    mmgpy = imported("mmgpy")
+    mmgpy = import_peer("mmgpy")
     spacing = node_spacing(image, corners_for(nodes, order))
 
     def run(factor: float) -> tuple[Mesh, NDArray[np.int64]]:
@@ -81,7 +81,7 @@ def remeshed(
             ) from error
         cells, numbers = mesh.get_tetrahedra_with_refs()
         points = _on_box(image, np.asarray(mesh.get_vertices(), dtype=np.float64))
-        return Mesh(points, oriented(points, np.asarray(cells, dtype=np.int64))), values[
+        return Mesh(points, orient_cells(points, np.asarray(cells, dtype=np.int64))), values[
             np.ravel(numbers) - 1
         ]
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.contents.phantom import load_phantom
-from tetopt.energy.discretization import E_D, combined
+from tetopt.energy.discretization import E_D, combine_energies
 from tetopt.energy.geometric import E_G
 from tetopt.engine.loop import MeshingResult
 from tetopt.engine.paper import optimize_paper
@@ -31,7 +31,7 @@ from tetopt.fem.elasticity import (
 )
 from tetopt.geometry.simplex import rho
 from tetopt.image import Image
-from tetopt.io.images import cropped, image_slice
+from tetopt.io.images import crop_image, image_slice
 from tetopt.measure.quality import QualityErrors, quality_errors
 from tetopt.mesh import Mesh
 from tetopt.model.averages import cell_young
@@ -40,7 +40,7 @@ from tetopt.start.delaunay import delaunay
 from tetopt.start.lattice import lattice_mesh
 
 
-def printed() -> dict[str, Any]:
+def printed_numbers() -> dict[str, Any]:
     """Return the paper's printed numbers, and the text on each experiment, from `paper.toml`."""
     return tomllib.loads((files("tetopt.study") / "paper.toml").read_text(encoding="utf-8"))
 
@@ -172,7 +172,7 @@ def figure_2b(k_D: float, n_places: int = 41) -> Landscape:
     """
     image, mesh, places, E_G_there, E_D_there = _energies_2b(n_places)
     initial = E_G(mesh.points, mesh.cells), E_D(image, mesh)
-    E = np.vectorize(combined)(E_G_there, E_D_there, *initial, k_D)
+    E = np.vectorize(combine_energies)(E_G_there, E_D_there, *initial, k_D)
     result = optimize_paper(
         image,
         mesh,
@@ -214,7 +214,7 @@ def _cropped_to_content(image: Image, proportions: tuple[int, ...]) -> Image:
     block = (size / proportions).max()
     grow = (block * np.array(proportions) - size) / image.spacing / 2.0
     low, high = np.maximum(np.rint(low - grow), 0), np.minimum(np.rint(high + grow), image.shape)
-    return cropped(image, [(int(a), int(b)) for a, b in zip(low, high, strict=True)])
+    return crop_image(image, [(int(a), int(b)) for a, b in zip(low, high, strict=True)])
 
 
 def elastography(snr_db: float | None) -> Image:
@@ -276,7 +276,7 @@ def figure_3ef(volume: Image) -> Case:
     half = 10.0 * blocks / volume.spacing / 2.0
     low = np.clip(np.rint(centre - half), 0, None)
     high = np.minimum(np.rint(centre + half), volume.shape)
-    image = cropped(volume, [(int(a), int(b)) for a, b in zip(low, high, strict=True)])
+    image = crop_image(volume, [(int(a), int(b)) for a, b in zip(low, high, strict=True)])
     mesh = lattice_mesh(image, "five-tet", blocks=tuple(int(b) for b in blocks))
     result = optimize_paper(image, mesh, k_D=0.3, iterations=15, boundary="slide")
     return Case("brain MR volume", image, mesh, result)

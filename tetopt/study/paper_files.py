@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from tetopt.commands.beside import image_and_labels
-from tetopt.contents.labels import checked_labels
+from tetopt.contents.labels import check_labels
 from tetopt.contents.phantom import load_phantom
 from tetopt.energy.sampling import cell_moments, cell_of_voxel
 from tetopt.errors import InputError
@@ -22,12 +22,12 @@ from tetopt.image import Image
 from tetopt.io.images import sha256
 from tetopt.io.mni import mni_path, mni_tissue
 from tetopt.job.events import note
-from tetopt.job.inputs import checked_outputs
+from tetopt.job.inputs import check_outputs
 from tetopt.job.options import WHOLE_BOX
-from tetopt.measure.segmentation import dice, segment, thresholded
+from tetopt.measure.segmentation import dice, segment, threshold_image
 from tetopt.mesh import Mesh
 from tetopt.report.figures import save_figure, slice_figure
-from tetopt.report.page import rendered, write_page
+from tetopt.report.page import render_page, write_page
 from tetopt.report.scene import (
     dark_structure_surface,
     isosurface_before_slices,
@@ -99,8 +99,8 @@ def reproduce(
     if tissue is None:
         note("the section on approximate segmentation is left out, as there are no `labels`")
     else:
-        tissue = checked_labels("labels", tissue)
-    paths = checked_outputs(results_folder(output), PAPER_FILES, force)
+        tissue = check_labels("labels", tissue)
+    paths = check_outputs(results_folder(output), PAPER_FILES, force)
     about = {"image": source.name, "image_sha256": sha256(source), "labels": labels_name}
     begin = time.perf_counter()
     steps: dict[str, Callable[[], dict[str, Any]]] = {
@@ -115,7 +115,7 @@ def reproduce(
         steps["segmentation"] = lambda: _segmentation(volume, tissue)
     sections = []
     for name, step in steps.items():
-        note(paper.printed()["sections"][name]["title"])
+        note(paper.printed_numbers()["sections"][name]["title"])
         sections.append(step())
     seconds = time.perf_counter() - begin
     results = about | {
@@ -131,7 +131,7 @@ def reproduce(
 
 def _section(name: str, **values: float) -> dict[str, Any]:
     """Return title and text of an experiment, with these numbers."""
-    said = paper.printed()["sections"][name]
+    said = paper.printed_numbers()["sections"][name]
     return {"title": said["title"], "text": said["text"].format(**values)}
 
 
@@ -139,7 +139,7 @@ def _row(name: str, ours: Any, geometric_mean: float) -> dict[str, Any]:
     """Return a row of Table 1: printed and reproduced numbers."""
     return {
         "name": name,
-        **paper.printed()["table1"][name],
+        **paper.printed_numbers()["table1"][name],
         "ours": list(ours),
         "geometric_mean": geometric_mean,
     }
@@ -152,7 +152,7 @@ def _row_of(name: str, mesh: Mesh) -> dict[str, Any]:
 def _mesh_row(name: str, mesh: Mesh) -> dict[str, Any]:
     return {
         "name": name,
-        "paper": paper.printed()["meshes"][name],
+        "paper": paper.printed_numbers()["meshes"][name],
         "ours": [len(mesh.points), len(mesh.cells)],
     }
 
@@ -182,7 +182,7 @@ def _figure_2(paths: dict[str, Path]) -> dict[str, Any]:
     ]
     truth = load_phantom("fig2_2d").label_image()
     overlaps = {
-        "voxels": dice(thresholded(cases[1].image, 4), truth),
+        "voxels": dice(threshold_image(cases[1].image, 4), truth),
         "initial mesh": dice(segment(cases[1].image, initial, 4), truth),
         "k_D = 0.3": dice(segment(cases[1].image, cases[1].result.mesh, 4), truth),
     }
@@ -199,7 +199,7 @@ def _figure_2(paths: dict[str, Path]) -> dict[str, Any]:
     }
 
 
-def _simulated(image: Image, mesh: Mesh) -> dict[str, float]:
+def _simulate(image: Image, mesh: Mesh) -> dict[str, float]:
     simulated = paper.simulate(image, mesh)[0]
     return {name: getattr(simulated, name) for name in CHANGE_WORDS}
 
@@ -244,14 +244,14 @@ def _figure_3cd(paths: dict[str, Path]) -> dict[str, Any]:
     rows += [_row_of("fig3d", case.result.mesh) | {"case": case.title} for case in cases]
     changes = []
     for case in cases:
-        before, after = (_simulated(case.image, mesh) for mesh in (case.initial, case.result.mesh))
+        before, after = (_simulate(case.image, mesh) for mesh in (case.initial, case.result.mesh))
         change = {name: after[name] / before[name] - 1.0 for name in after}
         changes.append({"case": case.title, "before": before, "after": after, "change": change})
     return _section("fig3cd") | {
         "errors": rows,
         "meshes": [_mesh_row("fig3c", shown.initial)],
         "simulation": changes,
-        "printed_change": paper.printed()["change"],
+        "printed_change": paper.printed_numbers()["change"],
         "pictures": [
             [
                 "fig3cd.png",
@@ -303,7 +303,7 @@ def _segmentation(volume: Image, tissue: Image) -> dict[str, Any]:
         f"{classes} classes, {name}": dice(labels, tissue)
         for classes in (4, 8)
         for name, labels in (
-            ("voxels", thresholded(volume, classes)),
+            ("voxels", threshold_image(volume, classes)),
             ("lattice", segment(volume, case.initial, classes)),
             ("optimised", segment(volume, case.result.mesh, classes)),
         )
@@ -316,11 +316,11 @@ def _segmentation(volume: Image, tissue: Image) -> dict[str, Any]:
 
 
 def _write_page(paths: dict[str, Path], results: dict[str, Any]) -> None:
-    words, sections = paper.printed()["page"], results["sections"]
+    words, sections = paper.printed_numbers()["page"], results["sections"]
     intro = words["intro"].format(version=results["versions"]["tetopt"], image=results["image"])
     if not any("dice" in section and "Section 5" in section["title"] for section in sections):
         intro += words["no_labels"]
-    content = rendered(
+    content = render_page(
         "study/paper.html",
         intro=intro,
         sections=sections,

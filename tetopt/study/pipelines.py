@@ -20,13 +20,13 @@ from tetopt.engine.loop import UNIFORM_ITERATIONS, UNIFORM_K_D
 from tetopt.engine.meshing import MODE_DEFAULTS, Mode, mesh_image
 from tetopt.geometry.quadratic import node_count
 from tetopt.image import Image
-from tetopt.measure.segmentation import thresholded
+from tetopt.measure.segmentation import threshold_image
 from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice_mesh
 from tetopt.study.interfaces import OTSU_CLASSES, interfaces
-from tetopt.study.mmg import remeshed
+from tetopt.study.mmg import remesh_image
 from tetopt.study.search import LEAST_REQUEST, REQUEST_RESPONSE, corners_for, tries
-from tetopt.study.tetwild import Filled, filled, node_spacing
+from tetopt.study.tetwild import Filled, fill_image, node_spacing
 from tetopt.system.extras import install_hint
 
 # of the search for a lattice of order 2, at most; few are so coarse, and a run takes milliseconds
@@ -64,7 +64,7 @@ UNTIMED_STEPS = {  # steps that a run's total leaves out, and why
 
 
 @contextmanager
-def _timed(seconds: dict[str, float], step: str) -> Iterator[None]:
+def _time_step(seconds: dict[str, float], step: str) -> Iterator[None]:
     """Store the wall time of a block in `seconds`."""
     begin = time.perf_counter()
     yield
@@ -80,7 +80,7 @@ def bcc(job: PipelineInput) -> Produced:
         As `tetopt.start.lattice.lattice_mesh`.
     """
     seconds: dict[str, float] = {}
-    with _timed(seconds, "lattice"):
+    with _time_step(seconds, "lattice"):
         first = corners_for(job.nodes, job.order) / job.nodes
         runs = tries(
             lambda factor: lattice_mesh(
@@ -107,7 +107,7 @@ def ours(job: PipelineInput, mode: Mode) -> Produced:
     seconds: dict[str, float] = {}
     k_D, iterations = MODE_DEFAULTS[mode][:2] if mode == "graded" else (job.k_D, job.iterations)
     content, notes = (job.image, list[str]()) if mode == "paper" else _content(job, seconds)
-    with _timed(seconds, "kernels"):
+    with _time_step(seconds, "kernels"):
         prepare_kernels(
             content, k_D, "paper" if mode == "paper" else "fast", is_graded=mode == "graded"
         )
@@ -125,7 +125,7 @@ def _content(job: PipelineInput, seconds: dict[str, float]) -> tuple[Image | Con
     """Return the content of the mesh, and notes on it: the image, with labels if given."""
     if job.labels is None:
         return job.image, []
-    with _timed(seconds, "labels"):
+    with _time_step(seconds, "labels"):
         if np.array_equal(job.image.data, job.labels.data):
             # Label numbers are meaningless as intensities: label 9 is no farther from 1 than label
             # 2.
@@ -144,17 +144,17 @@ def pytetwild(job: PipelineInput) -> Produced:
     Raises
     ------
     InputError
-        As `tetopt.study.interfaces.interfaces` and `tetopt.study.tetwild.filled`.
+        As `tetopt.study.interfaces.interfaces` and `tetopt.study.tetwild.fill_image`.
     """
     seconds: dict[str, float] = {}
     size = node_spacing(job.image, corners_for(job.nodes, job.order))
-    with _timed(seconds, "surfaces"):
+    with _time_step(seconds, "surfaces"):
         surfaces = interfaces(
             job.image, size, classes=job.classes, labels=job.labels, smoothing=job.smoothing
         )
-    with _timed(seconds, "tetrahedra"):
-        result = filled(job.image, surfaces, job.nodes, job.order)
-    return _searched(result, seconds, surfaces.notes)
+    with _time_step(seconds, "tetrahedra"):
+        result = fill_image(job.image, surfaces, job.nodes, job.order)
+    return _search_result(result, seconds, surfaces.notes)
 
 
 def mmg(job: PipelineInput) -> Produced:
@@ -164,16 +164,18 @@ def mmg(job: PipelineInput) -> Produced:
     Raises
     ------
     InputError
-        As `tetopt.study.mmg.remeshed`.
+        As `tetopt.study.mmg.remesh_image`.
     """
     seconds: dict[str, float] = {}
-    labels = thresholded(job.image, job.classes) if job.labels is None else job.labels
-    with _timed(seconds, "tetrahedra"):
-        result, of_cell = remeshed(job.image, labels, job.nodes, job.order, job.smoothing)
-    return _searched(result, seconds, [])._replace(labels=None if job.labels is None else of_cell)
+    labels = threshold_image(job.image, job.classes) if job.labels is None else job.labels
+    with _time_step(seconds, "tetrahedra"):
+        result, of_cell = remesh_image(job.image, labels, job.nodes, job.order, job.smoothing)
+    return _search_result(result, seconds, [])._replace(
+        labels=None if job.labels is None else of_cell
+    )
 
 
-def _searched(result: Filled, seconds: dict[str, float], notes: list[str]) -> Produced:
+def _search_result(result: Filled, seconds: dict[str, float], notes: list[str]) -> Produced:
     """Return a peer's result, with the search for the number of nodes as a separate step."""
     seconds["tetrahedra"] -= result.search_seconds
     seconds["search"] = result.search_seconds

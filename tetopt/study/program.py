@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides, is_on_sides
 from tetopt.geometry.quadratic import node_count
-from tetopt.geometry.simplex import oriented
+from tetopt.geometry.simplex import orient_cells
 from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
 from tetopt.io.images import save_image
@@ -86,7 +86,7 @@ def parse_program(text: str) -> Program:
     used = {key for word in words for key in re.findall(r"\{(\w*)\}", word)}
     if unknown := sorted(used - set(PLACEHOLDERS)):
         raise InputError(
-            f"{where}: unknown placeholder {{{unknown[0]}}}; use {_braced(PLACEHOLDERS)}"
+            f"{where}: unknown placeholder {{{unknown[0]}}}; use {_brace_names(PLACEHOLDERS)}"
         )
     if "output" not in used or not used & {"image", "labels"}:
         raise InputError(
@@ -107,7 +107,7 @@ def parse_program(text: str) -> Program:
     return Program(name, command)
 
 
-def _braced(names: tuple[str, ...]) -> str:
+def _brace_names(names: tuple[str, ...]) -> str:
     return ", ".join(f"{{{name}}}" for name in names)
 
 
@@ -146,7 +146,7 @@ def by_program(job: PipelineInput, program: Program) -> Produced:
             try:
                 loaded = _run(
                     program.name,
-                    [_filled(word, values) for word in words],
+                    [_fill_argument(word, values) for word in words],
                     Path(values["output"] + suffix),
                 )
             except InputError as error:
@@ -164,7 +164,7 @@ def by_program(job: PipelineInput, program: Program) -> Produced:
     if not is_near(runs[0].n_nodes, job.nodes):
         counts = ", ".join(map(str, sizes))
         notes.append(f"{runs[0].n_nodes} nodes instead of {job.nodes}; the runs gave {counts}")
-    mesh, kept, on_box = boxed(job.image, loaded.mesh)
+    mesh, kept, on_box = put_on_sides(job.image, loaded.mesh)
     labels, of_labels = _own_labels(loaded, kept, job)
     seconds = {"program": runs[0].seconds, "search": sum(each.seconds for each in runs[1:])}
     return Produced(mesh, seconds, [f"{len(runs)} runs", *notes, *on_box, *of_labels], labels)
@@ -183,7 +183,7 @@ def _inputs(folder: Path, job: PipelineInput, command: str) -> dict[str, str]:
     return paths | {"output": str(folder / "mesh")}
 
 
-def _filled(word: str, values: dict[str, str]) -> str:
+def _fill_argument(word: str, values: dict[str, str]) -> str:
     """Replace the placeholders in an argument; the mesh is a VTU file unless a suffix follows
     its placeholder.
     """
@@ -235,7 +235,7 @@ def _run(name: str, command: list[str], output: Path) -> MeshFile:
     return loaded
 
 
-def boxed(image: Image, mesh: Mesh) -> tuple[Mesh, NDArray[np.int64], list[str]]:
+def put_on_sides(image: Image, mesh: Mesh) -> tuple[Mesh, NDArray[np.int64], list[str]]:
     """Move a mesh's boundary onto the sides of the image's box if close; return the mesh, its
     cells, and notes.
 
@@ -274,7 +274,7 @@ def boxed(image: Image, mesh: Mesh) -> tuple[Mesh, NDArray[np.int64], list[str]]
     note = (
         f"its boundary was moved by up to {distance:.2g} voxels onto the sides of the image's box"
     )
-    return Mesh(world, oriented(world, cells)), every[~is_flat][kept], [note]
+    return Mesh(world, orient_cells(world, cells)), every[~is_flat][kept], [note]
 
 
 def pipelines_with(programs: Sequence[Program]) -> dict[str, Pipeline]:

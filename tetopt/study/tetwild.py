@@ -28,13 +28,13 @@ from scipy.spatial import cKDTree
 
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import node_count
-from tetopt.geometry.simplex import oriented, volumes
+from tetopt.geometry.simplex import orient_cells, volumes
 from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice_mesh
-from tetopt.study.endings import imported
-from tetopt.study.interfaces import Surfaces, compacted
+from tetopt.study.endings import import_peer
+from tetopt.study.interfaces import Surfaces, compact_points
 from tetopt.study.search import Response, corners_for, is_near, tries
 
 TETWILD_RUNS = 6  # of one search, at most; each takes about as long as the result's
@@ -54,7 +54,7 @@ UNTANGLING_ROUNDS = 60
 
 
 class Filled(NamedTuple):
-    """Result of `filled`."""
+    """Result of `fill_image`."""
 
     mesh: Mesh
     n_runs: int  # of fTetWild
@@ -69,7 +69,7 @@ def node_spacing(image: Image, nodes: int) -> float:
     return float((np.sqrt(2.0) * image.volume / nodes) ** (1.0 / 3.0))
 
 
-def filled(image: Image, surfaces: Surfaces, nodes: int, order: int = 1) -> Filled:
+def fill_image(image: Image, surfaces: Surfaces, nodes: int, order: int = 1) -> Filled:
     """Fill the image's box with tetrahedra that have facets along the surfaces, and about `nodes`
     nodes.
 
@@ -100,7 +100,7 @@ def filled(image: Image, surfaces: Surfaces, nodes: int, order: int = 1) -> Fill
         pytetwild is not installed; no run's boundary could be moved onto the box
         without inverting a cell.
     """
-    tetrahedralize = imported("pytetwild").tetrahedralize
+    tetrahedralize = import_peer("pytetwild").tetrahedralize
     spacing = node_spacing(image, corners_for(nodes, order))
 
     def run(factor: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -122,7 +122,7 @@ def filled(image: Image, surfaces: Surfaces, nodes: int, order: int = 1) -> Fill
         if not is_near(n_nodes, nodes):
             notes.append(f"{n_nodes} nodes after {len(runs)} runs of fTetWild; requested: {nodes}")
         search = sum(other.seconds for other in runs) - each.seconds
-        return Filled(Mesh(world, oriented(world, cells)), len(runs), search, notes)
+        return Filled(Mesh(world, orient_cells(world, cells)), len(runs), search, notes)
     raise InputError(
         f"pytetwild: none of {len(runs)} meshes could be fitted to the box; request more nodes"
     )
@@ -154,7 +154,7 @@ def _run(
     points, cells = inside_box(
         np.asarray(points, dtype=np.float64), cells, surfaces.low, surfaces.high
     )
-    return points, oriented(points, cells)
+    return points, orient_cells(points, cells)
 
 
 def inside_box(
@@ -165,7 +165,7 @@ def inside_box(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return the cells with their centroid in the box, and their nodes."""
     middles = points[cells].mean(axis=1)
-    return compacted(points, cells[((middles > low) & (middles < high)).all(axis=1)])
+    return compact_points(points, cells[((middles > low) & (middles < high)).all(axis=1)])
 
 
 def _sizing_field(surfaces: Surfaces, edge: float) -> tuple[NDArray, NDArray, NDArray]:
@@ -233,8 +233,8 @@ def put_on_box(
             break
         cells, kept = cells[~is_flat], kept[~is_flat]
     is_fixed = np.any(is_on[np.unique(cells)], axis=1)
-    points, cells = compacted(points, cells)
-    points = _untangled(points, cells, is_fixed)
+    points, cells = compact_points(points, cells)
+    points = _untangle(points, cells, is_fixed)
     v = volumes(points, cells)
     if v.min() <= 0.0:
         raise InputError(f"{int((v <= 0.0).sum())} cells are inverted on the box's faces")
@@ -257,7 +257,7 @@ def _box_faces_of_nodes(
     return is_on.reshape(-1, 2, 3)
 
 
-def _untangled(
+def _untangle(
     points: NDArray[np.float64], cells: NDArray[np.int64], is_fixed: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
     """Move nodes of inverted and nearly flat cells until all volumes are positive, for at most

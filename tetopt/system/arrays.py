@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from tetopt.errors import InputError
 
 
-def unmasked(what: str, values: ArrayLike) -> NDArray:
+def plain_array(what: str, values: ArrayLike) -> NDArray:
     """Return values as an array; InputError for masked ones, whose hidden numbers numpy would
     use.
     """
@@ -33,9 +33,9 @@ def simplex_arrays(
         Wrong shapes, non-finite points, no cells, or indices that are not integers or out of range.
     """
     try:
-        places = np.array(unmasked(f"{what} points", points), order="C")
+        places = np.array(plain_array(f"{what} points", points), order="C")
         places = places.astype(None if places.dtype.kind == "c" else np.float64, copy=False)
-        nodes = unmasked(f"{what} cells", cells)
+        nodes = plain_array(f"{what} cells", cells)
     except InputError:
         raise
     except (TypeError, ValueError, OverflowError) as error:

@@ -40,7 +40,7 @@ SHELL_OFFSET = 128  # what a shell adds to a signal's number
 
 
 @contextlib.contextmanager
-def started(
+def start_child(
     command: Sequence[str], environment: dict[str, str], folder: Path | None = None, **streams: Any
 ) -> Iterator[subprocess.Popen]:
     """Run a child process within a block; at the end of the block it is killed and its `returncode`
@@ -65,7 +65,7 @@ def started(
         **{"stdin": subprocess.DEVNULL} | streams,
     )
     try:
-        with _guarded(child, folder):
+        with _guard_child(child, folder):
             yield child
     finally:
         if folder is None:
@@ -76,7 +76,7 @@ def started(
 
 
 @contextlib.contextmanager
-def _guarded(child: subprocess.Popen, folder: Path | None) -> Iterator[None]:
+def _guard_child(child: subprocess.Popen, folder: Path | None) -> Iterator[None]:
     """Run a shell that kills the child's group and removes its folder if this process ends
     before the block does.
     """
@@ -97,7 +97,7 @@ def _guarded(child: subprocess.Popen, folder: Path | None) -> Iterator[None]:
         shell.communicate()
 
 
-def watched(
+def watch_child(
     child: subprocess.Popen,
     seconds: float,
     measure: Callable[[int], int],
@@ -159,7 +159,7 @@ def _family(session: int) -> set[psutil.Process]:
     return family
 
 
-def _marked(folder: Path) -> set[psutil.Process]:
+def _marked_processes(folder: Path) -> set[psutil.Process]:
     """Return the processes that were started for a child with this folder, including orphans."""
     import psutil
 
@@ -178,7 +178,7 @@ def _kill_all(child: subprocess.Popen, folder: Path) -> None:
 
     for _ in range(KILL_ROUNDS):
         n_left = 0
-        for each in _family(child.pid) | _marked(folder):
+        for each in _family(child.pid) | _marked_processes(folder):
             with contextlib.suppress(psutil.Error):  # it has ended meanwhile, or access is denied
                 n_left += each.status() not in (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)
                 each.kill()

@@ -43,7 +43,7 @@ _OUTPUTS: ContextVar[Outputs | None] = ContextVar("outputs", default=None)
 
 @contextmanager
 def outputs_of_command() -> Iterator[Outputs]:
-    """Treat the outputs checked by `checked_output` within a block as those of one command.
+    """Treat the outputs checked by `check_output` within a block as those of one command.
 
     An output must not be one of the inputs, nor the same as another output. Folders made by
     `results_folder` that are empty at the end are removed.
@@ -105,7 +105,7 @@ def results_folder(path: Path) -> Path:
     return path
 
 
-def checked_output(
+def check_output(
     path: str | Path,
     suffixes: tuple[str, ...],
     force: bool = False,
@@ -226,7 +226,9 @@ def written_whole(path: Path, n_bytes: int | None = None) -> Iterator[Path]:
     # Not `path.suffixes`, which skips leading dots: for "..nii.gz" it has only .gz.
     suffix = "".join(f".{part}" for part in path.name.split(".")[1:][-2:])[-20:]
     with _output(path, n_bytes) as place:
-        handle, name = tempfile.mkstemp(prefix=_hidden(path), suffix=suffix, dir=place.parent)
+        handle, name = tempfile.mkstemp(
+            prefix=_hidden_prefix(path), suffix=suffix, dir=place.parent
+        )
         os.close(handle)
         temporary = Path(name)
         try:
@@ -258,7 +260,7 @@ def _output(path: Path, n_bytes: int | None = None) -> Iterator[Path]:
         outputs.written.append(path)
 
 
-def _hidden(path: Path) -> str:
+def _hidden_prefix(path: Path) -> str:
     """Return the prefix of an output's temporary files and folders."""
     return f".{path.name[:TEMPORARY_LETTERS]}."
 
@@ -267,7 +269,7 @@ def _temporary_folder(stack: ExitStack, path: Path, folder: Path, suffix: str = 
     """Create a folder next to an output until the stack is unwound; files that cannot be removed
     remain, hidden.
     """
-    temporary = Path(tempfile.mkdtemp(prefix=_hidden(path), suffix=suffix, dir=folder))
+    temporary = Path(tempfile.mkdtemp(prefix=_hidden_prefix(path), suffix=suffix, dir=folder))
     stack.callback(shutil.rmtree, temporary, ignore_errors=True)
     return temporary
 

@@ -109,7 +109,7 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     def compiled(function: Callable[..., Any]) -> Any:
         dispatcher = numba.njit(**options)(function)
         if is_kept:
-            with _kept_in(_own_folder("linked")) as is_there:
+            with _keep_in(_own_folder("linked")) as is_there:
                 try:
                     dispatcher._cache = KeptCache(function) if is_there else dispatcher._cache
                 # no locator: the folder is gone or no longer writable
@@ -125,14 +125,14 @@ def plain_njit(*signature: Any, **options: Any) -> Callable[[Callable[..., Any]]
     known = {name: value for name, value in options.items() if name not in INSIDE_OPTIONS}
 
     def compiled(function: Callable[..., Any]) -> Any:
-        with _kept_in(_own_folder("plain") if known.get("cache") else None) as is_there:
+        with _keep_in(_own_folder("plain") if known.get("cache") else None) as is_there:
             return numba.njit(*signature, **known | {"cache": is_there})(function)
 
     return compiled
 
 
 @contextlib.contextmanager
-def _kept_in(folder: Path | None) -> Iterator[bool]:
+def _keep_in(folder: Path | None) -> Iterator[bool]:
     """Have numba keep the functions that are decorated within the block in a folder; give
     whether there is one.
     """

@@ -40,7 +40,7 @@ from numba.extending import overload, typeof_impl
 from numpy.typing import NDArray
 
 from tetopt.system.cache import place_cache
-from tetopt.system.child import started
+from tetopt.system.child import start_child
 from tetopt.system.interpreter import python_command, python_environment
 from tetopt.system.kernel_cache import (
     IS_PLAIN,
@@ -109,7 +109,7 @@ def _unlink(error: Exception) -> None:
         kernel.is_linked = False
 
 
-def packed(value: Any) -> Any:
+def pack_record(value: Any) -> Any:
     """Lay out a record for kernels; return any other value, including a laid-out record,
     unchanged.
     """
@@ -131,7 +131,7 @@ ALLOCATING_NAMES = frozenset(
 )
 
 
-def _named(function: Any) -> list[Any]:
+def _global_values(function: Any) -> list[Any]:
     """Return the global values that a function names."""
     return [function.__globals__.get(name) for name in function.__code__.co_names]
 
@@ -145,7 +145,7 @@ def _counts(function: Callable[..., Any]) -> bool:
     """
     if ALLOCATING_NAMES.intersection(function.__code__.co_names):
         return True
-    inner = [value.py_func for value in _named(function) if hasattr(value, "py_func")]
+    inner = [value.py_func for value in _global_values(function) if hasattr(value, "py_func")]
     return any(_returns_arrays(part) for part in [function, *inner])
 
 
@@ -156,7 +156,7 @@ def _returns_arrays(function: Callable[..., Any]) -> bool:
     )
 
 
-def _versioned(function: Callable[..., Any], **values: Any) -> Callable[..., Any]:
+def _version_function(function: Callable[..., Any], **values: Any) -> Callable[..., Any]:
     """Return a copy of a function that closes over the checksum of all kernels, with its own global
     values.
 
@@ -222,12 +222,14 @@ class Kernel:
         """The numba dispatcher by which Python calls it."""
         # with separate caches: only one has symbols
         compiled_by = plain_njit if links() is None else njit
-        return compiled_by(cache=True, error_model="numpy", nogil=True)(_versioned(self.function))
+        return compiled_by(cache=True, error_model="numpy", nogil=True)(
+            _version_function(self.function)
+        )
 
     def __call__(self, *values: Any) -> Any:
         """Call it from Python: links the units that it calls, and lays out records."""
         self.link()
-        return self.dispatcher(*map(packed, values))
+        return self.dispatcher(*map(pack_record, values))
 
     @cached_property
     def compiled(self) -> Any:
@@ -265,9 +267,9 @@ class Unit(Kernel):
         """The dispatcher for callers in machine code only."""
         if links() is None:
             options = {"cache": True, "error_model": "numpy", "nogil": True}
-            return plain_njit(self.signature, **options)(_versioned(self.function))
+            return plain_njit(self.signature, **options)(_version_function(self.function))
         dispatcher = _machine_code(cache=True, _nrt=_counts(self.function))(
-            _versioned(self.function)
+            _version_function(self.function)
         )
         dispatcher.compile(self.signature)
         return dispatcher
@@ -282,7 +284,7 @@ class Unit(Kernel):
         """A plain function that calls it for a record and a range of numbers, and returns how
         many calls fail.
         """
-        version = _versioned(_loop, _task=self)
+        version = _version_function(_loop, _task=self)
         version.__qualname__ = f"_loop.{self.symbol}"
         signature = types.int64(self.signature.args[0], types.int64, types.int64)
         return plain_njit(signature, cache=True, nogil=True)(version)
@@ -312,14 +314,14 @@ def _typeof_kernel(kernel: Kernel, _context: Any) -> types.Type:
 def units_of(function: Callable[..., Any]) -> Iterator[Unit]:
     """Yield the units that a function calls, directly or through its helpers."""
     for part in _parts(function):
-        yield from (value for value in _named(part) if isinstance(value, Unit))
+        yield from (value for value in _global_values(part) if isinstance(value, Unit))
 
 
 def _parts(function: Callable[..., Any]) -> list[Any]:
     """Return a function and the helpers that are compiled into it."""
     parts: list[Any] = [function]
     for part in parts:
-        for value in _named(part):
+        for value in _global_values(part):
             is_entry = isinstance(value, Entry)
             if is_entry or hasattr(value, "py_func"):
                 inner = value.function if is_entry else value.py_func
@@ -434,7 +436,9 @@ def _compile_apart(
             f"{claims!r}, {os.getpid()})"
         )
         command, environment = python_command("-c", code), python_environment()
-        processes = [stack.enter_context(started(command, environment)) for _ in range(n_processes)]
+        processes = [
+            stack.enter_context(start_child(command, environment)) for _ in range(n_processes)
+        ]
         while any(process.poll() is None for process in processes):
             say(f"compiling the kernels, {first + len(os.listdir(claims))} of {len(order)}")
             time.sleep(POLLED_SECONDS)
@@ -466,7 +470,7 @@ def compile_named(names: Sequence[str], claims: str, parent: int) -> None:
                 return
 
 
-_task: Any = None  # a unit; each compiled function below gets its own, see `_versioned`
+_task: Any = None  # a unit; each compiled function below gets its own, see `_version_function`
 _fails: Any = None
 
 
@@ -510,7 +514,7 @@ def run(task: Any, n: int, values: Any) -> None:
     if links() is None:
         n_failed = _run_plain(task, n, values)
     else:
-        laid_out = packed(values)
+        laid_out = pack_record(values)
         if laid_out.type != task.signature.args[0]:
             raise TypeError(
                 f"{task.__name__}: expected a {task.signature.args[0]}, got a {laid_out.type}"
@@ -593,9 +597,9 @@ def check_links() -> None:
     multiplied = Unit(_multiply)
     ALL_KERNELS.remove(multiplied)
     multiplied._make_known()
-    called = njit(cache=True)(_versioned(_call, _task=multiplied, _fails=links().fails))
+    called = njit(cache=True)(_version_function(_call, _task=multiplied, _fails=links().fails))
     x = np.ones(3)
-    rows = packed(_Rows(_Row(x, 2.0), len(x)))
+    rows = pack_record(_Rows(_Row(x, 2.0), len(x)))
     failures = called(rows, multiplied.address, rows.address)
     n_threads = numba.get_num_threads()
     # OpenMP starts no threads then, which a fork of the user's would not survive
