@@ -106,7 +106,7 @@ def test_what_failed_is_a_row_and_a_rerun_would_make_what_changed_and_what_faile
     )
     tetopt.save_image(small / "coarse.nii.gz", coarse)
     (small / "cut.nii.gz").write_bytes((small / "a.nii.gz").read_bytes()[:300])
-    command = ["cohort", small / "t.tsv", "-o", small / "out", "--iterations", 0, "--nodes", 60]
+    command = ["cohort", small / "t.tsv", "-o", small / "out", "--iterations", 0, "--nodes", 300]
     command += ["--scheduler", scheduler]
     labelled, far = (
         ["01", "a.nii.gz", "coarse.nii.gz", "n/a"],
@@ -135,10 +135,10 @@ def test_what_failed_is_a_row_and_a_rerun_would_make_what_changed_and_what_faile
         assert name in page
     assert list(meshes(small)) == ["sub-01"]
     # One has other options by now, one a whole image.
-    write_rows(small, [*labelled[:3], "80"], ["02", "a.nii.gz", "n/a", "n/a"], far)
+    write_rows(small, [*labelled[:3], "320"], ["02", "a.nii.gz", "n/a", "n/a"], far)
     capfd.readouterr()
     assert exit_code(*command, "--dry-run") == 0
-    assert "1 changed: nodes was 60, now 80" in capfd.readouterr().err
+    assert "1 changed: nodes was 300, now 320" in capfd.readouterr().err
     assert exit_code(*command, "--dry-run", "--retry-failed") == 0
     said = capfd.readouterr()
     assert "1 subjects are out of date" in said.err

@@ -163,7 +163,6 @@ def test_noise_level(shape, sigma):
     ("shape", "nodes", "words"),
     [
         ((30, 30, 30), 3, "9 or more in 3-D, got 3"),
-        ((30, 30, 30), 100.5, "whole number"),
         ((30, 30, 30), 500_000, "too many for 30 x 30 x 30 voxels; use at most 27000$"),
         ((200, 2, 2), 10, "too few for 200 x 2 x 2 voxels; the nearest octree found has 89"),
     ],
@@ -171,6 +170,8 @@ def test_noise_level(shape, sigma):
 def test_impossible_numbers_of_nodes(shape, nodes, words):
     with pytest.raises(tetopt.InputError, match=words):
         octree_mesh(ball(*shape), nodes)
+    with pytest.raises(TypeError):
+        octree_mesh(ball(*shape), nodes + 0.5)
 
 
 @pytest.mark.full
