@@ -311,18 +311,29 @@ def test_a_mask_that_finer_octrees_hardly_keep_better_has_the_nearest_number_of_
 def test_the_same_mesh_at_half_of_the_free_memory_or_a_refusal(monkeypatch):
     """Of a wall, for which finer octrees are tried: each of their steps that memory ends, ends all.
 
-    With a byte less than a step takes, no coarser octree stands in; with what the largest takes,
-    the mesh is that of all memory.
+    Whichever check finds too little, no coarser octree stands in; with what the largest takes, the
+    mesh is that of all memory.
     """
-    content, needs = shell(26, 9.0), set()
+    content, needs = shell(26, 9.0), []
     with monkeypatch.context() as patch:
-        patch.setattr(octree, "check_memory", lambda n_bytes, *words: needs.add(int(n_bytes)))
+        patch.setattr(octree, "check_memory", lambda n_bytes, *words: needs.append(n_bytes))
         expected = octree_mesh(content, 200)
-    for need in sorted(needs):
-        monkeypatch.setattr(budget, "available_bytes", lambda need=need: need - 1)
-        with pytest.raises(tetopt.InputError, match=r"octree: .* of memory, but only"):
+    for number in range(len(needs)):
+        later = iter(range(len(needs)))
+
+        def short(n_bytes, what, remedy, number=number, later=later):
+            if next(later) == number:
+                raise budget.MemoryShortage(f"{what}: {remedy}")
+
+        monkeypatch.setattr(octree, "check_memory", short)
+        with pytest.raises(budget.MemoryShortage):
             octree_mesh(content, 200)
-    for free in (max(needs) + 1, 2 * max(needs)):
+    monkeypatch.setattr(octree, "check_memory", budget.check_memory)
+    most = int(max(needs))
+    monkeypatch.setattr(budget, "available_bytes", lambda: most - 1)
+    with pytest.raises(tetopt.InputError, match=r"octree: .* of memory, but only"):
+        octree_mesh(content, 200)
+    for free in (most + 1, 2 * most):
         monkeypatch.setattr(budget, "available_bytes", lambda free=free: free)
         mesh = octree_mesh(content, 200)
         assert mesh.points.tobytes() == expected.points.tobytes()
