@@ -30,7 +30,7 @@ from tetopt import (
     load_mesh,
 )
 from tetopt.job.inputs import label_table
-from tetopt.model.labels import NO_TABLE
+from tetopt.model.label_names import NO_TABLE
 from tetopt.report.colours import grey_limits, label_colours, legend_patches
 from tetopt.report.figures import LETTER_INCHES, save_figure
 from tetopt.report.scene import Draw, View, cutaway, put_scene, view_of

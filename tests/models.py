@@ -12,7 +12,7 @@ import tetopt
 from tetopt.fem.elasticity import compression, lame_constants, stiffness, strains
 from tetopt.geometry.quadratic import cell_edges, quadratic
 from tetopt.geometry.simplex import volumes
-from tetopt.model.labels import TABLE_TEXT, LabelTable, table_words
+from tetopt.model.label_names import TABLE_TEXT, LabelTable, table_words
 from tetopt.model.loads import parse_loads
 from tetopt.model.materials import bin_moduli, materials
 from tetopt.model.model import Model

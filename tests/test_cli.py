@@ -454,7 +454,7 @@ def test_a_second_ctrl_c_gives_up(here, monkeypatch, capsys):
         assert stop()
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(tetopt.job.meshing, "_prepare", lambda _: None)
+    monkeypatch.setattr(tetopt.job.mesh_stage, "_prepare", lambda _: None)
     monkeypatch.setattr(
         tetopt.engine.meshing,
         "optimize",
@@ -618,7 +618,7 @@ def test_the_checksum_is_of_what_was_read(monkeypatch):
         Path("disc.nii").unlink()
         return optimize(*arguments, **options)
 
-    monkeypatch.setattr(tetopt.job.meshing, "_prepare", lambda _: None)
+    monkeypatch.setattr(tetopt.job.mesh_stage, "_prepare", lambda _: None)
     monkeypatch.setattr(tetopt.engine.meshing, "optimize", slow)
     assert_done("mesh disc.nii -o a.vtu --nodes 30 --iterations 1")
     assert load_mesh("a.vtu").field_data["image_sha256"].tolist() == [expected]

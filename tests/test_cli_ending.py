@@ -281,7 +281,7 @@ def test_what_was_written_before_an_error_is_said(monkeypatch, capsys):
 
 def test_a_mesh_that_the_disk_cannot_take_is_refused_before_the_run(monkeypatch, capsys):
     monkeypatch.setattr("shutil.disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9, 5000))
-    monkeypatch.setattr(tetopt.job.meshing, "watch_run", None)
+    monkeypatch.setattr(tetopt.job.mesh_stage, "watch_run", None)
     assert exit_code(MESH) == 2
     words = "a.vtu: needs at least 8640 bytes, but only 5000 are free; free some space first"
     assert words in capsys.readouterr().err
@@ -356,7 +356,7 @@ def measured_run(tmp_path_factory):
                 once.append(self.result)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tetopt.job.meshing, "MeshSearch", Remembered)
+        patch.setattr(tetopt.job.mesh_stage, "MeshSearch", Remembered)
         exit_code(*words, "-o", folder / "a.vtu", "--json", folder / "a.json")
         numbers = numbers_in(folder / "a.json")
         assert numbers["failed"] == {}

@@ -21,7 +21,7 @@ from numpy.testing import assert_array_equal
 import tetopt
 from tetopt import load_mesh
 from tetopt.contents.labels import BACKGROUND_COLOUR, LABEL_PALETTE, hex_colour
-from tetopt.job.model import MANY_INTERFACES
+from tetopt.job.solver_files import MANY_INTERFACES
 
 pytestmark = pytest.mark.full
 

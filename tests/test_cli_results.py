@@ -61,10 +61,10 @@ def test_results_are_in_the_file_in_place_of_earlier_ones(order, suffix, options
 def test_results_too_large_are_told(order, monkeypatch, capsys):
     """As by `tetopt fem`: with small numbers for large ones here."""
     words = "convert a.vtu b.vtu --results a.frd --force"
-    monkeypatch.setattr("tetopt.job.model.SMALL_FRACTION", 10.0)
+    monkeypatch.setattr("tetopt.job.solver_files.SMALL_FRACTION", 10.0)
     assert_done(words)
     assert "the largest displacement" not in capsys.readouterr().err
-    monkeypatch.setattr("tetopt.job.model.SMALL_FRACTION", 1e-9)
+    monkeypatch.setattr("tetopt.job.solver_files.SMALL_FRACTION", 1e-9)
     assert_done(words)
     assert re.search(
         r"warning: .*a.frd: displacement: the largest displacement, .* mm, is",

@@ -25,7 +25,7 @@ from tetopt.engine.meshing import process_bytes
 from tetopt.fem.elasticity import stiffness
 from tetopt.fem.reference import reference
 from tetopt.job.events import listen_with, progress, start_stage
-from tetopt.job.meshing import left_words, watch_run
+from tetopt.job.mesh_stage import left_words, watch_run
 from tetopt.start.memory import (
     BOUND_MARGIN,
     CHANNEL_BYTES,
@@ -199,7 +199,7 @@ def test_a_run_ends_before_the_limit_with_the_mesh_reached(tmp_path, monkeypatch
     assert 0 < numbers["memory"]["peak_bytes"]
     assert 0 < numbers["memory"]["predicted_bytes"]
     now = budget.resident_bytes
-    monkeypatch.setattr("tetopt.job.meshing.check_memory_of", lambda *_: None)
+    monkeypatch.setattr("tetopt.job.mesh_stage.check_memory_of", lambda *_: None)
     monkeypatch.setattr(budget.MemoryLimit, "is_reached", lambda self: now() > self.n_bytes)
     capsys.readouterr()
     exit_code(*words, "--max-gb", "0.001")

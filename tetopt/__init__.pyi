@@ -65,7 +65,7 @@ from .mesh import Mesh as Mesh
 from .model.build import build_model as build_model
 from .model.fields import cell_fields as cell_fields
 from .model.file import MeshFile as MeshFile
-from .model.labels import LabelTable as LabelTable
+from .model.label_names import LabelTable as LabelTable
 from .model.mappings import ByLabel as ByLabel
 from .model.on_image import field_on_image as field_on_image, warped_image as warped_image
 from .model.loads import Load as Load

@@ -22,11 +22,11 @@ from commands import exit_code
 import tetopt
 from tetopt import InputError, workers
 from tetopt.cohort import cohort as cohort_module
+from tetopt.cohort import cohort_plan
 from tetopt.cohort import estimate as estimate_module
-from tetopt.cohort import plan as cohort_plan
 from tetopt.cohort.layout import begin
 from tetopt.cohort.options import CohortOptions
-from tetopt.cohort.state import SubjectState
+from tetopt.cohort.subject_states import SubjectState
 from tetopt.cohort.subjects import read_table
 from tetopt.job.options import RunOptions
 from tetopt.system.work_directory import lock_directory

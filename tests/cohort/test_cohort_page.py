@@ -9,10 +9,10 @@ import pytest
 from browser import FRAMES, copied, document
 from cohorts import HOSTILE, key_of, run_of, save_cohort, save_run, thumbnail
 
-from tetopt.cohort import page
+from tetopt.cohort import cohort_page as page
+from tetopt.cohort.cohort_page import save_cohort_files
 from tetopt.cohort.flags import flags_of
 from tetopt.cohort.numbers import collect
-from tetopt.cohort.page import save_cohort_files
 from tetopt.io.text import plain
 
 

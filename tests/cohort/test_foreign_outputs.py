@@ -11,10 +11,10 @@ from attacks import KINDS, content, outside, planted
 from cohorts import run_of, save_run, thumbnail
 from commands import assert_refused, exit_code
 
-from tetopt.cohort import plan as cohort_plan
+from tetopt.cohort import cohort_plan
+from tetopt.cohort.cohort_page import save_cohort_files
 from tetopt.cohort.layout import begin, clean, log_path, numbers_path, publish, thumbnail_path
 from tetopt.cohort.numbers import collect
-from tetopt.cohort.page import save_cohort_files
 from tetopt.errors import InputError
 
 pytestmark = pytest.mark.deep

@@ -10,9 +10,9 @@ import pytest
 from commands import exit_code, numbers_in
 
 import tetopt
-from tetopt.cohort import run as run_module
+from tetopt.cohort import subject_runs as run_module
 from tetopt.cohort.layout import begin, clean, failure_path, log_path, numbers_path, subject_folder
-from tetopt.cohort.run import SubjectTask, run_all, run_subject
+from tetopt.cohort.subject_runs import SubjectTask, run_all, run_subject
 from tetopt.errors import InputError
 from tetopt.job.events import Event
 from tetopt.job.options import JobOptions

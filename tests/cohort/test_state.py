@@ -8,7 +8,7 @@ import pytest
 from cohorts import save_failure, save_run
 
 from tetopt.cohort.layout import begin, mesh_name, numbers_path, subject_folder
-from tetopt.cohort.state import SubjectState, differences, state_of
+from tetopt.cohort.subject_states import SubjectState, differences, state_of
 
 KEY = "sub-1"
 

@@ -11,13 +11,13 @@ from tetopt.energy.sampling import channel_grid, from_ticks
 from tetopt.engine.complex import cell_squares, energies, node_stars, remeasure
 from tetopt.engine.density import Limits, _put_middle, best_splits, exchange, roomy, worth_of_split
 from tetopt.engine.flips import flip
-from tetopt.engine.interfaces import with_labels
+from tetopt.engine.label_state import with_labels
 from tetopt.engine.labelling import label_voxels
 from tetopt.engine.loop import GRADED_K_D
 from tetopt.engine.repair import repair
+from tetopt.engine.sliding import combined_ways, constraint_values
 from tetopt.engine.smooth import attract, blocks, sweep
 from tetopt.engine.state import state_of, with_min_dihedral
-from tetopt.engine.surface import combined_ways, constraint_values
 from tetopt.measure.interfaces import label_interfaces
 
 

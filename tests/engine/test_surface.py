@@ -16,8 +16,8 @@ from tetopt.energy.sampling import cell_of_voxel, channel_grid, moment_sums, ove
 from tetopt.engine.complex import build
 from tetopt.engine.fast import MOST_OFFSET_FRACTION, Run
 from tetopt.engine.loop import side_ticks
+from tetopt.engine.sliding import level_at, put_on_surface
 from tetopt.engine.state import objective_of, sides_of
-from tetopt.engine.surface import level_at, put_on_surface
 from tetopt.geometry.check import manifold_problems
 from tetopt.geometry.topology import boundary_facets, components
 from tetopt.measure.fidelity import cell_labels, label_fidelity, mask_fidelity

@@ -11,9 +11,9 @@ import tetopt
 from tetopt.contents.memberships import labels_at, memberships
 from tetopt.engine import labelling
 from tetopt.engine.fast import BAND_FRACTION, MOST_OFFSET_FRACTION, Run
-from tetopt.engine.interfaces import FEWEST_CENTRES, PART_CENTRES, SAMPLED_FRACTION, cell_contents
+from tetopt.engine.label_state import FEWEST_CENTRES, PART_CENTRES, SAMPLED_FRACTION, cell_contents
 from tetopt.engine.labelling import Contents, label_cells, label_voxels
-from tetopt.engine.surface import fill_offsets
+from tetopt.engine.sliding import fill_offsets
 from tetopt.geometry.simplex import volumes
 from tetopt.measure.interfaces import label_interfaces
 

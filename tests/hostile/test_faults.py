@@ -21,7 +21,7 @@ from hostile.faults import Fault, arrays_count, left_in, steps_count
 from models import sample_image
 
 import tetopt
-import tetopt.job.meshing
+import tetopt.job.mesh_stage
 from tetopt.engine.meshing import Attempt, MeshSearch
 
 pytestmark = [
@@ -112,7 +112,7 @@ def runs(monkeypatch):
                 once["result"] = self.result
             once["is_there"] = True
 
-    monkeypatch.setattr(tetopt.job.meshing, "MeshSearch", Remembered)
+    monkeypatch.setattr(tetopt.job.mesh_stage, "MeshSearch", Remembered)
     return once
 
 

@@ -10,7 +10,7 @@ from tetopt.contents.labels import hex_colour
 from tetopt.errors import InputError
 from tetopt.io.label_tables import NO_TABLE, LabelTable, load_label_table
 from tetopt.model.file import table_in
-from tetopt.model.labels import label_words, labels_named, table_of_labels, table_words
+from tetopt.model.label_names import label_words, labels_named, table_of_labels, table_words
 from tetopt.model.sets import MOST_LETTERS, SET_NAME, interface_names, label_set_names
 
 FREESURFER = """#$Id: FreeSurferColorLUT.txt $

@@ -9,7 +9,7 @@ from tetopt.io.abaqus import abaqus
 from tetopt.io.febio import febio
 from tetopt.io.tags import named_materials, tag_sets
 from tetopt.model.build import build_model
-from tetopt.model.labels import TABLE_TEXT, LabelTable
+from tetopt.model.label_names import TABLE_TEXT, LabelTable
 
 
 def test_tags_say_which_sets_an_item_is_in():

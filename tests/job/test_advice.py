@@ -8,7 +8,7 @@ from commands import exit_code, numbers_in
 
 import tetopt
 from tetopt.contents.labels import LostComponent
-from tetopt.engine.interfaces import crowded_nodes
+from tetopt.engine.label_state import crowded_nodes
 from tetopt.engine.loop import IterationRecord, MeshingResult
 from tetopt.job.advice import (
     beyond_requirements,

@@ -15,7 +15,7 @@ import tetopt.measure.measures
 from tetopt.cohort.flags import flags_of
 from tetopt.cohort.layout import mesh_name, numbers_path, subject_folder
 from tetopt.cohort.numbers import row_of
-from tetopt.cohort.state import state_of
+from tetopt.cohort.subject_states import state_of
 from tetopt.job.advice import Problem, of_layers, order_problems, sentences
 from tetopt.job.events import ended_words
 from tetopt.job.options import SourceOptions

@@ -17,7 +17,7 @@ from tetopt.job.inputs import label_sizes_of
 from tetopt.job.options import RunOptions, given_options
 from tetopt.job.request import checksum, job_request
 from tetopt.job.texts import option_words, with_options
-from tetopt.model.labels import LabelTable
+from tetopt.model.label_names import LabelTable
 from tetopt.start.label_sizes import LabelSize
 
 # Of each field of the options of `tetopt mesh` a value that is not its default.

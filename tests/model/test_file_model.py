@@ -6,7 +6,7 @@ from models import quadratic_model, sample_model
 
 import tetopt
 from tetopt.cli import main
-from tetopt.model.labels import colour_labels, table_words
+from tetopt.model.label_names import colour_labels, table_words
 
 TABLE = tetopt.LabelTable({0: "white matter", 1: "skull"}, {1: (1.0, 0.0, 0.0)})
 

@@ -23,7 +23,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.cut import plane_cut
 from tetopt.geometry.simplex import centroids, orient_cells, volumes
 from tetopt.geometry.topology import boundary_facets, facets
-from tetopt.model.labels import LabelTable
+from tetopt.model.label_names import LabelTable
 from tetopt.report import explore
 from tetopt.report.exhibit import exhibit, first_axis, opened_on, warp_factors
 from tetopt.report.explore import colour_table, explorer_html, save_explorer

@@ -26,7 +26,7 @@ from tetopt.image import Image
 from tetopt.measure.fidelity import cell_labels
 from tetopt.measure.quality import rho_histogram
 from tetopt.mesh import Mesh
-from tetopt.model.labels import LabelTable, colour_labels, table_words
+from tetopt.model.label_names import LabelTable, colour_labels, table_words
 from tetopt.report import figures
 from tetopt.report.colours import LISTED_LABELS, UNCOVERED_COLOUR, label_colours, legend_patches
 from tetopt.report.figures import (

@@ -14,7 +14,7 @@ from browser import document
 
 from tetopt.geometry.topology import boundary_facets
 from tetopt.io.text import plain
-from tetopt.model.labels import LabelTable
+from tetopt.model.label_names import LabelTable
 from tetopt.report.exhibit import exhibit
 from tetopt.report.explore import save_explorer
 from tetopt.report.page import PAGE_SCRIPTS, picture_html, policy_html, script_html, write_page

@@ -12,7 +12,7 @@ import pytest
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.model.labels import LabelTable
+from tetopt.model.label_names import LabelTable
 from tetopt.report.thumbnail import SIDE_PIXELS, save_thumbnail, thumbnail_png
 from tetopt.start.lattice import lattice_mesh
 

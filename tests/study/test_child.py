@@ -14,8 +14,8 @@ import pytest
 
 import tetopt
 from tetopt.job.events import Event, listen_with
-from tetopt.study.child import run_in_child
 from tetopt.study.endings import AFTER_CRASHES
+from tetopt.study.pipeline_process import run_in_child
 from tetopt.study.pipelines import PIPELINES, PipelineInput
 from tetopt.system.child import signal_words
 
@@ -162,7 +162,7 @@ def test_peak_is_the_childs_own():
 def test_the_end_of_the_parent_ends_the_child(tmp_path, sent):
     """And what it started; and takes the temporary folder away."""
     program = (
-        "import pipes, tetopt; from tetopt.study.child import run_in_child\n"
+        "import pipes, tetopt; from tetopt.study.pipeline_process import run_in_child\n"
         "from tetopt.study.pipelines import PipelineInput\n"
         "image = tetopt.load_phantom('sphere').image(voxel_mm=4.0)\n"
         "run_in_child(pipes.sleep, PipelineInput(image, None, 300), max_seconds=300.0)"

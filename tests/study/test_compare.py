@@ -17,10 +17,10 @@ from tetopt.fem.reference import compare as reference_errors
 from tetopt.geometry.quadratic import quadratic
 from tetopt.model.averages import element_young, young_image
 from tetopt.study import baseline, compare, compare_files
-from tetopt.study.child import Outcome
 from tetopt.study.compare_files import COMPARE_PICTURES
 from tetopt.study.compare_report import Settings
 from tetopt.study.endings import AFTER_CRASHES
+from tetopt.study.pipeline_process import Outcome
 from tetopt.study.pipelines import PIPELINES
 
 REFERENCE_DOFS = 2000

@@ -5,7 +5,7 @@ import pytest
 
 import tetopt
 from tetopt.contents.otsu import class_thresholds
-from tetopt.study.interfaces import Surfaces, class_labels, interfaces
+from tetopt.study.isosurfaces import Surfaces, class_labels, interfaces
 
 PHANTOM = tetopt.load_phantom("sphere")  # radius 20 mm about the origin
 IMAGE, LABELS = PHANTOM.image(voxel_mm=2.0), PHANTOM.label_image(voxel_mm=2.0)

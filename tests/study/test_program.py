@@ -20,8 +20,8 @@ from tetopt.cli import main
 from tetopt.fem.elasticity import check_fills_box
 from tetopt.geometry.simplex import orient_cells, volumes
 from tetopt.geometry.topology import boundary_facets
-from tetopt.study.child import run_in_child
-from tetopt.study.interfaces import class_labels
+from tetopt.study.isosurfaces import class_labels
+from tetopt.study.pipeline_process import run_in_child
 from tetopt.study.pipelines import PipelineInput
 from tetopt.study.program import by_program, parse_program, pipelines_with, put_on_sides
 

@@ -14,7 +14,7 @@ import tetopt
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import boundary_facets
 from tetopt.study import endings, tetwild
-from tetopt.study.interfaces import interfaces
+from tetopt.study.isosurfaces import interfaces
 from tetopt.study.pipelines import PIPELINES, PipelineInput
 
 needs_pytetwild = pytest.mark.skipif(

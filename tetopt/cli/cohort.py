@@ -23,11 +23,11 @@ from tetopt.cohort.cohort import (
     plan_cohort,
     run_planned,
 )
+from tetopt.cohort.cohort_page import STATUS_WORDS
 from tetopt.cohort.estimate import share_for
 from tetopt.cohort.layout import PAGE_NAME, TABLE_NAME
 from tetopt.cohort.numbers import Row
 from tetopt.cohort.options import CohortOptions
-from tetopt.cohort.page import STATUS_WORDS
 from tetopt.cohort.subjects import Problems
 from tetopt.io.text import count_text
 from tetopt.job.events import Event, listen_with, time_words

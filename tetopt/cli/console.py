@@ -304,7 +304,7 @@ def print_fidelity(
 
 def _print_labels(measured: dict[str, Any], ndim: int, every: bool) -> None:
     """Print the labels: the worst, or every one with all measures."""
-    from tetopt.model.labels import count_of_labels
+    from tetopt.model.label_names import count_of_labels
     from tetopt.report.tables import label_differences, label_table, surface_table, worst_labels
 
     names = measured.get("label_names", {})

@@ -15,7 +15,7 @@ from tetopt.cli.console import log, show_event
 from tetopt.cli.ending import is_ended
 from tetopt.engine.loop import IterationRecord
 from tetopt.job.events import Event, Stage
-from tetopt.job.meshing import left_words
+from tetopt.job.mesh_stage import left_words
 from tetopt.system.budget import memory_words, resident_bytes
 
 LINE_SECONDS = 10.0  # between lines, if there is no terminal for a bar

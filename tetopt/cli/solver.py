@@ -22,7 +22,7 @@ from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.inputs import list_names
 from tetopt.job.options import SolverOptions
 from tetopt.model.fields import GAUSS_MODULI
-from tetopt.model.labels import TABLE_TEXT, labels_of, table_of_words
+from tetopt.model.label_names import TABLE_TEXT, labels_of, table_of_words
 from tetopt.model.loads import SHOWN_LOAD_DIGITS, count_of_steps, load_words
 from tetopt.model.materials import Materials
 from tetopt.model.model import STRESS_UNITS, Model, element_facets, elements

@@ -9,12 +9,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tetopt.cohort.estimate import Estimate, estimate_memory, share_for
-from tetopt.cohort.layout import WORK_NAME, begin, check_out, clean, failure_path, linked_place
-from tetopt.cohort.numbers import Row, collect
-from tetopt.cohort.options import CohortOptions
-from tetopt.cohort.page import STATUS_WORDS, save_cohort_files
-from tetopt.cohort.plan import (
+from tetopt.cohort.cohort_page import STATUS_WORDS, save_cohort_files
+from tetopt.cohort.cohort_plan import (
     PlannedSubject,
     choose_subjects,
     entries_of,
@@ -22,7 +18,11 @@ from tetopt.cohort.plan import (
     suffix_of_meshes,
     with_states,
 )
-from tetopt.cohort.run import Ended, SubjectTask, run_all
+from tetopt.cohort.estimate import Estimate, estimate_memory, share_for
+from tetopt.cohort.layout import WORK_NAME, begin, check_out, clean, failure_path, linked_place
+from tetopt.cohort.numbers import Row, collect
+from tetopt.cohort.options import CohortOptions
+from tetopt.cohort.subject_runs import Ended, SubjectTask, run_all
 from tetopt.cohort.subjects import TABLE_SUFFIXES, Problems, key, write_table
 from tetopt.errors import InputError
 from tetopt.io.text import count_text

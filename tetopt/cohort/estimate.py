@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import fields
 from io import StringIO
 
+from tetopt.cohort.cohort_plan import PlannedSubject
 from tetopt.cohort.options import CohortOptions
-from tetopt.cohort.plan import PlannedSubject
 from tetopt.engine.meshing import process_bytes
 from tetopt.errors import InputError
 from tetopt.io.images import file_shape

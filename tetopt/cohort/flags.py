@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from tetopt.cohort.numbers import Row, Value, present
-from tetopt.model.labels import label_words
+from tetopt.model.label_names import label_words
 
 # A normal number exceeds this distance from the median in 1 case of 1.7 million; cohorts have
 # longer tails.

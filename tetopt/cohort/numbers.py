@@ -24,7 +24,7 @@ from tetopt.cohort.layout import (
     table_in,
     thumbnail_path,
 )
-from tetopt.cohort.state import Status, mesh_of, state_of
+from tetopt.cohort.subject_states import Status, mesh_of, state_of
 from tetopt.geometry.box import world_axes
 from tetopt.io.text import plain
 from tetopt.system.files import save_json, written_whole

@@ -35,7 +35,7 @@ from tetopt.model.file import (
     MASK_TEXT,
     MeshFile,
 )
-from tetopt.model.labels import (
+from tetopt.model.label_names import (
     TABLE_TEXT,
     table_words,
 )

@@ -22,7 +22,7 @@ from tetopt.job.inputs import label_table, read_mesh
 from tetopt.job.options import LabelNamesOption, Option, SpaceOption
 from tetopt.measure.fidelity import FacetSurface, surface_areas
 from tetopt.model.file import MeshFile
-from tetopt.model.labels import label_words, labels_named
+from tetopt.model.label_names import label_words, labels_named
 from tetopt.model.model import SPACES
 from tetopt.model.sets import FACE_NAMES, boundary_rows, face_sets
 

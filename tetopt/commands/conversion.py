@@ -24,7 +24,8 @@ from tetopt.io.text import count_text
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.events import note, progress, warning, warnings_heard
 from tetopt.job.inputs import list_names, read_mesh
-from tetopt.job.model import (
+from tetopt.job.options import ALL_LABELS, LabelChoice, LabelledPart, SolverOptions
+from tetopt.job.solver_files import (
     check_solver_options,
     choices_of,
     convert_model,
@@ -32,7 +33,6 @@ from tetopt.job.model import (
     save_for_solver,
     with_chosen_sets,
 )
-from tetopt.job.options import ALL_LABELS, LabelChoice, LabelledPart, SolverOptions
 from tetopt.mesh import Mesh
 from tetopt.model.fields import is_stress
 from tetopt.model.file import (
@@ -45,7 +45,7 @@ from tetopt.model.file import (
     without_results,
     without_stale_results,
 )
-from tetopt.model.labels import kept_labels, labels_of
+from tetopt.model.label_names import kept_labels, labels_of
 from tetopt.model.model import Model
 from tetopt.model.sets import (
     INTERFACE_PREFIX,

@@ -16,13 +16,13 @@ from tetopt.io.formats import save_model
 from tetopt.io.images import sha256
 from tetopt.job.events import warning, warnings_heard
 from tetopt.job.inputs import read_mesh
-from tetopt.job.model import (
+from tetopt.job.options import LabelledPart, ModelOptions, stated_part
+from tetopt.job.solver_files import (
     check_model_options,
     convert_model,
     large_words,
     with_chosen_sets,
 )
-from tetopt.job.options import LabelledPart, ModelOptions, stated_part
 from tetopt.model.averages import DEFAULT_AVERAGE
 from tetopt.model.file import MeshFile, loads_in, texts_of, without_results
 from tetopt.model.loads import MOST_COMPRESSION_PERCENT, count_of_steps

@@ -2,7 +2,7 @@
 surface.
 
 The midpoint of an edge moves nearly the shortest way onto the levels on which its ends lie, like
-nodes in `tetopt.engine.surface`. No cell around it may come near to folding.
+nodes in `tetopt.engine.sliding`. No cell around it may come near to folding.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tetopt.contents.content import Content
 from tetopt.contents.domain import ON_SURFACE_VOXELS, levels
-from tetopt.engine.surface import (
+from tetopt.engine.sliding import (
     ASIDE_VOXELS,
     CURVE_STEPS,
     MOST_MEETING,

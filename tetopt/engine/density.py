@@ -52,6 +52,15 @@ from tetopt.engine.complex import (
     wrong_side,
 )
 from tetopt.engine.flips import close_gaps
+from tetopt.engine.sliding import (
+    MOST_MEETING,
+    faces_up,
+    insert_label,
+    is_among,
+    put_on_surface,
+    star_faces_up,
+    uphill_at,
+)
 from tetopt.engine.smooth import (
     Blocks,
     blocks,
@@ -60,15 +69,6 @@ from tetopt.engine.smooth import (
     star_misfit,
     star_shape,
     trial_of,
-)
-from tetopt.engine.surface import (
-    MOST_MEETING,
-    faces_up,
-    insert_label,
-    is_among,
-    put_on_surface,
-    star_faces_up,
-    uphill_at,
 )
 from tetopt.geometry.topology import compact
 from tetopt.geometry.vectors import dot, minus, put_row, row

@@ -33,7 +33,7 @@ from tetopt.engine.complex import (
 )
 from tetopt.engine.density import Limits, compact_state, exchange
 from tetopt.engine.flips import _evaluate_cells, _evaluate_triangles, flip
-from tetopt.engine.interfaces import mend_pinches, with_labels
+from tetopt.engine.label_state import mend_pinches, with_labels
 from tetopt.engine.labelling import LabelVoxels, label_voxels
 from tetopt.engine.loop import (
     MIN_DIHEDRAL,
@@ -50,9 +50,9 @@ from tetopt.engine.loop import (
 )
 from tetopt.engine.paper import optimize_paper
 from tetopt.engine.repair import cell_cosines, n_cells_below, repair
+from tetopt.engine.sliding import _fill_offsets, fill_offsets
 from tetopt.engine.smooth import _attract, attract, blocks, sweep
 from tetopt.engine.state import angle_limit_of, content_energies, state_of, with_min_dihedral
-from tetopt.engine.surface import _fill_offsets, fill_offsets
 from tetopt.errors import InputError
 from tetopt.geometry.manifold import OUTSIDE_LABEL
 from tetopt.geometry.simplex import regular_edge, volumes

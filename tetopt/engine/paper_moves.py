@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from tetopt.energy.geometric import volume_and_E_G, volume_gradient
 from tetopt.energy.sampling import cell_orientation, few_threads
 from tetopt.engine.complex import FLAT_FRACTION, NodeStars, State, cell_energy
+from tetopt.engine.sliding import projection_at
 from tetopt.engine.smooth import Trial, TrialByValue, star_image, store, trial_of
-from tetopt.engine.surface import projection_at
 from tetopt.geometry.vectors import difference, minus, put_row, row, scale_vector, times
 from tetopt.system.kernels import Floats2, Ints1, helper, run, unit
 

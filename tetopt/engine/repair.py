@@ -42,8 +42,8 @@ from tetopt.engine.flips import (
     ring_of_edge,
     turn_to_arcs,
 )
+from tetopt.engine.sliding import projection_at, slides
 from tetopt.engine.smooth import slide_node, star_energy, store, trial_of
-from tetopt.engine.surface import projection_at, slides
 from tetopt.geometry.vectors import difference, dot, put_row, row, scale_vector, times
 from tetopt.system.kernels import Bools1, Floats1, Floats2, Ints1, entry, helper, unit
 

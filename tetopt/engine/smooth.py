@@ -42,7 +42,7 @@ from tetopt.engine.complex import (
     worst_cosine,
     wrong_side,
 )
-from tetopt.engine.surface import (
+from tetopt.engine.sliding import (
     band_of,
     combined_ways,
     is_on_surface,
@@ -576,7 +576,7 @@ class Search(NamedTuple):
     """
 
     x: NDArray[np.float64]  # (4, 3) room for a cell's corners
-    normal: NDArray[np.float64]  # (7, 3) see `tetopt.engine.surface.normals_at`
+    normal: NDArray[np.float64]  # (7, 3) see `tetopt.engine.sliding.normals_at`
     is_sliding: bool  # True if the node stays on its surfaces
     best: NDArray[np.float64]  # (1,) the least energy of the star
     place: NDArray[np.int64]  # (1, 3) its place, ticks

@@ -28,7 +28,7 @@ from tetopt.io.read_dicom import dicom_file, read_segments_table
 from tetopt.io.segments import segments_of, segments_table
 from tetopt.io.text import plain
 from tetopt.io.volumes import one_line
-from tetopt.model.labels import NO_TABLE, LabelTable
+from tetopt.model.label_names import NO_TABLE, LabelTable
 from tetopt.system.incoming import irregular, text_of
 
 __all__ = ["NO_TABLE", "LabelTable", "load_label_table"]

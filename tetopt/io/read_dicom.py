@@ -35,7 +35,7 @@ from tetopt.io.volumes import (
     one_line,
     volume_index,
 )
-from tetopt.model.labels import LabelTable
+from tetopt.model.label_names import LabelTable
 from tetopt.system.extras import install_hint
 from tetopt.system.incoming import irregular
 

@@ -17,7 +17,7 @@ from tetopt.interop.conversions import CELL_DIMENSIONS
 from tetopt.io.apart import read_apart
 from tetopt.io.gmsh import OwnComments, own_comments
 from tetopt.io.raw import Group, Raw, by_corners
-from tetopt.model.labels import TABLE_TEXT, LabelTable, table_words
+from tetopt.model.label_names import TABLE_TEXT, LabelTable, table_words
 from tetopt.system.budget import check_memory, memory_words
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tetopt.contents.labels import LARGEST_LABEL
 from tetopt.errors import InputError
 from tetopt.io.text import plain
-from tetopt.model.labels import LabelTable
+from tetopt.model.label_names import LabelTable
 
 SEGMENT_FIELD = re.compile(r"Segment(\d{1,6})_(\w+)")
 

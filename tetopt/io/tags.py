@@ -26,7 +26,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.topology import facets
 from tetopt.io.text import free_text
 from tetopt.mesh import Mesh
-from tetopt.model.labels import TABLE_TEXT, labels_of, table_of_words
+from tetopt.model.label_names import TABLE_TEXT, labels_of, table_of_words
 from tetopt.model.loads import load_words
 from tetopt.model.model import Model, header_lines
 from tetopt.model.sets import (

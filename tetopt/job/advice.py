@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from tetopt.contents.labels import BACKGROUND_LABEL
 from tetopt.engine.loop import MeshingResult
 from tetopt.engine.meshing import Mode
-from tetopt.engine.surface import MOST_MEETING
+from tetopt.engine.sliding import MOST_MEETING
 from tetopt.job.events import note, report_violation, warning
 from tetopt.job.inputs import list_names
 from tetopt.job.options import Method
 from tetopt.measure.fidelity import LabelFidelity, MaskFidelity
 from tetopt.measure.interfaces import LabelInterface
 from tetopt.measure.judge import LABEL_VOXELS, Requirements, faulty_labels
-from tetopt.model.labels import count_of_labels, label_words
+from tetopt.model.label_names import count_of_labels, label_words
 from tetopt.start.label_sizes import SizesByLabel
 from tetopt.start.octree import is_for_walls
 from tetopt.start.sizes import LONG_EDGE, EdgeRatios, Sizes

@@ -50,7 +50,7 @@ from tetopt.model.file import (
     own_mask,
     words_of_other_box,
 )
-from tetopt.model.labels import (
+from tetopt.model.label_names import (
     NO_TABLE,
     label_words,
     labels_named,

@@ -27,8 +27,8 @@ from tetopt.io.formats import FORMATS
 from tetopt.io.images import check_bounds, file_shape, parse_crop, parse_slice, smaller_words
 from tetopt.io.label_tables import NO_TABLE, LabelTable
 from tetopt.job.inputs import balance_of, check_outputs, label_sizes_of, number_of, read_companion
-from tetopt.job.model import check_solver_options
 from tetopt.job.options import JobOptions, Method, stated_part
+from tetopt.job.solver_files import check_solver_options
 from tetopt.model.mappings import named_file
 from tetopt.model.tissues import groups_of
 from tetopt.start.label_sizes import SizesByLabel

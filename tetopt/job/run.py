@@ -25,7 +25,7 @@ from tetopt.job.advice import (
 )
 from tetopt.job.events import Listener, listen_with, start_stage
 from tetopt.job.job import Job
-from tetopt.job.meshing import mesh_task
+from tetopt.job.mesh_stage import mesh_task
 from tetopt.job.read import read
 from tetopt.job.task import Meshed, Shapes, Task
 from tetopt.job.write import draw, measures_of, numbers_of, save_outcome

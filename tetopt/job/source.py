@@ -54,7 +54,7 @@ from tetopt.measure.judge import Requirements
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
 from tetopt.model.file import MASK_TEXT, MeshFile
-from tetopt.model.labels import (
+from tetopt.model.label_names import (
     TABLE_TEXT,
     kept_labels,
     label_words,

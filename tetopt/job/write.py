@@ -12,11 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.contents.content import continue_image
-from tetopt.engine.interfaces import crowded_nodes
+from tetopt.engine.label_state import crowded_nodes
 from tetopt.engine.loop import MeshingResult
 from tetopt.errors import Note, warn
 from tetopt.job.events import warnings_heard
-from tetopt.job.model import (
+from tetopt.job.options import SolverOptions
+from tetopt.job.plan import nodes_of_targets, stated_options
+from tetopt.job.solver_files import (
     drop_early,
     keep_early,
     save_anyway,
@@ -24,15 +26,19 @@ from tetopt.job.model import (
     solver_model,
     with_chosen_sets,
 )
-from tetopt.job.options import SolverOptions
-from tetopt.job.plan import nodes_of_targets, stated_options
 from tetopt.job.source import Source
 from tetopt.job.task import Meshed, Shapes, Task
 from tetopt.measure.measures import fidelity, measure_each
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields, is_result
 from tetopt.model.file import MASK_TEXT, MeshFile
-from tetopt.model.labels import TABLE_TEXT, LabelTable, colour_labels, table_of_labels, table_words
+from tetopt.model.label_names import (
+    TABLE_TEXT,
+    LabelTable,
+    colour_labels,
+    table_of_labels,
+    table_words,
+)
 from tetopt.model.model import Model
 from tetopt.model.sets import Sets, box_of, label_set_names, surviving_sets
 from tetopt.report.summary import run_summary

@@ -39,7 +39,7 @@ from tetopt.model.file import (
     without_stale_results,
     words_of_other_box,
 )
-from tetopt.model.labels import (
+from tetopt.model.label_names import (
     TABLE_TEXT,
     LabelTable,
     colour_labels,
@@ -138,8 +138,8 @@ def build_model(
         The box of the meshed image; by default that of `image`.
     about : dict, optional
         Strings for the file's header. Its "label_table", a `LabelTable` or the result of
-        `tetopt.model.labels.table_words`, gives the names of labels in mappings and in the standard
-        sets.
+        `tetopt.model.label_names.table_words`, gives the names of labels in mappings and in the
+        standard sets.
 
     Returns
     -------

@@ -19,7 +19,7 @@ from tetopt.image import Image
 from tetopt.interop import notebook
 from tetopt.mesh import Mesh
 from tetopt.model.fields import GAUSS_MODULI, NODE_MODULI, is_result
-from tetopt.model.labels import TABLE_TEXT, LabelTable, labels_of, table_of_words
+from tetopt.model.label_names import TABLE_TEXT, LabelTable, labels_of, table_of_words
 from tetopt.model.loads import load_words, parse_load
 from tetopt.model.mappings import check_young
 from tetopt.model.materials import BinningError
@@ -242,7 +242,7 @@ def own_mask(loaded: MeshFile, image: Image) -> Image | None:
 
 
 def table_in(text: str | None) -> LabelTable:
-    """Parse a label table written by `tetopt.model.labels.table_words`; empty for any other
+    """Parse a label table written by `tetopt.model.label_names.table_words`; empty for any other
     text.
     """
     try:

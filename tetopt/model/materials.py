@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tetopt.energy.sampling import ranges_of
 from tetopt.errors import InputError, Remark, warn
-from tetopt.model.labels import label_words, labels_named
+from tetopt.model.label_names import label_words, labels_named
 from tetopt.model.mappings import ByLabel, check_young
 
 # Poisson's ratio of soft tissue that linear cells still represent: they lock closer to 0.5
@@ -166,7 +166,7 @@ def by_label(
     Parameters
     ----------
     mapping : ByLabel
-        A name in it refers to all labels with that name (`tetopt.model.labels.labels_named`).
+        A name in it refers to all labels with that name (`tetopt.model.label_names.labels_named`).
     labels : (M,) integers or None
     names : mapping of label to text, optional
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tetopt.contents.labels import LARGEST_LABEL, check_labels
 from tetopt.errors import InputError
 from tetopt.image import Image
-from tetopt.model.labels import labels_named
+from tetopt.model.label_names import labels_named
 from tetopt.model.mappings import named_file
 from tetopt.system.incoming import rows_of, toml_of
 

@@ -23,7 +23,7 @@ def label_colours(
     """Return the colour of each label.
 
     A label has the same colour in all pictures: its `own`, e.g. from
-    `tetopt.model.labels.LabelTable.colours`, or that of its number
+    `tetopt.model.label_names.LabelTable.colours`, or that of its number
     (`tetopt.contents.labels.colours_by_number`). 0, the background, is always light grey, although
     label tables make it black.
 

@@ -14,7 +14,7 @@ from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
-from tetopt.model.labels import NO_TABLE, LabelTable, table_of_labels
+from tetopt.model.label_names import NO_TABLE, LabelTable, table_of_labels
 from tetopt.report.colours import grey_limits, label_colours
 
 COLOUR_MAP = "viridis"  # perceptually even

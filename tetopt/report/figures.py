@@ -28,7 +28,7 @@ from tetopt.image import Image
 from tetopt.measure.fidelity import cell_labels, half_level_surface
 from tetopt.measure.quality import BAD_SHAPE, quality_errors, rho_histogram
 from tetopt.mesh import Mesh
-from tetopt.model.labels import NO_TABLE, LabelTable
+from tetopt.model.label_names import NO_TABLE, LabelTable
 from tetopt.report.colours import (
     LISTED_LABELS,
     UNCOVERED_COLOUR,

@@ -27,7 +27,7 @@ from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import facets
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.model.labels import NO_TABLE, LabelTable
+from tetopt.model.label_names import NO_TABLE, LabelTable
 from tetopt.report.colours import grey_limits, label_colours
 from tetopt.report.figures import FIGURE_SUFFIXES, MASK_LINE, MESH_LINE
 from tetopt.system.files import check_suffix, save_bytes

@@ -14,8 +14,8 @@ from tetopt.job.events import note
 from tetopt.measure.fidelity import image_fit
 from tetopt.measure.quality import Quality, quality
 from tetopt.model.fields import cell_fields
-from tetopt.study.child import run_in_child
 from tetopt.study.options import BaselineOptions
+from tetopt.study.pipeline_process import run_in_child
 from tetopt.study.pipelines import PIPELINES, PipelineInput
 from tetopt.system.files import check_output, save_json
 

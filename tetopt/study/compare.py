@@ -41,8 +41,8 @@ from tetopt.model.averages import element_young, young_image
 from tetopt.model.mappings import ModulusMapping
 from tetopt.report.summary import versions
 from tetopt.study import compare_report as records
-from tetopt.study.child import Outcome, run_in_child
 from tetopt.study.compare_report import Measurement, Report, Settings
+from tetopt.study.pipeline_process import Outcome, run_in_child
 from tetopt.study.pipelines import PIPELINES, UNTIMED_STEPS, Pipeline, PipelineInput
 from tetopt.study.program import pipelines_with
 

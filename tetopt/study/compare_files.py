@@ -16,7 +16,7 @@ from tetopt.job.events import note
 from tetopt.job.inputs import check_outputs, label_table
 from tetopt.measure.segmentation import threshold_image
 from tetopt.model.fields import cell_fields
-from tetopt.model.labels import table_of_labels
+from tetopt.model.label_names import table_of_labels
 from tetopt.model.mappings import parse_mapping
 from tetopt.report.figures import save_figure
 from tetopt.study import compare

@@ -9,7 +9,7 @@ from tetopt.fem.reference import Errors, OwnError
 from tetopt.measure.fidelity import LabelFidelity
 from tetopt.measure.quality import Quality
 from tetopt.model.averages import DEFAULT_AVERAGE
-from tetopt.study.interfaces import OTSU_CLASSES
+from tetopt.study.isosurfaces import OTSU_CLASSES
 from tetopt.study.pipelines import PIPELINES
 from tetopt.study.program import Program
 

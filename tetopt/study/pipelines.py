@@ -23,7 +23,7 @@ from tetopt.image import Image
 from tetopt.measure.segmentation import threshold_image
 from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice_mesh
-from tetopt.study.interfaces import OTSU_CLASSES, interfaces
+from tetopt.study.isosurfaces import OTSU_CLASSES, interfaces
 from tetopt.study.mmg import remesh_image
 from tetopt.study.search import LEAST_REQUEST, REQUEST_RESPONSE, corners_for, tries
 from tetopt.study.tetwild import Filled, fill_image, node_spacing
@@ -144,7 +144,7 @@ def pytetwild(job: PipelineInput) -> Produced:
     Raises
     ------
     InputError
-        As `tetopt.study.interfaces.interfaces` and `tetopt.study.tetwild.fill_image`.
+        As `tetopt.study.isosurfaces.interfaces` and `tetopt.study.tetwild.fill_image`.
     """
     seconds: dict[str, float] = {}
     size = node_spacing(job.image, corners_for(job.nodes, job.order))

@@ -32,7 +32,7 @@ from tetopt.io.text import last_line
 from tetopt.mesh import Mesh
 from tetopt.model.file import MeshFile
 from tetopt.study.endings import Crashed
-from tetopt.study.interfaces import class_labels
+from tetopt.study.isosurfaces import class_labels
 from tetopt.study.pipelines import PIPELINES, Pipeline, PipelineInput, Produced
 from tetopt.study.search import LEAST_REQUEST, REQUEST_RESPONSE, corners_for, is_near, tries
 from tetopt.study.tetwild import node_spacing, put_on_box

@@ -34,7 +34,7 @@ from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice_mesh
 from tetopt.study.endings import import_peer
-from tetopt.study.interfaces import Surfaces, compact_points
+from tetopt.study.isosurfaces import Surfaces, compact_points
 from tetopt.study.search import Response, corners_for, is_near, tries
 
 TETWILD_RUNS = 6  # of one search, at most; each takes about as long as the result's

@@ -29,9 +29,9 @@ from tetopt.engine.meshing import (
 from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import squared_edges
 from tetopt.job.events import KERNEL_WORDS, ended_words, note, progress, start_stage, time_words
-from tetopt.job.model import check_early, keep_early
 from tetopt.job.options import SolverOptions, has_model
 from tetopt.job.plan import kind_of
+from tetopt.job.solver_files import check_early, keep_early
 from tetopt.job.task import Meshed, Task
 from tetopt.job.write import model_with
 from tetopt.measure.fidelity import cell_labels

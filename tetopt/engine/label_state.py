@@ -23,7 +23,7 @@ from tetopt.engine.labelling import (
     mend_labels,
     unfit_labels,
 )
-from tetopt.engine.surface import MOST_MEETING, insert_label
+from tetopt.engine.sliding import MOST_MEETING, insert_label
 from tetopt.geometry.manifold import OUTSIDE_LABEL, pinches
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import facets

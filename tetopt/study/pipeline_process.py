@@ -1,10 +1,10 @@
 """A pipeline in a separate process: its memory is separate, and a crash or runaway ends only the
 process.
 
-The child is ``python -m tetopt.study.child FOLDER``; job and result are files in a temporary
-folder. The parent watches the resident memory of the child and its processes instead of setting
-RLIMIT_AS: numba, VTK and the allocators reserve far more address space than they use, so such a
-limit would end runs that need little memory.
+The child is ``python -m tetopt.study.pipeline_process FOLDER``; job and result are files in a
+temporary folder. The parent watches the resident memory of the child and its processes instead of
+setting RLIMIT_AS: numba, VTK and the allocators reserve far more address space than they use, so
+such a limit would end runs that need little memory.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ def _run_once(
     with tempfile.TemporaryDirectory(prefix="tetopt-") as name:
         folder = Path(name)
         (folder / "job.pickle").write_bytes(pickle.dumps((pipeline, job)))
-        command = python_command("-m", "tetopt.study.child", str(folder))
+        command = python_command("-m", "tetopt.study.pipeline_process", str(folder))
         with open(folder / "stderr.txt", "wb") as errors:
             environment = python_environment(TMPDIR=name)
             with start_child(

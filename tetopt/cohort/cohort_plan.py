@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from tetopt.cohort.layout import mesh_name, numbers_path
 from tetopt.cohort.options import CohortOptions
-from tetopt.cohort.state import SubjectState, state_of
+from tetopt.cohort.subject_states import SubjectState, state_of
 from tetopt.cohort.subjects import (
     FILE_OPTIONS,
     Problems,

@@ -27,7 +27,7 @@ from tetopt.model.averages import DEFAULT_AVERAGE, parse_average
 from tetopt.model.build import Choices, model_of_file
 from tetopt.model.fields import cell_fields, is_result
 from tetopt.model.file import MeshFile
-from tetopt.model.labels import TABLE_TEXT, labels_of, table_of_words
+from tetopt.model.label_names import TABLE_TEXT, labels_of, table_of_words
 from tetopt.model.loads import FACET_FORCES, check_steps, known_set, parse_load
 from tetopt.model.mappings import MAPPED_OPTIONS, named_file, parse_any_mapping
 from tetopt.model.materials import Spacing
