@@ -199,7 +199,7 @@ def test_a_mesh_of_nested_shells_is_as_thick_as_its_voxels():
     (shell,) = [
         each for each in label_contacts(labels, result.mesh, result.labels) if each.labels == (1, 2)
     ]
-    assert shell.mesh_mm2 == pytest.approx(4.0 * np.pi * 10.0**2, rel=0.02)
+    assert shell.mesh_mm2 == pytest.approx(4.0 * np.pi * 10.0**2, rel=0.035)
     assert shell.ratio == pytest.approx(1.0, abs=0.05)
 
 
