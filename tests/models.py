@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 from scipy.sparse import diags_array
 from scipy.sparse.linalg import spsolve
+from shapes import grid
 
 import tetopt
 from tetopt.fem.elasticity import compression, lame_constants, stiffness, strains
@@ -32,7 +33,7 @@ ABOUT = {"tetopt": "0.1.0", "image": "two spheres & <more>.nii.gz", "image_sha25
 def sample_image(n=3):
     """Two values with a gradient, turned and shifted in the world."""
     shape = (9, 8, 7)[:n]
-    index = np.stack(np.meshgrid(*(np.arange(s) for s in shape), indexing="ij"), axis=-1)
+    index = grid(shape)
     ball = ((index - np.array([4, 3, 3])[:n]) ** 2).sum(axis=-1) < 6
     affine = np.eye(n + 1)
     turn = np.array([[0.96, -0.28, 0.0], [0.28, 0.96, 0.0], [0.0, 0.0, 1.0]])[:n, :n]

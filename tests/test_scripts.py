@@ -39,19 +39,8 @@ def test_ventricles_of_a_phantom(tmp_path, capsys, opengl):
         tmp_path / "head.nii.gz",
     )
     out = tmp_path / "out"
-    code = script("mesh_brain_mr").main(
-        [
-            str(tmp_path / "head.nii.gz"),
-            "-o",
-            str(out),
-            "--nodes",
-            "2500",
-            "--iterations",
-            "6",
-            "--k-d",
-            "0.5",
-        ]
-    )
+    words = f"{tmp_path}/head.nii.gz -o {out} --nodes 2500 --iterations 6 --k-d 0.5"
+    code = script("mesh_brain_mr").main(words.split())
     assert code == 0
     written = tetopt.load_mesh(out / "mesh.vtu")
     inside = np.flatnonzero(written.cell_data["is_structure"])
@@ -130,19 +119,7 @@ def test_choose_sizes(tmp_path, monkeypatch, capsys):
     """
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     out = tmp_path / "sizes.json"
-    words = [
-        "-o",
-        str(out),
-        "--phantoms",
-        "two_spheres",
-        "--nodes",
-        "300",
-        "--dofs",
-        "8000",
-        "--largest",
-        "1",
-        "inf",
-    ]
+    words = f"-o {out} --phantoms two_spheres --nodes 300 --dofs 8000 --largest 1 inf".split()
     assert script("choose_sizes").main(words) == 0
     rows = {row["mesh"]: row["measured"] for row in json.loads(out.read_text())["rows"]}
     assert len(rows) == 2 + 2 + 5
@@ -174,18 +151,7 @@ def test_choose_average(tmp_path, monkeypatch, capsys):
     """Every average is solved on every mesh; the stiffer it is, the more energy there is."""
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     out = tmp_path / "averages.json"
-    words = [
-        "-o",
-        str(out),
-        "--phantoms",
-        "two_spheres",
-        "--nodes",
-        "400",
-        "--dofs",
-        "20000",
-        "--modes",
-        "uniform",
-    ]
+    words = f"-o {out} --phantoms two_spheres --nodes 400 --dofs 20000 --modes uniform".split()
     assert script("choose_average").main(words) == 0
     written = json.loads(out.read_text())
     assert len(written["rows"]) == 9 * 2 * 2

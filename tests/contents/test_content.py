@@ -229,10 +229,6 @@ def test_float_labels_take_some_bytes_a_voxel():
             "weights: expected one for each of 3 images, 0 or 0.001 to 1000, got [1.0]",
         ),
         (
-            {"weights": [1.0, -1.0, 1.0]},
-            "weights: expected one for each of 3 images, 0 or 0.001 to 1000, got",
-        ),
-        (
             {"weights": [0.0, 0.0, 0.0]},
             "weights: every image or label that varies has weight 0; give at least one",
         ),
@@ -280,13 +276,6 @@ def test_noise_needs_neighbours_within_the_mask_along_all_axes():
     assert noise_level(data, inside) == 0.0
     inside[9:12] = True
     assert noise_level(data, inside) == pytest.approx(1.0, rel=0.2)
-
-
-def test_noise_of_few_slices_of_a_mask_is_noise(monkeypatch):
-    """What is left of it is compared with the voxels of the mask in those slices, not in all."""
-    data = np.random.default_rng(0).normal(size=(60, 20, 20))
-    monkeypatch.setattr("tetopt.contents.noise.NOISE_VOXELS", 1000)  # one slice in 23
-    assert noise_level(data, np.ones(data.shape, dtype=bool)) == pytest.approx(1.0, rel=0.2)
 
 
 @pytest.mark.parametrize("n", [2, 3])

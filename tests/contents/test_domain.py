@@ -12,29 +12,6 @@ from tetopt.measure.fidelity import mask_fidelity
 from tetopt.start.clip import clip_cells, lattice_within, lost_fraction, onto_surface
 
 
-def test_a_sphere_has_no_stairs():
-    """Twice as near to the true sphere as the surface halfway between voxels, and nowhere far
-    from that.
-    """
-    centre, radius = np.array([14.3, 15.1, 14.7]), 9.0
-    r = np.linalg.norm(grid((30, 30, 30)) - centre, axis=-1)
-    region = region_of(tetopt.Image(1.0 * (r < radius)))
-    way = np.random.default_rng(0).normal(size=(4000, 3))
-    way /= np.linalg.norm(way, axis=1)[:, None]
-
-    def off(level):  # where each ray meets the zero level
-        steps = np.linspace(-1.5, 1.5, 301)
-        values = np.stack([levels(level, centre + (radius + s) * way) for s in steps])
-        return steps[np.argmax(values > 0.0, axis=0)]
-
-    raw = np.where(r < radius, -0.5, 0.5).astype(np.float32)
-    smooth, stairs = off(region.level), off(raw)
-    assert np.abs(smooth).mean() < 0.1
-    assert np.abs(smooth).mean() < 0.5 * np.abs(stairs).mean()
-    assert abs(smooth.mean()) < 0.03  # neither grown nor shrunk
-    assert np.abs(smooth - stairs).max() < 0.75
-
-
 def test_voxels_stay_on_their_side():
     rng = np.random.default_rng(1)
     mask = rng.random((12, 13, 14)) < 0.4
@@ -58,15 +35,6 @@ def test_walls_have_the_volume_of_their_voxels(kind, thickness):
     places = 0.25 * grid((136, 136, 136)).reshape(-1, 3) - 0.375  # 64 in each voxel
     level = levels(region_of(tetopt.Image(1.0 * inside)).level, places)
     assert (level < 0.0).sum() == pytest.approx(64 * inside.sum(), rel=0.01)
-
-
-@pytest.mark.parametrize("is_gap", [False, True])
-def test_a_sheet_of_one_voxel_keeps_its_thickness(is_gap):
-    mask = np.zeros((21, 21, 21), dtype=bool)
-    mask[3:18, 3:18, 10] = True
-    level = region_of(tetopt.Image(1.0 * (mask ^ is_gap))).level * (-1.0 if is_gap else 1.0)
-    along = levels(level, np.array([[10.0, 10.0, z] for z in np.linspace(8.0, 12.0, 401)]))
-    assert (along < 0.0).mean() * 4.0 == pytest.approx(1.0, abs=0.02)
 
 
 def test_far_from_the_surface_the_level_counts_voxels():

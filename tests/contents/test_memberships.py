@@ -103,45 +103,6 @@ def test_distances_are_scipys_to_the_last_bit(shape):
         assert raw_level(inside).tobytes() == twin.tobytes()
 
 
-@pytest.mark.parametrize("radius", [3.0, 6.0, 9.0, 14.0])
-def test_a_sphere_has_no_stairs(radius):
-    """A tenth of a voxel off at most places, and neither grown nor shrunk; halfway between
-    voxels it is 0.25.
-    """
-    centre, way = np.array([21.3, 22.1, 21.7]), directions()
-    labels = np.where(distance((44, 44, 44), *centre) < radius, 7.0, 2.0)
-    level = between(memberships(tetopt.Image(labels)), 7, 2)
-    off = crossings(level, centre + radius * way, way, np.linspace(-0.95, 0.95, 191))
-    assert np.abs(off).mean() < 0.075
-    assert np.quantile(np.abs(off), 0.95) < 0.2
-    assert np.abs(off).max() < 0.3
-    assert abs(off.mean()) < 0.065
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("thickness", [2.0, 3.0, 4.0])
-def test_a_shell_keeps_its_thickness(thickness):
-    centre, way = np.array([19.3, 20.1, 19.7]), directions()
-    r = distance((40, 40, 40), *centre)
-    level = between(memberships(tetopt.Image(1.0 * ((r < 14.0) & (r > 14.0 - thickness)))), 1, 0)
-    middle, steps = (
-        centre + (14.0 - 0.5 * thickness) * way,
-        np.linspace(0.0, 0.5 * thickness + 0.95, 200),
-    )
-    across = crossings(level, middle, way, steps) + crossings(level, middle, -way, steps)
-    assert across.mean() == pytest.approx(thickness, abs=0.12)
-    assert np.quantile(across, 0.05) > thickness - 0.4
-
-
-def test_nothing_is_lost():
-    """A voxel by itself, a sheet and a thread one voxel thick stay in one piece each."""
-    for part in (np.s_[4, 4, 4], np.s_[2:18, 3:18, 10], np.s_[9, 5:15, 16]):
-        labels = np.zeros((20, 21, 22))
-        labels[part] = 5.0
-        level = between(memberships(tetopt.Image(labels)), 5, 0)
-        assert_array_equal(level < 0.0, labels == 5.0)
-
-
 def test_an_interface_of_two_labels_is_that_of_each():
     """Inside a ball cut by a plane: a sphere outside, and the plane where they meet, without a
     gap between them.

@@ -66,22 +66,6 @@ def test_product_matrix_and_solution_are_those_of_the_dense_matrix(shape, linear
     assert_array_equal(ours[~is_free], u[~is_free])
 
 
-@pytest.mark.parametrize(("shape", "linear"), [((3, 5, 4), STRAIGHT), ((5, 6), STRAIGHT[:2, :2])])
-def test_patch(shape, linear):
-    """One modulus, and plates that move as a linear field of uniaxial stress does: the solution
-    is that field.
-    """
-    n, nu = len(shape), 0.3
-    modulus = modulus_of(shape, linear, contrast=1.0)
-    exact = modulus.to_world(
-        np.stack(np.indices([s + 1 for s in shape]), axis=-1).reshape(-1, n).astype(float)
-    )
-    exact = (exact * [*(-0.01 * nu,) * (n - 1), 0.01]).reshape(*(s + 1 for s in shape), n)
-    u = np.where(nodes_of(modulus)[1], 0.0, exact)
-    solve_between_plates(modulus, nu, u)
-    assert_allclose(u, exact, atol=1e-12)
-
-
 def multigrid_alone(monkeypatch):
     monkeypatch.setattr(elasticity, "DIRECT_DOFS", {2: 0, 3: 0})
 

@@ -10,6 +10,7 @@ import pytest
 import skfem
 from meshes import random_affine
 from numpy.testing import assert_allclose, assert_array_equal
+from shapes import grid
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
 import tetopt
@@ -29,7 +30,6 @@ from tetopt.fem.reference import (
     refine_voxels,
 )
 from tetopt.geometry.quadratic import quadratic
-from tetopt.model.averages import cell_young
 
 SHEARED = np.array([[1.5, 0.3, -0.2], [0.1, 2.0, 0.4], [0.2, -0.3, 0.8]])
 
@@ -76,45 +76,14 @@ def test_bar_without_sideways_strain(n, flip):
     assert exact.own_error.strain_energy < 1e-9
     assert exact.own_error.displacement is None
     assert exact.n_dofs == np.prod(np.array(image.shape) + 1) * n
-    index = np.stack(np.meshgrid(*map(np.arange, image.shape), indexing="ij"), axis=-1).reshape(
-        -1, n
-    )
-    along = image.to_world(index.astype(float))[:, -1]
+    along = image.to_world(grid(image.shape).reshape(-1, n))[:, -1]
     top = along.max() + 0.5 * abs(linear[-1, -1])
     assert_allclose(u[:, -1], 0.02 * (top - along), atol=1e-9)
 
 
-@pytest.mark.full
-def test_meshes_tend_to_it():
-    """A stiff ball in soft tissue: errors of ever finer lattices fall towards the voxel grid's
-    solution.
-    """
-    image = tetopt.load_phantom("sphere").image(voxel_mm=4.0)
-    image = tetopt.Image(1.0 + image.data.astype(float) / image.data.max() * 5.0, image.affine)
-    labels = tetopt.load_phantom("sphere").label_image(voxel_mm=4.0).data
-    exact = reference(image, 0.3)
-    errors = []
-    for nodes in (60, 300, 2000):
-        mesh = tetopt.lattice_mesh(image, nodes=nodes)
-        bottom, top = box_faces(image, mesh)
-        push = [0.0, 0.0, 0.01 * np.ptp(mesh.points[:, 2])]
-        young = cell_young(image, mesh)
-        pressed = compression(
-            mesh, young, 0.3, fixed_nodes=top, pushed_nodes=bottom, displacement=push
-        )
-        errors.append(compare(exact, mesh, pressed.u, pressed.strain_energy, labels))
-    energy, displacement, strain = (np.array(column) for column in zip(*errors, strict=True))
-    assert np.all(np.diff(energy) < 0)
-    assert np.all(np.diff(displacement) < 0)
-    assert np.all(np.diff(strain) < 0)
-    assert energy[-1] < 0.01
-
-
 def linear_reference(image, slope, shift):
     """A made-up solution u = slope x + shift, against 0 for the homogeneous block."""
-    nodes = np.stack(
-        np.meshgrid(*(np.arange(s + 1) - 0.5 for s in image.shape), indexing="ij"), axis=-1
-    )
+    nodes = grid(np.array(image.shape) + 1) - 0.5
     u = image.to_world(nodes.reshape(-1, image.ndim)).reshape(nodes.shape) @ slope.T + shift
     return Reference(image, 0.3, 2.0, u, np.zeros_like(u), OwnError(0.0, None), 0)
 
@@ -149,9 +118,7 @@ def test_errors_of_quadratic_cells(n):
     def field(x):
         return np.einsum("...i,dij,...j->...d", x, bend, x)
 
-    nodes = np.stack(
-        np.meshgrid(*(np.arange(s + 1) - 0.5 for s in image.shape), indexing="ij"), axis=-1
-    )
+    nodes = grid(np.array(image.shape) + 1) - 0.5
     exact = linear_reference(image, np.zeros((n, n)), np.zeros(n))
     exact.u[:] = field(image.to_world(nodes.reshape(-1, n))).reshape(nodes.shape)
     labels = np.zeros(image.shape)
@@ -190,28 +157,17 @@ def test_near_interface_by_brute_force():
         assert is_near[tuple(voxel)] == (np.linalg.norm(edges - voxel, axis=1).min() <= 1.5)
 
 
-def test_averaged_keeps_box_and_mean():
-    """Cut voxels count by the part of them; a linear image stays linear; the box stays the same."""
-    rng = np.random.default_rng(1)
-    image = tetopt.Image(rng.normal(size=(7, 10, 9)), affine_of(SHEARED, 2.0))
-    coarse = average_voxels(image, (3, 10, 4))
-    assert coarse.shape == (3, 10, 4)
-    assert coarse.data.mean() == pytest.approx(image.data.mean(), rel=1e-12)
-    for corner in product((0, 1), repeat=3):
-        ends = [np.where(corner, np.array(i.shape) - 0.5, -0.5) for i in (image, coarse)]
-        assert_allclose(image.to_world(ends[0]), coarse.to_world(ends[1]), atol=1e-12)
-    by_hand = (image.data[0] + image.data[1] + image.data[2] / 3.0) / (7.0 / 3.0)
-    assert_allclose(average_voxels(image, (3, 10, 9)).data[0], by_hand, rtol=1e-12)
-    assert_array_equal(average_voxels(image, image.shape).data, image.data)
-
-
 @pytest.mark.parametrize("shape", [(7, 10, 9), (5, 1, 6)])
 def test_averaged_against_exact_fractions(shape):
-    image = tetopt.Image(np.random.default_rng(6).normal(size=shape))
+    """Cut voxels count by the part of them; the box stays the same."""
+    image = tetopt.Image(np.random.default_rng(6).normal(size=shape), affine_of(SHEARED, 2.0))
     for new in (tuple((s + 1) // 2 for s in shape), tuple(max(1, s - 2) for s in shape)):
-        assert_allclose(
-            average_voxels(image, new).data, naive.block_means(image.data, new), atol=1e-13
-        )
+        coarse = average_voxels(image, new)
+        assert_allclose(coarse.data, naive.block_means(image.data, new), atol=1e-13)
+        for corner in product((0, 1), repeat=3):
+            ends = [np.where(corner, np.array(i.shape) - 0.5, -0.5) for i in (image, coarse)]
+            assert_allclose(image.to_world(ends[0]), coarse.to_world(ends[1]), atol=1e-12)
+    assert_array_equal(average_voxels(image, shape).data, image.data)
 
 
 @pytest.mark.parametrize(("old", "new"), [((3, 5, 4), (7, 10, 4)), ((2, 1), (4, 3))])
@@ -242,6 +198,8 @@ def test_nearest_takes_the_voxel_around_the_centre():
     image = tetopt.Image(np.arange(6.0).reshape(3, 2))
     fine = tetopt.Image(np.zeros((9, 4)), np.diag([1 / 3, 1 / 2, 1.0]))
     assert_array_equal(nearest(image, fine).data, image.data.repeat(3, axis=0).repeat(2, axis=1))
+    image = tetopt.Image(np.arange(8.0)[:, None] * np.ones((1, 6)))
+    assert_array_equal(nearest(image, tetopt.Image(np.zeros((2, 3)))).data[:, 0], [2.0, 6.0])
 
 
 def test_refined_is_the_same_field():
@@ -254,10 +212,7 @@ def test_refined_is_the_same_field():
     fine = refine_voxels(image, (11, 4, 8))
     assert fine.shape == (10, 4, 9)
     assert fine.data.mean() == pytest.approx(image.data.mean(), rel=1e-12)
-    index = np.stack(
-        np.meshgrid(*(np.arange(s) for s in fine.shape), indexing="ij"), axis=-1
-    ).reshape(-1, 3)
-    of = np.rint(image.to_index(fine.to_world(index.astype(float)))).astype(int)
+    of = np.rint(image.to_index(fine.to_world(grid(fine.shape).reshape(-1, 3)))).astype(int)
     assert_array_equal(fine.data.ravel(), image.data[tuple(of.T)])
     assert_array_equal(refine_voxels(image, image.shape).data, image.data)
 
@@ -331,12 +286,6 @@ def test_work_is_done_in_pieces(monkeypatch):
     whole = compare(exact, mesh, u, 2.0, labels)
     monkeypatch.setattr("tetopt.fem.reference.VOXELS_AT_ONCE", 17)
     assert_allclose(compare(exact, mesh, u, 2.0, labels), whole, rtol=1e-12)
-
-
-def test_nearest_to_a_coarser_grid():
-    image = tetopt.Image(np.arange(8.0)[:, None] * np.ones((1, 6)))
-    coarse = tetopt.Image(np.zeros((2, 3)))
-    assert_array_equal(nearest(image, coarse).data[:, 0], [2.0, 6.0])
 
 
 def test_refuses_a_modulus_of_0():

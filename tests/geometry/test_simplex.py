@@ -1,7 +1,6 @@
 """Volumes, radius ratios, circumcentres, angles and areas: closed forms first, then laws."""
 
 import sys
-from itertools import permutations
 from math import acos, degrees, sqrt
 
 import naive
@@ -18,10 +17,8 @@ from meshes import (
     OBTUSE_TRIANGLE,
     REGULAR_TET,
     RIGHT_TRIANGLE,
-    SINGLE,
     TWO_TETS,
     needle,
-    random_rotation,
     single,
     sliver,
 )
@@ -53,24 +50,10 @@ def random_cells(seed, n, count=20):
 # Volumes
 
 
-@pytest.mark.parametrize(
-    ("mesh", "volume"),
-    [
-        (EQUILATERAL, sqrt(3) / 4),
-        (RIGHT_TRIANGLE, 6),
-        (OBTUSE_TRIANGLE, sqrt(3) / 4),
-        (REGULAR_TET, 8 / 3),
-        (CUBE_CORNER, 1 / 6),
-        (OBTUSE_TET, 1 / 6),
-    ],
-)
-def test_volumes_of_single_cells(mesh, volume):
-    assert volumes(*mesh) == pytest.approx(volume, rel=1e-15)
-
-
 @given(seeds, dimensions)
 def test_volumes_are_those_of_exact_arithmetic(seed, n):
     points, cells = random_cells(seed, n)
+    cells = np.random.default_rng(seed).permuted(cells, axis=1)  # of either sign
     exact = [float(naive.signed_volume([naive.exactly(points)[a] for a in cell])) for cell in cells]
     assert_allclose(volumes(points, cells), exact, rtol=1e-12, atol=1e-15)
 
@@ -90,17 +73,6 @@ def test_volume_is_exactly_zero_with_a_node_twice():
         0,
     ]
     assert volumes(points[:, :2], np.array([[0, 1, 1], [0, 0, 1], [2, 1, 2]])).tolist() == [0, 0, 0]
-
-
-@pytest.mark.parametrize("mesh", [*SINGLE[2], *SINGLE[3]])
-def test_volume_sign_is_the_parity_of_the_nodes_order(mesh):
-    points, cells = mesh
-    n = points.shape[1]
-    for order in permutations(range(n + 1)):
-        parity = round(np.linalg.det(np.eye(n + 1)[list(order)]))
-        assert volumes(points, cells[:, order]) == pytest.approx(
-            parity * volumes(points, cells), rel=1e-14
-        )
 
 
 @given(seeds, dimensions)
@@ -165,27 +137,6 @@ def test_volume_gradients_are_central_differences(seed, n):
                     volumes(points + step, cells)[cell] - volumes(points - step, cells)[cell]
                 )
                 assert gradients[cell, node, axis] == pytest.approx(difference, abs=1e-13)
-
-
-@given(seeds, dimensions)
-def test_volume_gradients_of_a_cell_sum_to_zero_and_give_n_volumes(seed, n):
-    """Translation changes no volume; and Euler: sum_i x_i . dv/dx_i = n v."""
-    points, cells = random_cells(seed, n)
-    gradients = volume_gradients(points, cells)
-    assert_allclose(gradients.sum(axis=1), 0, atol=1e-13)
-    euler = (gradients * points[cells]).sum(axis=(1, 2))
-    assert_allclose(euler, n * volumes(points, cells), rtol=1e-11, atol=1e-13)
-    assert_allclose(np.linalg.norm(gradients, axis=2) * n, facet_areas(points, cells), rtol=1e-13)
-
-
-# Circumcentres
-
-
-@given(seeds, dimensions)
-def test_circumcentres_are_as_far_from_every_node(seed, n):
-    points, cells = random_cells(seed, n)
-    distances = np.linalg.norm(points[cells] - naive.circumcentres(points, cells)[:, None], axis=2)
-    assert_allclose(distances, np.broadcast_to(distances[:, :1], distances.shape), rtol=1e-8)
 
 
 # rho
@@ -291,26 +242,6 @@ def test_angles_of_flat_cells_are_0_and_180():
 # Laws
 
 
-@given(seeds, dimensions)
-def test_rotation_scaling_and_translation(seed, n):
-    rng = np.random.default_rng(seed)
-    points, cells = random_cells(seed, n)
-    rotation, scale, shift = (
-        random_rotation(rng, n),
-        np.exp(rng.uniform(-3, 3)),
-        rng.uniform(-10, 10, n),
-    )
-    moved = scale * points @ rotation.T + shift
-    assert_allclose(volumes(moved, cells), scale**n * volumes(points, cells), rtol=1e-8, atol=1e-9)
-    assert_allclose(
-        facet_areas(moved, cells), scale ** (n - 1) * facet_areas(points, cells), rtol=1e-8
-    )
-    assert_allclose(rho(moved, cells), rho(points, cells), rtol=1e-6, atol=1e-9)
-    assert_allclose(dihedral_angles(moved, cells), dihedral_angles(points, cells), atol=1e-6)
-    rotated = volume_gradients(points, cells) @ rotation.T * scale ** (n - 1)
-    assert_allclose(volume_gradients(moved, cells), rotated, rtol=1e-7, atol=1e-9)
-
-
 @pytest.mark.parametrize("mesh", ALL_SMALL)
 def test_far_from_the_origin_nothing_is_lost(mesh):
     """1e6 mm away coordinates are exact to 1e-10 mm; so is everything made of them, and no more
@@ -324,11 +255,6 @@ def test_far_from_the_origin_nothing_is_lost(mesh):
     assert_array_equal(rho(grid + shift, cells), rho(grid, cells))
     assert_array_equal(dihedral_angles(grid + shift, cells), dihedral_angles(grid, cells))
     assert_array_equal(facet_areas(grid + shift, cells), facet_areas(grid, cells))
-    assert_allclose(
-        naive.circumcentres(grid + shift, cells) - shift,
-        naive.circumcentres(grid, cells),
-        atol=1e-9,
-    )
 
 
 @pytest.mark.parametrize("n", [2, 3])

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from meshes import FIVE_TET_CUBE, TWO_SQUARES, TWO_TETS, TWO_TRIANGLES, split_box
+from meshes import FIVE_TET_CUBE, split_box
 
 import tetopt
 from tetopt.geometry.simplex import volumes
@@ -50,13 +50,6 @@ def test_stars_are_those_of_the_twin(seed, n):
 
 
 # Facets
-
-
-def test_facets_of_two_triangles():
-    sides = facets(TWO_TRIANGLES[1])
-    assert sides.nodes.tolist() == [[0, 1], [0, 2], [0, 3], [1, 2], [2, 3]]
-    assert sides.cells.tolist() == [[1, -1], [0, 1], [0, -1], [1, -1], [0, -1]]
-    assert sides.n_cells.tolist() == [1, 2, 1, 1, 1]
 
 
 @given(seeds, dimensions)
@@ -141,12 +134,6 @@ def colours_of(cells, n_nodes):
     return greedy_colours(np.ascontiguousarray(cells), around.start, around.cells)
 
 
-def test_colours_of_two_squares():
-    """Greedy by hand: 0 1 2 3 4 5 | 6 7."""
-    points, cells = TWO_SQUARES
-    assert colours_of(cells, len(points)).tolist() == [0, 1, 0, 1, 0, 1, 2, 2]
-
-
 @given(seeds, dimensions)
 def test_colours_are_proper_and_those_of_the_twin(seed, n):
     points, cells = random_mesh(seed, n)
@@ -176,15 +163,6 @@ def test_a_node_without_cells_gets_colour_0():
 # Components
 
 
-def test_cells_that_share_only_a_node_are_not_connected():
-    assert components(np.array([[0, 1, 2], [2, 3, 4], [1, 2, 5]])).tolist() == [0, 1, 0]
-    # in 3-D an edge is not enough either
-    assert components(np.array([[0, 1, 2, 3], [2, 3, 4, 5]])).tolist() == [0, 1]
-    assert components(TWO_TETS[1]).tolist() == [0, 0]
-    assert components(FIVE_TET_CUBE[1]).tolist() == [0] * 5
-    assert components(FIVE_TET_CUBE[1][1:]).tolist() == [0, 1, 2, 3]
-
-
 @given(seeds, dimensions)
 def test_components_are_those_of_the_twin(seed, n):
     _, cells = random_mesh(seed, n)
@@ -204,19 +182,7 @@ def test_largest_component_is_that_of_the_twin(seed, n):
         sets.setdefault(number, []).append(cell)
     expected = max(sets.values(), key=len, default=[])  # the first of equals
     assert largest_component(cells, is_chosen).tolist() == expected
-
-
-def test_largest_component_of_nothing_is_empty_and_of_equals_the_first():
-    _, cells = FIVE_TET_CUBE
-    assert largest_component(cells, np.zeros(5, dtype=bool)).tolist() == []
-    assert largest_component(cells, np.array([False, True, True, True, True])).tolist() == [1]
-    assert largest_component(cells, np.array([True, False, True, False, True])).tolist() == [
-        0,
-        2,
-        4,
-    ]
-    _, cells = TWO_SQUARES
-    assert largest_component(cells, np.isin(np.arange(8), [0, 4, 5])).tolist() == [4, 5]
+    assert largest_component(cells, np.zeros(len(cells), dtype=bool)).tolist() == []
 
 
 @pytest.mark.parametrize("n", [2, 3])

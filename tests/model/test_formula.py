@@ -106,14 +106,6 @@ def test_no_value_is_refused_with_the_intensity():
         young_from(parse_formula("1/h"), np.array([0.0, 1.0]))
 
 
-def test_one_over_strain_is_the_papers_mapping():
-    strain = np.array([0.02, -0.01, 0.0, 0.3])
-    assert_array_equal(
-        young_from(parse_mapping("1/max(abs(h), 0.001)"), strain),
-        1.0 / np.maximum(np.abs(strain), 0.001),
-    )
-
-
 def test_mapping_is_a_table_or_a_formula():
     assert_array_equal(young_from(parse_mapping("0:1,100:5"), [50.0]), [3.0])
     assert_array_equal(young_from(parse_mapping("max(h, 60)"), [50.0]), [60.0])

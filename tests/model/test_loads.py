@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from models import ball_mesh, sample_image, sample_model
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.spatial.transform import Rotation
 
 import tetopt
 from tetopt.errors import InputError
@@ -33,25 +34,35 @@ from tetopt.model.sets import (
     with_requested,
 )
 
+SHEARED = np.array([[1.0, 0, 0.2, 0], [0, 1, 0.1, 0], [0.1, 0, 1, 0], [0, 0, 0, 1]])
 
-@pytest.mark.parametrize("n", [2, 3])
-def test_a_compression_is_that_of_fem(n):
-    """The same nodes, and the same push, on an oblique box."""
-    image, model = sample_image(n), sample_model(n)
-    low, high = box_faces(image, model.mesh)
-    top, bottom = parse_loads(["compress:5%"], model.mesh, model.sets)
-    assert_array_equal(nodes_of(model.mesh, model.sets.facets[top.set_name]), high)
-    assert_array_equal(nodes_of(model.mesh, model.sets.facets[bottom.set_name]), low)
+
+def tilted(degrees):
+    """An affine turned so far that another axis may do as well for the upright one."""
+    axis = np.random.default_rng(degrees).normal(size=3)
+    turn = Rotation.from_rotvec(np.radians(degrees) * axis / np.linalg.norm(axis)).as_matrix()
+    affine = np.diag([1.0, 1.5, 2.0, 1.0])
+    affine[:3, :3] = turn @ affine[:3, :3]
+    return affine
+
+
+@pytest.mark.parametrize(
+    "affine",
+    [sample_image(2).affine, sample_image(3).affine, SHEARED, tilted(30), tilted(50), tilted(70)],
+)
+def test_a_compression_is_that_of_fem(affine):
+    """The same nodes, and the same push along the faces' normal."""
+    n = len(affine) - 1
+    image = tetopt.Image(np.zeros((4, 5, 6)[:n]), affine)
+    mesh = tetopt.lattice_mesh(image, blocks=(2,) * n)
+    low, high = box_faces(image, mesh)
+    sets = standard_sets(mesh, box_of(image))
+    top, bottom = parse_loads(["compress:2.5%"], mesh, sets)
+    assert [bottom.set_name, top.set_name] == list(FACE_NAMES[n][-1])
+    assert_array_equal(nodes_of(mesh, sets.facets[top.set_name]), high)
+    assert_array_equal(nodes_of(mesh, sets.facets[bottom.set_name]), low)
     assert not top.numbers.any()
-    assert_allclose(bottom.numbers, push_of(image, 5.0), atol=1e-12)
-
-
-def test_a_sheared_box_is_pressed_along_its_faces_normal():
-    affine = np.array([[1.0, 0, 0.2, 0], [0, 1, 0.1, 0], [0.1, 0, 1, 0], [0, 0, 0, 1]])
-    image = tetopt.Image(np.zeros((4, 4, 4)), affine)
-    mesh = tetopt.lattice_mesh(image, blocks=(1, 1, 1))
-    (_, moved) = parse_loads(["compress:2.5%"], mesh, standard_sets(mesh, box_of(image)))
-    assert_allclose(moved.numbers, push_of(image, 2.5), atol=1e-12)
+    assert_allclose(bottom.numbers, push_of(image, 2.5), atol=1e-12)
 
 
 WORDS = {  # and what they mean in 3-D

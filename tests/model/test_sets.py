@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from models import ball_mesh, sample_image, sample_model
 from numpy.testing import assert_allclose, assert_array_equal
-from scipy.spatial.transform import Rotation
 
 import tetopt
 from tetopt.errors import InputError
-from tetopt.fem.elasticity import box_faces
 from tetopt.geometry.box import world_axes
 from tetopt.geometry.simplex import volumes
 from tetopt.model.file import sets_beside
@@ -319,19 +317,3 @@ def test_sets_of_a_mesh_join_the_standard_ones():
     assert_array_equal(merged.facets["left_2"], some)
     assert_array_equal(merged.cells["Boundary_2"], np.arange(4))
     assert "left_2" not in standard.facets  # which are left as they were
-
-
-@pytest.mark.parametrize("tilt", [0.0, 30.0, 50.0, 70.0])
-def test_top_and_bottom_are_those_of_fem(tilt):
-    """Also where a box is tilted so far that another axis would do as well."""
-    rng = np.random.default_rng(int(tilt))
-    axis = rng.normal(size=3)
-    turn = Rotation.from_rotvec(np.radians(tilt) * axis / np.linalg.norm(axis)).as_matrix()
-    affine = np.eye(4)
-    affine[:3, :3] = turn @ np.diag([1.0, 1.5, 2.0])
-    image = tetopt.Image(np.zeros((4, 5, 6)), affine)
-    mesh = tetopt.lattice_mesh(image, blocks=(2, 2, 2))
-    low, high = box_faces(image, mesh)
-    sets = standard_sets(mesh, box_of(image)).facets
-    assert_array_equal(nodes_of(mesh, sets["inferior"]), low)
-    assert_array_equal(nodes_of(mesh, sets["superior"]), high)

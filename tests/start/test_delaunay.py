@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from meshes import box_corners, random_affine
 from naive import circumcentres
 from scipy.spatial import Delaunay
+from shapes import grid
 
 from tetopt import Image, lattice_mesh
 from tetopt.geometry.simplex import squared_edges, volumes
@@ -24,15 +25,6 @@ def world(index, affine):
 
 def as_set(cells):
     return set(map(tuple, np.sort(cells, axis=1).tolist()))
-
-
-def grid_nodes(*sizes):
-    return (
-        np.stack(np.meshgrid(*map(np.arange, sizes), indexing="ij"), axis=-1).reshape(
-            -1, len(sizes)
-        )
-        * 1.0
-    )
 
 
 def random_box_nodes(rng, n, n_nodes, per_wall=0.1):
@@ -91,7 +83,7 @@ def test_a_cubic_grid_has_no_flat_cell(sizes):
     """Cells with corners on a unit cube have 1/2, or 1/6 or 1/3; Qhull by itself makes cells of
     0 here.
     """
-    index = grid_nodes(*sizes)
+    index = grid(sizes).reshape(-1, len(sizes))
     n = len(sizes)
     cells = delaunay(index, IDENTITY[n])
     check_tiling(index, cells, (np.zeros(n), np.array(sizes) - 1.0))
@@ -122,7 +114,7 @@ def test_nodes_of_lattices(n, kind):
 def test_no_cell_is_flat_on_jittered_and_plain_grids_of_any_affine(seed):
     """Some nodes moved, most not: ties and generic places side by side."""
     rng = np.random.default_rng(seed)
-    index = grid_nodes(4, 4, 4)
+    index = grid((4, 4, 4)).reshape(-1, 3)
     is_inside = ((index > 0) & (index < 3)).all(axis=1) & (rng.random(64) < 0.5)
     index[is_inside] += rng.uniform(-0.2, 0.2, (is_inside.sum(), 3))
     affine = random_affine(rng, 3, is_sheared=False)
@@ -155,7 +147,7 @@ def test_far_from_the_origin_and_in_small_voxels_the_cells_are_the_same():
 
 
 def test_no_cells_for_nodes_in_a_plane_or_given_twice():
-    flat = grid_nodes(3, 3, 1)
+    flat = grid((3, 3, 1)).reshape(-1, 3)
     assert delaunay(flat, np.eye(4)) is None
-    twice = np.vstack([grid_nodes(3, 3, 3), [[1.0, 1.0, 1.0]]])
+    twice = np.vstack([grid((3, 3, 3)).reshape(-1, 3), [[1.0, 1.0, 1.0]]])
     assert delaunay(twice, np.eye(4)) is None

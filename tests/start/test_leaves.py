@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from meshes import random_affine
 from naive import circumcentres
 from scipy.spatial import cKDTree
+from shapes import grid
 
 import tetopt
 from tetopt.geometry.simplex import volumes
@@ -132,7 +133,7 @@ def test_within_a_mask_one_octree_is_enough(monkeypatch, n):
     made = []
     octree = sys.modules["tetopt.start.octree"]
     monkeypatch.setattr(octree, "leaf_cells", lambda *args: made.append(args) or leaf_cells(*args))
-    place = np.stack(np.meshgrid(*[np.arange(40.0)] * n, indexing="ij"), axis=-1) - 18.0
+    place = grid((40,) * n) - 18.0
     affine = random_affine(np.random.default_rng(5), n, is_sheared=False)
     distance = np.linalg.norm(place, axis=-1)
     image = tetopt.Image(100.0 * (distance < 8.0), affine)
