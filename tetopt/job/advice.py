@@ -4,7 +4,8 @@ measurements, and oddities.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -27,25 +28,129 @@ from tetopt.start.sizes import LONG_EDGE, EdgeRatios, Sizes
 
 # Of the cells, over the voxels': other volumes are told beside the verdict.
 NEAR_VOLUME, NEAR_MASK = (0.85, 1.15), (0.95, 1.05)
-VOLUME_RATIO = 2.0  # of a label's cells to its voxels, or the other way round: more is reported
-LABEL_DICE = 0.5  # of a label with its cells: below it the cells hardly represent the label
-NODES_MISSED = 0.01  # of the requested number of nodes: a larger miss is reported
-ENERGY_RISE = 1e-3  # relative: E is reported if it ended higher above its least value
-LENGTH_ROUNDING = 1e-3  # relative: the tolerance of edges to their limits
-TARGETS_MISSED = 0.1  # of the edges: a larger fraction far over their targets is reported
-# between the surfaces of mesh and mask, 95th percentile: above it, details of the mask are lost
-FAR_VOXELS = 1.5
-# of the requested cells across: with fewer, at the label's median, they are reported
-ACROSS_MET = 0.9
-# of the cells: if more contain no voxel centre, there are too many for the image
-EMPTY_CELLS = 0.02
 POCKETS = "voxels without a label, enclosed or bright"  # label 0 where a background was removed
+Wanted = Literal["smaller", "larger"]
 # Requirements whose sentences ask for smaller cells.
-SMALLER_CELLS: Mapping[str, Literal["smaller"]] = dict.fromkeys(
+SMALLER_CELLS: Mapping[str, Wanted] = dict.fromkeys(
     ("min_dihedral", "overlap", "mask", "components", "manifold", "labels", "error"), "smaller"
 )
-# times a voxel's shortest edge: if slices are this far apart, cells lie between them
-THICK_SLICES = 2.0
+THICK_SLICES = 2.0  # times a voxel's shortest edge: so far apart, cells lie between slices
+
+
+class Oddity(NamedTuple):
+    """Words on a valid mesh that is probably not intended."""
+
+    threshold: float  # of the measure: only a larger value is reported
+    sentence: str  # with the value as `{0}`
+    remedy: str = ""
+    wants: Wanted | None = None  # cells, if the remedy is followed
+
+
+ANY_COUNT = 0.0  # of what should not be: one is reported
+NODES = "{n_nodes} nodes instead of {nodes}{walls}"
+# By measure. The thresholds are chosen, but for distances: beyond 1.5 voxels, details are lost.
+ODDITIES = {
+    # small labels without a cell
+    "lost": Oddity(
+        ANY_COUNT, f"no cell has label {{labels}}, of fewer than {LABEL_VOXELS} voxels in the mesh"
+    ),
+    # volume of a label's cells over its voxels', or the other way round, the larger
+    "volume": Oddity(
+        2.0,
+        "{count} with more than {limit:g} times the volume of the voxels, or less than half "
+        "(ratio in brackets): {labels}",
+        "allow more nodes",
+        "smaller",
+    ),
+    # voxels of a label and its cells that are not of both: 1 - Dice
+    "overlap": Oddity(
+        0.5,
+        "Dice below {limit:g} for label {labels}",
+        "allow more nodes, or check that these are labels, not intensities",
+        "smaller",
+    ),
+    # fraction of the requested cells across that a label lacks
+    "across": Oddity(
+        0.1, "fewer than {requested:g} cells across: {labels}", "allow more nodes", "smaller"
+    ),
+    # components of the mask that the mesh lacks
+    "merged": Oddity(
+        ANY_COUNT,
+        "the {word} has {mask.components} connected components, the mesh {mask.mesh_components}: "
+        "elements are too large for the {word}'s detail",
+        "allow more nodes",
+        "smaller",
+    ),
+    # voxels between the surfaces of mesh and mask, 95th percentile
+    "distance": Oddity(
+        1.5,
+        "the mesh's boundary and the {word}'s surface are {0:.1f} voxels apart at the 95th "
+        "percentile, {mean:.1f} on average: elements are too large for the details",
+        "allow more nodes",
+        "smaller",
+    ),
+    "dropped": Oddity(
+        ANY_COUNT,
+        "dropped {0} small connected components of the mesh that are not separate in the {word}"
+        "{volumes}",
+        "`keep_components` keeps them",
+    ),
+    # fraction of the requested number of nodes by which a mesh misses it, by the reason
+    "nodes_of_sizes": Oddity(
+        0.01,
+        f"{NODES}: the target sizes need about {{needed}}",
+        "set `nodes` to that, or use larger sizes",
+        "smaller",
+    ),
+    "nodes_beyond_voxels": Oddity(
+        0.01, f"{NODES}: most cells contain no voxel centre", wants="larger"
+    ),
+    "nodes_at_the_start": Oddity(
+        0.01, f"{NODES}, as no iteration was made", "allow some `iterations`"
+    ),
+    "nodes": Oddity(0.01, NODES),
+    # relative rise of E above its least value, and of E_D above its first
+    "E": Oddity(
+        1e-3,
+        "E ended at {last:.4f}, above its minimum {least:.4f}: a tessellation in the first n_t "
+        "iterations raised it",
+        "`retessellate` accept keeps only those that lower it",
+    ),
+    "E_D": Oddity(
+        1e-3, "{what} rose {to}, as shapes were improved at its expense", "increase `k_D`"
+    ),
+    "crowded": Oddity(
+        ANY_COUNT,
+        f"more than {MOST_MEETING} labels meet at {{0}} nodes; only the first {MOST_MEETING} "
+        "determine where these nodes lie",
+    ),
+    # fraction of the cells without a voxel centre
+    "empty": Oddity(
+        0.02,
+        "{n_empty} of {n_cells} cells contain no voxel centre: these contribute nothing to E_D and "
+        "take the nearest voxel's value{more}",
+    ),
+    # relative, by which edges miss their limits
+    "longest_edge": Oddity(
+        1e-3,
+        "the longest edge is {edge:.4g} mm, {0:.0%} over `edge_max` {limit:g}: splits and "
+        "collapses respect it, but nodes move apart",
+        "lower it",
+    ),
+    "shortest_edge": Oddity(
+        1e-3,
+        "the shortest edge is {edge:.4g} mm, {0:.0%} under `size_min` {limit:g}: splits respect "
+        "it, but nodes move together",
+        "raise it",
+    ),
+    # fraction of the edges that are far over their targets
+    "targets": Oddity(
+        0.1,
+        f"{{0:.0%}} of the edges are longer than {LONG_EDGE:.2f} times their target size",
+        "allow more nodes, or use larger sizes",
+        "smaller",
+    ),
+}
 
 
 class Problem(NamedTuple):
@@ -56,13 +161,45 @@ class Problem(NamedTuple):
     text: str
     remedy: str = ""
     name: str | None = None
-    wants: Literal["smaller", "larger"] | None = None  # cells, if the remedy is followed
+    wants: Wanted | None = None  # cells, if the remedy is followed
     is_failure: bool = False  # not of a requirement; its text says what failed
 
     @property
     def words(self) -> str:
         """The sentence, with its remedy."""
         return f"{self.text}; {self.remedy}" if self.remedy else self.text
+
+
+def find_oddity(name: str, value: float, **facts: Any) -> Iterator[Problem]:
+    """Yield a problem if a measure is odd; `facts` are what its sentence states."""
+    odd = ODDITIES[name]
+    if value > odd.threshold:
+        yield Problem(odd.sentence.format(value, **facts), odd.remedy, wants=odd.wants)
+
+
+def find_odd_labels(
+    name: str,
+    rows: Iterable[LabelFidelity],
+    value: Callable[[LabelFidelity], float],
+    words: Callable[[LabelFidelity], str],
+    most: int = sys.maxsize,
+    unhelped: frozenset[int] = frozenset(),
+    **facts: Any,
+) -> Iterator[Problem]:
+    """Yield a problem if a measure of labels is odd, which names `most` of them, the worst first.
+
+    It has no remedy if all of them are `unhelped`.
+    """
+    limit = ODDITIES[name].threshold
+    odd = sorted((row for row in rows if value(row) > limit), key=value, reverse=True)
+    count = "1 label" if len(odd) == 1 else f"{len(odd)} labels"
+    labels = list_names([words(row) for row in odd], most)
+    problems = find_oddity(
+        name, value(odd[0]) if odd else limit, count=count, labels=labels, limit=limit, **facts
+    )
+    for each in problems:
+        is_helped = any(row.label not in unhelped for row in odd)
+        yield each if is_helped else each._replace(remedy="", wants=None)
 
 
 def order_problems(problems: Iterable[Problem]) -> list[Problem]:
@@ -120,14 +257,10 @@ def unmet_requirements(
     """
     for name, words in requirements.items():
         yield Problem(words, name=name, wants=SMALLER_CELLS.get(name))
-    yield from _lost_labels(measured, word)
+    yield from _of_labels(measured, word)
     yield from _of_mask(measured.get("mask"), word)
-    if n_dropped := measured.get("dropped_components"):
-        text = (
-            f"dropped {n_dropped} small connected components of the mesh that are not "
-            f"separate in the {word}"
-        )
-        yield Problem(f"{text}{_dropped_words(measured)}", "`keep_components` keeps them")
+    n_dropped = measured.get("dropped_components") or 0
+    yield from find_oddity("dropped", n_dropped, word=word, volumes=_dropped_words(measured))
 
 
 def _dropped_words(measured: dict[str, Any]) -> str:
@@ -142,40 +275,31 @@ def _dropped_words(measured: dict[str, Any]) -> str:
     return f", as large as {sum(voxels.values()):.3g} voxels{of_labels}"
 
 
-def _lost_labels(measured: dict[str, Any], word: str) -> Iterator[Problem]:
+def _of_labels(measured: dict[str, Any], word: str) -> Iterator[Problem]:
     """Yield small labels without a cell, and labels of poor volume or overlap, beyond those that
     violate the requirement.
     """
     labels = measured.get("labels", [])
     required = required_of(word, measured.get("label_names", {}))
-    words = {row.label: required.label_words(row.label) for row in labels}
-    ratios = {row: row.volume_ratio for row in labels}
-
-    def smaller(rows: Iterable[LabelFidelity], remedy: str) -> dict[str, Any]:
-        is_helped = any(row.label not in required.unhelped for row in rows)
-        return {"remedy": remedy, "wants": "smaller"} if is_helped else {}
-
     faulty = set(faulty_labels(labels))
     others = [row for row in labels if row.label not in faulty]
-    if small := [words[row.label] for row in others if row.is_lost]:
-        yield Problem(
-            f"no cell has label {', '.join(small)}, of fewer than {LABEL_VOXELS} voxels in the mesh"
-        )
     there = [row for row in others if row.covered_voxels and row.mesh_volume > 0.0]
-    far = [row for row in there if max(ratios[row], 1.0 / ratios[row]) > VOLUME_RATIO]
-    if far := sorted(far, key=lambda row: -max(ratios[row], 1.0 / ratios[row])):
-        worst = ", ".join(f"{words[row.label]} ({ratios[row]:.3g})" for row in far)
-        count = "1 label" if len(far) == 1 else f"{len(far)} labels"
-        text = (
-            f"{count} with more than {VOLUME_RATIO:g} times the volume of the voxels, or "
-            "less than half"
-        )
-        yield Problem(f"{text} (ratio in brackets): {worst}", **smaller(far, "allow more nodes"))
-    poor = [row for row in others if row.voxels >= LABEL_VOXELS and row.dice < LABEL_DICE]
-    if poor:
-        names = list_names([words[row.label] for row in poor], 5)
-        remedy = "allow more nodes, or check that these are labels, not intensities"
-        yield Problem(f"Dice below {LABEL_DICE} for label {names}", **smaller(poor, remedy))
+    large = [row for row in others if row.voxels >= LABEL_VOXELS]
+
+    def words(row: LabelFidelity) -> str:
+        return required.label_words(row.label)
+
+    yield from find_odd_labels("lost", others, lambda row: row.is_lost, words)
+    yield from find_odd_labels(
+        "volume",
+        there,
+        lambda row: max(row.volume_ratio, 1.0 / row.volume_ratio),
+        lambda row: f"{words(row)} ({row.volume_ratio:.3g})",
+        unhelped=required.unhelped,
+    )
+    yield from find_odd_labels(
+        "overlap", large, lambda row: 1.0 - row.dice, words, 5, required.unhelped
+    )
 
 
 def required_of(word: str, names: Mapping[int, str]) -> Requirements:
@@ -268,22 +392,12 @@ def _faults(
 def _of_mask(mask: MaskFidelity | None, word: str) -> Iterator[Problem]:
     if mask is None:
         return
-    remedy = "allow more nodes"
     # more components of the mesh than of the mask violate a requirement
-    if mask.components > mask.mesh_components:
-        text = (
-            f"the {word} has {mask.components} connected components, the mesh "
-            f"{mask.mesh_components}: elements are"
-        )
-        yield Problem(f"{text} too large for the {word}'s detail", remedy, wants="smaller")
-    if (far := max(mask.distance_p95, mask.reverse_p95)) > FAR_VOXELS:
-        text = (
-            f"the mesh's boundary and the {word}'s surface are {far:.1f} voxels apart at the "
-            "95th percentile, "
-            f"{max(mask.distance_mean, mask.reverse_mean):.1f} on average: elements are too "
-            "large for the details"
-        )
-        yield Problem(text, remedy, wants="smaller")
+    yield from find_oddity("merged", mask.components - mask.mesh_components, word=word, mask=mask)
+    mean = max(mask.distance_mean, mask.reverse_mean)
+    yield from find_oddity(
+        "distance", max(mask.distance_p95, mask.reverse_p95), word=word, mean=mean
+    )
 
 
 def of_result(
@@ -300,63 +414,58 @@ def of_result(
 
     The mesh has `n_nodes`, where a graded mesh should have `nodes`; `measured` holds the counts.
     """
-    if nodes is not None and abs(n_nodes - nodes) > NODES_MISSED * nodes:
-        n_initial = len(result.initial.points)
-        for_walls = (
-            mode == "graded"
-            and "mask" in measured
-            and n_nodes > nodes
-            and is_for_walls(n_initial, nodes)
-        )
-        text = f"{n_nodes} nodes instead of {nodes}"
-        text += (
-            f" (the initial mesh has {n_initial}, to keep thin walls of the mask)"
-            if for_walls
-            else ""
-        )
-        if (needed := measured.get("nodes_of_sizes")) and needed > nodes:
-            remedy = "set `nodes` to that, or use larger sizes"
-            yield Problem(f"{text}: the target sizes need about {needed}", remedy, wants="smaller")
-        elif n_nodes < nodes and has_most_empty(result, measured.get("cells_without_voxel", 0)):
-            yield Problem(f"{text}: most cells contain no voxel centre", wants="larger")
-        elif result.history[-1].iteration == 0:
-            yield Problem(f"{text}, as no iteration was made", "allow some `iterations`")
-        else:
-            wants: Literal["smaller", "larger"] = "smaller" if n_nodes < nodes else "larger"
-            remedies = ["more iterations"] * (result.ended == "iterations") + [
-                "a `k_D` above 0"
-            ] * (k_D == 0.0)
-            remedy = " or ".join([*remedies, *[f"{wants} sizes"] * has_sizes])
-            yield Problem(
-                text, f"use {remedy}" if remedy else "", wants=wants if has_sizes else None
-            )
-    lowest, first, last = (
-        min(row.E for row in result.history),
-        result.history[0],
-        result.history[-1],
-    )
-    if last.E > lowest * (1.0 + ENERGY_RISE) and method == "paper":
-        text = (
-            f"E ended at {last.E:.4f}, above its minimum {lowest:.4f}: a tessellation in the "
-            "first n_t iterations"
-        )
-        yield Problem(f"{text} raised it", "`retessellate` accept keeps only those that lower it")
-    if mode == "start" and last.E_D > first.E_D * (1.0 + ENERGY_RISE):
-        rise = (
-            f"to {last.E_D / first.E_D:.3f} times its initial value"
-            if first.E_D > 0.0
-            else "from 0"
-        )
+    if nodes is not None:
+        yield from _of_nodes(result, mode, n_nodes, nodes, measured, k_D, has_sizes)
+    least = min(row.E for row in result.history)
+    first, last = result.history[0], result.history[-1]
+    if method == "paper":
+        yield from find_oddity("E", _rise(least, last.E), last=last.E, least=least)
+    if mode == "start":
+        rise = _rise(first.E_D, last.E_D)
+        to = f"to {1.0 + rise:.3f} times its initial value" if first.E_D > 0.0 else "from 0"
         what = "E_D, with voxels on the wrong side of the mask," if "mask" in measured else "E_D"
-        yield Problem(
-            f"{what} rose {rise}, as shapes were improved at its expense", "increase `k_D`"
+        yield from find_oddity("E_D", rise, what=what, to=to)
+    yield from find_oddity("crowded", measured.get("nodes_of_many_labels") or 0)
+
+
+def _rise(before: float, after: float) -> float:
+    """Return the relative rise of a value of 0 or more."""
+    if before > 0.0:
+        return after / before - 1.0
+    return np.inf if after > 0.0 else 0.0
+
+
+def _of_nodes(
+    result: MeshingResult,
+    mode: Mode,
+    n_nodes: int,
+    nodes: int,
+    measured: dict[str, Any],
+    k_D: float | None,
+    has_sizes: bool,
+) -> Iterator[Problem]:
+    """Yield the miss of a requested number of nodes, with its reason."""
+    n_initial, needed = len(result.initial.points), measured.get("nodes_of_sizes") or 0
+    is_of_walls = mode == "graded" and "mask" in measured and n_nodes > nodes
+    wants: Wanted = "smaller" if n_nodes < nodes else "larger"
+    name, remedies = "nodes", list[str]()
+    if needed > nodes:
+        name = "nodes_of_sizes"
+    elif n_nodes < nodes and has_most_empty(result, measured.get("cells_without_voxel", 0)):
+        name = "nodes_beyond_voxels"
+    elif result.history[-1].iteration == 0:
+        name = "nodes_at_the_start"
+    else:
+        remedies += ["more iterations"] * (result.ended == "iterations")
+        remedies += ["a `k_D` above 0"] * (k_D == 0.0) + [f"{wants} sizes"] * has_sizes
+    walls = f" (the initial mesh has {n_initial}, to keep thin walls of the mask)"
+    walls = walls if is_of_walls and is_for_walls(n_initial, nodes) else ""
+    miss = abs(n_nodes - nodes) / nodes
+    for each in find_oddity(name, miss, n_nodes=n_nodes, nodes=nodes, needed=needed, walls=walls):
+        remedy = f"use {' or '.join(remedies)}" if remedies else each.remedy
+        yield each._replace(
+            remedy=remedy, wants=wants if name == "nodes" and has_sizes else each.wants
         )
-    if crowded := measured.get("nodes_of_many_labels"):
-        text = (
-            f"more than {MOST_MEETING} labels meet at {crowded} nodes; only the first "
-            f"{MOST_MEETING} determine"
-        )
-        yield Problem(f"{text} where these nodes lie")
 
 
 def has_most_empty(result: MeshingResult, n_empty: int) -> bool:
@@ -378,21 +487,15 @@ def of_empty(
     domain, so that the image may be of no importance, and fewer nodes are no remedy.
     """
     n_cells = len(result.mesh.cells)
-    if n_empty <= EMPTY_CELLS * n_cells:
-        return
-    text = (
-        f"{n_empty} of {n_cells} cells contain no voxel centre: these contribute nothing to E_D "
-        "and take the nearest "
-        "voxel's value"
-    ) + ", which is harmless unless moduli come from the image" * is_masked
-    if spacing.max() >= THICK_SLICES * spacing.min():
-        yield Problem(
-            f"{text}; slices are {spacing.max():.3g} mm apart, so some cells lie between them"
-        )
-    elif is_free and not is_masked:
-        yield Problem(text, "reduce `nodes`", wants="larger")
-    else:
-        yield Problem(text)
+    more = ", which is harmless unless moduli come from the image" if is_masked else ""
+    is_thick = spacing.max() >= THICK_SLICES * spacing.min()
+    if is_thick:
+        more += f"; slices are {spacing.max():.3g} mm apart, so some cells lie between them"
+    for each in find_oddity(
+        "empty", n_empty / n_cells, n_empty=n_empty, n_cells=n_cells, more=more
+    ):
+        is_helped = is_free and not is_masked and not is_thick
+        yield each._replace(remedy="reduce `nodes`", wants="larger") if is_helped else each
 
 
 def tell_label_sizes(sizes: SizesByLabel) -> None:
@@ -420,41 +523,26 @@ def of_layers(
     """Yield labels with fewer cells across than requested, in the mesh as measured, the worst
     first.
     """
-    thin = [
-        row
-        for row in labels
-        if row.label != BACKGROUND_LABEL and row.cells_across < ACROSS_MET * cells_across
-    ]
-    if thin:
-        rows = [
+    tissues = [row for row in labels if row.label != BACKGROUND_LABEL]
+    yield from find_odd_labels(
+        "across",
+        tissues,
+        lambda row: 1.0 - row.cells_across / cells_across,
+        lambda row: (
             f"{label_words(row.label, names)} {row.cells_across:.2g} (edges {row.edge:.2g} mm)"
-            for row in sorted(thin, key=lambda row: row.cells_across)
-        ]
-        text = f"fewer than {cells_across:g} cells across: {list_names(rows, 5)}"
-        yield Problem(text, "allow more nodes", wants="smaller")
+        ),
+        5,
+        requested=cells_across,
+    )
 
 
 def of_sizes(
     sizes: Sizes, shortest: float, longest: float, edges: EdgeRatios | None
 ) -> Iterator[Problem]:
     """Yield size limits and targets that the edges, from shortest to longest, mm, do not meet."""
-    if sizes.longest is not None and longest > sizes.longest * (1.0 + LENGTH_ROUNDING):
-        text = (
-            f"the longest edge is {longest:.4g} mm, {longest / sizes.longest - 1.0:.0%} over "
-            "`edge_max` "
-            f"{sizes.longest:g}: splits and collapses respect it, but nodes move apart"
-        )
-        yield Problem(text, "lower it")
-    if shortest < sizes.smallest * (1.0 - LENGTH_ROUNDING):
-        text = (
-            f"the shortest edge is {shortest:.4g} mm, {1.0 - shortest / sizes.smallest:.0%} "
-            "under `size_min` "
-            f"{sizes.smallest:g}: splits respect it, but nodes move together"
-        )
-        yield Problem(text, "raise it")
-    if edges is not None and edges.above > TARGETS_MISSED:
-        text = (
-            f"{edges.above:.0%} of the edges are longer than {LONG_EDGE:.2f} times their "
-            "target size"
-        )
-        yield Problem(text, "allow more nodes, or use larger sizes", wants="smaller")
+    if (most := sizes.longest) is not None:
+        yield from find_oddity("longest_edge", longest / most - 1.0, edge=longest, limit=most)
+    if least := sizes.smallest:
+        yield from find_oddity("shortest_edge", 1.0 - shortest / least, edge=shortest, limit=least)
+    if edges is not None:
+        yield from find_oddity("targets", edges.above)
