@@ -1132,11 +1132,11 @@ def lines(draw):
     draw.good("m.vtu")
     words = [one_of(draw.rng, pool) for _ in range(int(draw.rng.integers(0, 6)))]
     words = (
-        [word for word in words if word not in ("demo", "paper", "compare", "baseline")]
+        [word for word in words if word not in ("demo", "compare", "baseline")]
         if len(words) != 1
         else words
     )
-    if words[:1] in (["demo"], ["paper"]):  # which have defaults for all they need
+    if words[:1] == ["demo"]:  # which have defaults for all they need
         words.append("--nodes=x")
     if words[:1] == ["view"] and "--html" not in words:  # which would open a window
         words += ["--html", "out.vtu"]

@@ -11,6 +11,7 @@ import numpy as np
 import PIL.Image
 import pytest
 from browser import document
+from paper.report import _write_page
 
 from tetopt.geometry.topology import boundary_facets
 from tetopt.io.text import plain
@@ -18,7 +19,6 @@ from tetopt.model.label_names import LabelTable
 from tetopt.report.exhibit import exhibit
 from tetopt.report.explore import save_explorer
 from tetopt.report.page import PAGE_SCRIPTS, picture_html, policy_html, script_html, write_page
-from tetopt.study.paper_files import _write_page
 
 pytestmark = pytest.mark.deep
 RAN = "document.documentElement.dataset.xss=1"

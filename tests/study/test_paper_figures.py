@@ -1,5 +1,5 @@
 """One test per figure and table row of the paper; the printed numbers are in
-`tetopt/study/paper.toml`.
+`scripts/paper/paper.toml`.
 
 Tolerances are the printed digits where the paper says how the mesh was made (row 3; node and cell
 counts), and a band where it does not; each band is justified in a line.
@@ -9,11 +9,11 @@ import functools
 
 import numpy as np
 import pytest
+from paper import experiments as paper
 
 import tetopt
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import largest_component
-from tetopt.study import paper
 
 PRINTED = paper.printed_numbers()
 

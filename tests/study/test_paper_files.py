@@ -1,4 +1,4 @@
-"""`tetopt paper` and `tetopt fem`: files, numbers, page, and one line for bad input."""
+"""`scripts/reproduce_paper.py` and `tetopt fem`: files, page, and one line for bad input."""
 
 import json
 import re
@@ -9,11 +9,12 @@ import PIL.Image
 import pytest
 from browser import browser, copied, document
 from numpy.testing import assert_allclose
+from paper import experiments as paper
+from paper.report import PAPER_PICTURES
+from reproduce_paper import main as reproduce
 
 import tetopt
 from tetopt.cli import main
-from tetopt.study import paper
-from tetopt.study.paper_files import PAPER_PICTURES
 
 
 @pytest.fixture(scope="module")
@@ -35,11 +36,11 @@ def run(tmp_path_factory, opengl):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(paper, "figure_2b", lambda k_D: landscape(k_D, n_places=9))
         patch.setattr(paper, "lattice_mesh", fewer)
-        assert main(["paper", "-o", str(out), *inputs, "--seeds", "2"]) == 0
+        assert reproduce(["-o", str(out), *inputs, "--seeds", "2"]) == 0
     return out
 
 
-@pytest.mark.full
+@pytest.mark.deep
 @pytest.mark.drawn
 def test_files(run):
     assert {path.name for path in run.iterdir()} == {"paper.json", "paper.html", *PAPER_PICTURES}
@@ -47,7 +48,7 @@ def test_files(run):
         assert np.std(np.asarray(PIL.Image.open(run / name).convert("L"))) > 10.0, name
 
 
-@pytest.mark.full
+@pytest.mark.deep
 def test_page_holds_every_number(run):
     """Each printed number and each of ours stands in the page as the JSON has it; nothing points
     outside.
@@ -68,7 +69,7 @@ def test_page_holds_every_number(run):
     assert not re.search(r"(src|href)=[\"'](?!data:)", page)
 
 
-@pytest.mark.full
+@pytest.mark.deep
 def test_every_other_number_is_on_the_page(run):
     """E_D, minima, Dice and changes of the JSON are in the page; changes are after over before;
     rows are their own.
@@ -104,7 +105,7 @@ def test_every_other_number_is_on_the_page(run):
         )
 
 
-@pytest.mark.full
+@pytest.mark.deep
 def test_counts_and_row_3(run):
     numbers = json.loads((run / "paper.json").read_text())
     meshes = [row for section in numbers["sections"] for row in section.get("meshes", ())]
@@ -112,7 +113,7 @@ def test_counts_and_row_3(run):
     assert all(row["paper"] == row["ours"] for row in meshes)
 
 
-@pytest.mark.full
+@pytest.mark.deep
 def test_segmentation_improves_on_the_lattice(run):
     """Every label's Dice against the truth is in the JSON, and the mean of an optimised mesh
     beats the lattice's.
@@ -129,7 +130,7 @@ def test_segmentation_improves_on_the_lattice(run):
     )
 
 
-@pytest.mark.full
+@pytest.mark.deep
 def test_page_in_a_browser(run, tmp_path):
     """Headless Chromium draws the page and reports no script or image error; it is short on a
     wide screen.
@@ -148,18 +149,18 @@ def test_page_in_a_browser(run, tmp_path):
     assert int(re.search(r'data-height="(\d+)"', head)[1]) <= 5000
 
 
-@pytest.mark.full
+@pytest.mark.deep
 def test_paper_refuses(tmp_path, capsys):
     tetopt.save_image(tmp_path / "flat.nii", tetopt.load_phantom("disc_2d").image(voxel_mm=4.0))
-    assert main(["paper", "-o", str(tmp_path / "o"), "--image", str(tmp_path / "flat.nii")]) == 2
+    assert reproduce(["-o", str(tmp_path / "o"), "--image", str(tmp_path / "flat.nii")]) == 2
     assert "expected a volume, got a 2-D image" in capsys.readouterr().err
-    assert main(["paper", "-o", str(tmp_path / "o"), "--seeds", "0"]) == 2
+    assert reproduce(["-o", str(tmp_path / "o"), "--seeds", "0"]) == 2
     assert "--seeds: expected 1 or more, got 0" in capsys.readouterr().err
     head, small = (tetopt.load_phantom("sphere").label_image(voxel_mm=size) for size in (4.0, 5.0))
     tetopt.save_image(tmp_path / "head.nii", head)
     tetopt.save_image(tmp_path / "small.nii", small)
     inputs = ["--image", str(tmp_path / "head.nii"), "--labels", str(tmp_path / "small.nii")]
-    assert main(["paper", "-o", str(tmp_path / "o"), *inputs]) == 2
+    assert reproduce(["-o", str(tmp_path / "o"), *inputs]) == 2
     assert "expected labels on the image's grid" in capsys.readouterr().err
     assert not (tmp_path / "o").exists()
 

@@ -44,7 +44,6 @@ COMMANDS = {
     "phantom": "phantom",
     "fem": "fem",
     "segment": "segment",
-    "paper": "compare",
     "baseline": "compare",
     "compare": "compare",
     "warm-up": "warm_up",

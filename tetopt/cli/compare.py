@@ -1,6 +1,4 @@
-"""``tetopt baseline``, ``compare`` and ``paper``: comparisons with the conventional pipelines
-and with the paper.
-"""
+"""``tetopt baseline`` and ``compare``: comparisons with the conventional pipelines."""
 
 from __future__ import annotations
 
@@ -20,25 +18,6 @@ from tetopt.study.compare_table import columns_of, rows_of
 from tetopt.study.options import BaselineOptions, CompareOptions
 
 ResultsOption = Annotated[Path, Option("DIR", "Folder for the results.", letter="o")]
-
-
-def paper_command(
-    output: ResultsOption,
-    image: Annotated[
-        Path | None, Option("T1", "Brain MR volume (default: nilearn's MNI152 T1).")
-    ] = None,
-    labels: Annotated[Path | None, Option("LABELS", "Tissue labels of IMAGE, for Dice.")] = None,
-    seeds: Annotated[int, Option("N", "Number of random meshes for Fig. 1.")] = 200,
-    force: ForceOption = False,
-) -> int:
-    """Reproduce the paper's figures and table: paper.json, pictures, and a page that compares
-    the numbers.
-    """
-    from tetopt.study.paper_files import reproduce
-
-    page, seconds = reproduce(output, image, labels, seeds, force)
-    print_line(f"{page}: the paper's numbers next to tetopt's; {seconds:.0f} s")
-    return 0
 
 
 def baseline_command(

@@ -71,7 +71,7 @@ class Errors(NamedTuple):
 
 
 def reference(modulus: Image, nu: float, percent: float = 1.0) -> Reference:
-    """Fix the box's top and push its bottom in, both bonded: `tetopt.study.paper.simulate` on the
+    """Fix the box's top and push its bottom in, both bonded: `simulate` of scripts/paper on the
     voxels.
 
     Parameters

@@ -45,12 +45,18 @@ def package_text(name: str) -> str:
     return resources.files("tetopt").joinpath(name).read_text(encoding="utf-8")
 
 
-def render_page(template: str, **values: Any) -> Markup:
-    """Render a template in the package; all values except markup are escaped.
+def render_page(template: str | Path, **values: Any) -> Markup:
+    """Render a template in the package, or that of a file; all values except markup are escaped.
 
     See https://jinja.palletsprojects.com/ for the language of the templates.
     """
-    return Markup(_environment().get_template(template).render(values, picture=picture_html))
+    environment = _environment()
+    source = (
+        environment.get_template(template)
+        if isinstance(template, str)
+        else environment.from_string(template.read_text(encoding="utf-8"))
+    )
+    return Markup(source.render(values, picture=picture_html))
 
 
 def write_page(path: Path, title: str, content: str, style: str = "") -> None:

@@ -1,4 +1,4 @@
-"""Pictures of the paper's experiments, reproduced by `tetopt.study.paper`, that no other command
+"""Pictures of the paper's experiments, reproduced by `paper.experiments`, that no other command
 draws.
 """
 
@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
+from paper.experiments import Case, Landscape
 from tetopt.measure.quality import rho_histogram
-from tetopt.study.paper import Case, Landscape
 
 BEFORE_COLOUR, AFTER_COLOUR = "#7f7f7f", "#d95f02"
 

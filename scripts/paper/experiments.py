@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import tomllib
 from functools import cache
-from importlib.resources import files
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -42,7 +42,7 @@ from tetopt.start.lattice import lattice_mesh
 
 def printed_numbers() -> dict[str, Any]:
     """Return the paper's printed numbers, and the text on each experiment, from `paper.toml`."""
-    return tomllib.loads((files("tetopt.study") / "paper.toml").read_text(encoding="utf-8"))
+    return tomllib.loads(Path(__file__).with_name("paper.toml").read_text(encoding="utf-8"))
 
 
 class Case(NamedTuple):

@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from paper import experiments
+from paper.figures import landscape_figure, relaxation_figure
 from tetopt.commands.beside import image_and_labels
 from tetopt.contents.labels import check_labels
 from tetopt.contents.phantom import load_phantom
@@ -36,8 +38,6 @@ from tetopt.report.scene import (
     structure_before_slices,
 )
 from tetopt.report.summary import versions
-from tetopt.study import paper
-from tetopt.study.paper_figures import landscape_figure, relaxation_figure
 from tetopt.system.files import results_folder, save_json
 
 PAPER_PICTURES = (
@@ -60,7 +60,7 @@ CHANGE_WORDS = {  # of quantities compared before and after, by name in paper.js
 
 
 def reproduce(
-    output: Path, image_path: Path | None, labels_path: Path | None, seeds: int, force: bool = False
+    output: Path, image: Path | None, labels: Path | None, seeds: int, force: bool = False
 ) -> tuple[Path, float]:
     """Run every experiment, and write the files `PAPER_FILES` into a folder; return the page and
     the seconds taken.
@@ -68,10 +68,10 @@ def reproduce(
     Parameters
     ----------
     output : Path
-    image_path : Path or None
+    image : Path or None
         A brain MR volume with dark CSF, for Fig. 3(a, b, e, f) and the segmentation; None:
         nilearn's MNI152.
-    labels_path : Path or None
+    labels : Path or None
         Its tissue labels, on the same voxels; None: those of the MNI152, or no section on
         segmentation.
     seeds : int
@@ -85,11 +85,11 @@ def reproduce(
         Files cannot be read or written, or the volume is too small or uniform for the figures.
     """
     if seeds < 1:
-        raise InputError(f"`seeds`: expected 1 or more, got {seeds}")
-    source = mni_path("t1") if image_path is None else image_path
-    volume, tissue = image_and_labels(source, labels_path, WHOLE_BOX)
-    labels_name = None if labels_path is None else labels_path.name
-    if image_path is None and labels_path is None:
+        raise InputError(f"--seeds: expected 1 or more, got {seeds}")
+    source = mni_path("t1") if image is None else image
+    volume, tissue = image_and_labels(source, labels, WHOLE_BOX)
+    labels_name = None if labels is None else labels.name
+    if image is None and labels is None:
         tissue, labels_name = mni_tissue(), "MNI152 tissue"
     if min(volume.shape) < 16 or volume.range[0] == volume.range[1]:
         raise InputError(
@@ -97,7 +97,7 @@ def reproduce(
             f"{volume.shape}"
         )
     if tissue is None:
-        note("the section on approximate segmentation is left out, as there are no `labels`")
+        note("the section on approximate segmentation is left out, as there are no --labels")
     else:
         tissue = check_labels("labels", tissue)
     paths = check_outputs(results_folder(output), PAPER_FILES, force)
@@ -115,7 +115,7 @@ def reproduce(
         steps["segmentation"] = lambda: _segmentation(volume, tissue)
     sections = []
     for name, step in steps.items():
-        note(paper.printed_numbers()["sections"][name]["title"])
+        note(experiments.printed_numbers()["sections"][name]["title"])
         sections.append(step())
     seconds = time.perf_counter() - begin
     results = about | {
@@ -131,7 +131,7 @@ def reproduce(
 
 def _section(name: str, **values: float) -> dict[str, Any]:
     """Return title and text of an experiment, with these numbers."""
-    said = paper.printed_numbers()["sections"][name]
+    said = experiments.printed_numbers()["sections"][name]
     return {"title": said["title"], "text": said["text"].format(**values)}
 
 
@@ -139,28 +139,28 @@ def _row(name: str, ours: Any, geometric_mean: float) -> dict[str, Any]:
     """Return a row of Table 1: printed and reproduced numbers."""
     return {
         "name": name,
-        **paper.printed_numbers()["table1"][name],
+        **experiments.printed_numbers()["table1"][name],
         "ours": list(ours),
         "geometric_mean": geometric_mean,
     }
 
 
 def _row_of(name: str, mesh: Mesh) -> dict[str, Any]:
-    return _row(name, paper.errors_of(mesh), paper.geometric_mean_error(mesh))
+    return _row(name, experiments.errors_of(mesh), experiments.geometric_mean_error(mesh))
 
 
 def _mesh_row(name: str, mesh: Mesh) -> dict[str, Any]:
     return {
         "name": name,
-        "paper": paper.printed_numbers()["meshes"][name],
+        "paper": experiments.printed_numbers()["meshes"][name],
         "ours": [len(mesh.points), len(mesh.cells)],
     }
 
 
 def _figure_1(paths: dict[str, Path], seeds: int) -> dict[str, Any]:
-    case = paper.figure_1(0)
+    case = experiments.figure_1(0)
     save_figure(relaxation_figure(case), paths["fig1.png"])
-    spread = paper.figure_1_spread(seeds)
+    spread = experiments.figure_1_spread(seeds)
     rows = []
     for name, errors in spread.items():
         low, middle, high = np.percentile(errors, [5, 50, 95], axis=0)
@@ -172,7 +172,7 @@ def _figure_1(paths: dict[str, Path], seeds: int) -> dict[str, Any]:
 
 
 def _figure_2(paths: dict[str, Path]) -> dict[str, Any]:
-    cases = [paper.figure_2(k_D) for k_D in (0.05, 0.30)]
+    cases = [experiments.figure_2(k_D) for k_D in (0.05, 0.30)]
     initial = cases[0].initial
     meshes = [("initial", initial)] + [(case.title, case.result.mesh) for case in cases]
     save_figure(slice_figure(cases[0].image, meshes), paths["fig2.png"])
@@ -200,16 +200,16 @@ def _figure_2(paths: dict[str, Path]) -> dict[str, Any]:
 
 
 def _simulate(image: Image, mesh: Mesh) -> dict[str, float]:
-    simulated = paper.simulate(image, mesh)[0]
+    simulated = experiments.simulate(image, mesh)[0]
     return {name: getattr(simulated, name) for name in CHANGE_WORDS}
 
 
-def _E_D_relative(case: paper.Case) -> float:
+def _E_D_relative(case: experiments.Case) -> float:
     return case.result.history[-1].E_D / case.result.history[0].E_D
 
 
 def _figure_2b(paths: dict[str, Path]) -> dict[str, Any]:
-    landscapes = [paper.figure_2b(k_D) for k_D in (0.05, 0.3, 0.8)]
+    landscapes = [experiments.figure_2b(k_D) for k_D in (0.05, 0.3, 0.8)]
     save_figure(landscape_figure(landscapes), paths["fig2b.png"])
     minima = [
         {"k_D": each.k_D, "lowest": each.E.min(), "found": each.E_minimum} for each in landscapes
@@ -221,7 +221,7 @@ def _figure_2b(paths: dict[str, Path]) -> dict[str, Any]:
 
 
 def _figure_3ab(paths: dict[str, Path], volume: Image) -> dict[str, Any]:
-    case = paper.figure_3ab(volume)
+    case = experiments.figure_3ab(volume)
     save_figure(
         slice_figure(case.image, [("initial", case.initial), ("k_D = 0.2", case.result.mesh)]),
         paths["fig3ab.png"],
@@ -234,7 +234,7 @@ def _figure_3ab(paths: dict[str, Path], volume: Image) -> dict[str, Any]:
 
 
 def _figure_3cd(paths: dict[str, Path]) -> dict[str, Any]:
-    cases = [paper.figure_3cd(snr) for snr in SNR_DB]
+    cases = [experiments.figure_3cd(snr) for snr in SNR_DB]
     shown = cases[1]
     save_figure(
         slice_figure(shown.image, [("initial", shown.initial), (shown.title, shown.result.mesh)]),
@@ -251,7 +251,7 @@ def _figure_3cd(paths: dict[str, Path]) -> dict[str, Any]:
         "errors": rows,
         "meshes": [_mesh_row("fig3c", shown.initial)],
         "simulation": changes,
-        "printed_change": paper.printed_numbers()["change"],
+        "printed_change": experiments.printed_numbers()["change"],
         "pictures": [
             [
                 "fig3cd.png",
@@ -262,7 +262,7 @@ def _figure_3cd(paths: dict[str, Path]) -> dict[str, Any]:
 
 
 def _figure_3ef(paths: dict[str, Path], volume: Image) -> dict[str, Any]:
-    case = paper.figure_3ef(volume)
+    case = experiments.figure_3ef(volume)
     image, initial, mesh = case.image, case.initial, case.result.mesh
     below = 0.6 * float(np.median(image.data[image.data > image.data.mean()]))
     before, after = (
@@ -298,7 +298,7 @@ def _figure_3ef(paths: dict[str, Path], volume: Image) -> dict[str, Any]:
 
 
 def _segmentation(volume: Image, tissue: Image) -> dict[str, Any]:
-    case = paper.segmentation_case(volume)
+    case = experiments.segmentation_case(volume)
     overlaps = {
         f"{classes} classes, {name}": dice(labels, tissue)
         for classes in (4, 8)
@@ -316,12 +316,12 @@ def _segmentation(volume: Image, tissue: Image) -> dict[str, Any]:
 
 
 def _write_page(paths: dict[str, Path], results: dict[str, Any]) -> None:
-    words, sections = paper.printed_numbers()["page"], results["sections"]
+    words, sections = experiments.printed_numbers()["page"], results["sections"]
     intro = words["intro"].format(version=results["versions"]["tetopt"], image=results["image"])
     if not any("dice" in section and "Section 5" in section["title"] for section in sections):
         intro += words["no_labels"]
     content = render_page(
-        "study/paper.html",
+        Path(__file__).with_name("paper.html"),
         intro=intro,
         sections=sections,
         change_words=CHANGE_WORDS,

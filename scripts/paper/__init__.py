@@ -1,0 +1,1 @@
+"""The paper's experiments, their pictures and a page of their numbers."""
