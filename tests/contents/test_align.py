@@ -55,6 +55,7 @@ PAIRS = {
 }
 MOVE = turned((0.7, 1.6, 1.2), (0.3, -0.5, 0.8))  # both at once: the image is oblique as well
 PAIRS["both oblique"] = (MOVE @ PAIRS["oblique"][0], MOVE @ PAIRS["oblique"][1])
+PAIRS["in a plane"] = (np.eye(3), np.array([[0.0, -2.0, 9.3], [1.0, 0.0, 0.8], [0, 0, 1]]))
 
 
 def nearest_twin(other, image):
@@ -87,8 +88,10 @@ def linear_twin(other, image):
 
 def pair(which, values):
     image_affine, affine = PAIRS[which]
-    rng = np.random.default_rng(3)
-    return tetopt.Image(np.zeros(SHAPE), image_affine), tetopt.Image(values(rng), affine)
+    rng, n = np.random.default_rng(3), len(affine) - 1
+    return tetopt.Image(np.zeros(SHAPE[:n]), image_affine), tetopt.Image(
+        values(rng, OTHER[:n]), affine
+    )
 
 
 def message(function, *args):
@@ -105,7 +108,7 @@ def test_nearest_is_its_twin(which):
     """Labels, a 0/255 mask and a probability map, each voxel the one whose box it lies in, 0
     outside all of them.
     """
-    image, labels = pair(which, lambda rng: rng.integers(1, 9, OTHER))
+    image, labels = pair(which, lambda rng, shape: rng.integers(1, 9, shape))
     expected = nearest_twin(labels, image)
     assert 0 < np.count_nonzero(expected == 0) < expected.size  # both inside and outside are tried
     aligned = resample_labels(labels, image, "l")
@@ -121,7 +124,7 @@ def test_nearest_is_its_twin(which):
 
 @pytest.mark.parametrize("which", PAIRS)
 def test_linear_is_its_twin(which):
-    image, other = pair(which, lambda rng: rng.normal(size=OTHER).astype(np.float32))
+    image, other = pair(which, lambda rng, shape: rng.normal(size=shape).astype(np.float32))
     aligned = resample_contrast(other, image, "c")
     assert_allclose(aligned.data, linear_twin(other, image), atol=1e-6)
     assert_array_equal(aligned.affine, image.affine)
@@ -170,17 +173,6 @@ def test_grid_shifted_by_half_a_voxel(spacing, sign):
         assert_array_equal(aligned[-1], 0)
     else:  # index i - 1/2: the upper is i, the first on the lower face, inside
         assert_array_equal(aligned, labels.data)
-
-
-def test_two_dimensions():
-    affine = np.array([[0.0, -2.0, 9.3], [1.0, 0.0, 0.8], [0, 0, 1]])
-    image = tetopt.Image(np.zeros((8, 5)))
-    rng = np.random.default_rng(1)
-    other = tetopt.Image(rng.integers(1, 5, (6, 5)), affine)
-    expected = nearest_twin(other, image)
-    assert 0 < (expected == 0).sum() < expected.size
-    assert_array_equal(resample_labels(other, image, "l").data, expected)
-    assert_allclose(resample_contrast(other, image, "c").data, linear_twin(other, image), atol=1e-6)
 
 
 def test_labels_without_a_voxel_in_the_image_or_mask_are_named(recwarn):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import skfem
 from meshes import random_rotation, split_box
+from models import LOAD_CASES, load_words
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.sparse import diags_array
 from scipy.spatial import cKDTree
@@ -151,23 +152,6 @@ def skfem_solution(model, step=1):
     return result
 
 
-LOADS = {
-    "displacement": ["hold:inferior", "move:superior:0.1,free,0.05"],
-    "pressure": ["hold:inferior", "pressure:superior:0.3"],
-    "traction": ["hold:inferior", "traction:superior:0.1,-0.2,0.3"],
-    "spring": ["spring:inferior:2.5", "traction:superior:0.1,-0.2,0.3"],
-    "gravity": ["hold:inferior", "gravity:0,3000,-9810"],
-    "all": [
-        "hold:inferior",
-        "move:superior:free,free,0.1",
-        "pressure:left:0.3",
-        "pressure:left:0.1",
-        "gravity:0,0,-9810",
-        "traction:right:0,0.2,-0.1",
-        "spring:right:2.0",
-        "spring:anterior:0.5",
-    ],
-}
 FACES = {
     "left": "x_min",
     "right": "x_max",
@@ -201,15 +185,15 @@ def model_with(mesh, sets, loads, order, **values):
 
 
 @pytest.mark.parametrize(
-    ("kind", "n", "order"),
+    ("case", "n", "order"),
     [
-        *((kind, 3, 1) for kind in LOADS),
+        *((case, 3, 1) for case in LOAD_CASES),
         *(("all", n, order) for n, order in BOTH if n + order != 4),
     ],
 )
-def test_each_kind_of_load_as_scikit_fem_has_it(kind, n, order):
+def test_each_kind_of_load_as_scikit_fem_has_it(case, n, order):
     mesh, sets, values = uneven(n)
-    model = model_with(mesh, sets, LOADS[kind], order, **values)
+    model = model_with(mesh, sets, load_words(case, n), order, **values)
     solution = solve(model)
     expected = skfem_solution(model)
     assert np.abs(solution.u - expected).max() < 1e-9 * np.abs(expected).max()
@@ -220,7 +204,7 @@ def test_each_kind_of_load_as_scikit_fem_has_it(kind, n, order):
 def test_moduli_at_the_nodes_as_scikit_fem_has_them(n, order):
     """Linear within each cell. Both take the n + 1 points that are exact for degree 2."""
     mesh, sets, values = uneven(n)
-    model = model_with(mesh, sets, LOADS["pressure"], order, **values)
+    model = model_with(mesh, sets, load_words("pressure", n), order, **values)
     model = model._replace(node_young=np.random.default_rng(1).uniform(1.0, 9.0, len(mesh.points)))
     u, expected = solve(model).u, skfem_solution(model)
     assert np.abs(u - expected).max() < 1e-9 * np.abs(expected).max()
@@ -304,7 +288,7 @@ def test_the_work_of_what_is_moved(order):
 
 def test_units_do_not_matter():
     mesh, sets, values = uneven(3)
-    model = model_with(mesh, sets, LOADS["all"], 1, **values)
+    model = model_with(mesh, sets, load_words("all"), 1, **values)
     ours, other = solve(model), solve(in_units(model, "MPa"))
     assert_allclose(other.u, ours.u, rtol=1e-9, atol=1e-12)
     assert other.strain_energy == pytest.approx(ours.strain_energy, rel=1e-9)
@@ -333,7 +317,7 @@ def test_any_number_of_free_pieces_on_springs():
 def test_fields(n, order):
     """Names, shapes and what they are: means of cells, and means by volume around nodes."""
     mesh, sets, values = uneven(n)
-    model = model_with(mesh, sets, LOADS["all"], order, **values)
+    model = model_with(mesh, sets, load_words("all", n), order, **values)
     solution = solve(model)
     fields = solution_fields(mesh, solution)
     n_nodes = len(nodes_of_order(mesh, order))

@@ -53,42 +53,27 @@ def test_a_function_sees_float64_and_may_return_whole_numbers():
 @pytest.mark.parametrize(
     ("mapping", "message"),
     [
-        (
-            [(0, 1), (0, 2)],
-            "mapping: intensities must increase, got 0 and then 0; sort the pairs and give each "
-            "intensity once",
-        ),
+        ([(0, 1), (0, 2)], "intensities must increase, got 0 and then 0"),
         ([1.0, 2.0], "mapping: expected pairs (intensity, kPa), got an array of shape (2,)"),
         ("soft", "mapping: expected pairs (intensity, kPa), got 'soft'"),
         ([(0, 1), (1,)], "mapping: expected pairs (intensity, kPa), got [(0, 1), (1,)]"),
         (
             [(0, 1), (5, np.nan)],
-            "mapping: expected finite intensities and moduli, got [[0.0, 1.0], [5.0, nan]]",
+            "expected finite intensities and moduli, got [[0.0, 1.0], [5.0, nan]]",
         ),
         (
             [(0, -1), (10, 9)],
-            "modulus: expected 0 kPa or more, got 1 invalid values, such as -1 at intensity 0; "
-            "give a modulus mapping (`young`) that is positive from 0 to 10, or leave out other "
-            "tissue (`mask`)",
+            "0 kPa or more, got 1 invalid values, such as -1 at intensity 0",
         ),
-        (
-            lambda h: 4.0 - h,
-            "modulus: expected 0 kPa or more, got 2 invalid values, such as -1 at intensity 5, "
-            "-6 at intensity 10; "
-            "give a modulus mapping (`young`) that is positive from 0 to 10, or leave out other "
-            "tissue (`mask`)",
-        ),
-        (
-            lambda h: h.sum(),
-            "mapping: expected a function that returns one value for each intensity, got shape "
-            "() for shape (3,)",
-        ),
+        (lambda h: 4.0 - h, "got 2 invalid values, such as -1 at intensity 5, -6 at intensity 10"),
+        (lambda h: h.sum(), "got shape () for shape (3,)"),
     ],
 )
 def test_messages_of_mappings(mapping, message):
     with pytest.raises(InputError) as error:
         young_from(mapping, [0, 5, 10])
-    assert str(error.value) == message
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
 
 
 # From text and files
