@@ -29,7 +29,7 @@ from tetopt import (
     load_image,
     load_mesh,
 )
-from tetopt.job.inputs import label_table
+from tetopt.job.mesh_file import label_table
 from tetopt.model.label_names import NO_TABLE
 from tetopt.report.colours import grey_limits, label_colours, legend_patches
 from tetopt.report.figures import LETTER_INCHES, save_figure

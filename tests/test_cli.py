@@ -477,7 +477,7 @@ def test_ctrl_c_while_reading(here, monkeypatch):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(tetopt.job.inputs, "load_image", interrupted)
+    monkeypatch.setattr(tetopt.job.aligned, "load_image", interrupted)
     assert exit_code("mesh disc.nii -o a.vtu") == 130
     assert here() == []
 

@@ -12,7 +12,7 @@ from commands import exit_code
 import tetopt
 import tetopt.io.nifti
 from tetopt.io.images import parse_crop, smaller_words
-from tetopt.job import inputs
+from tetopt.job import aligned
 from tetopt.system import budget
 
 EDGE = 2000
@@ -88,7 +88,7 @@ def test_a_volume_is_refused_before_its_voxels_are_read(suffix, tmp_path, monkey
     path = tmp_path / f"large{suffix}"
     (write_pyramid if suffix == ".zarr" else write_header)(path)
     monkeypatch.setattr(budget, "available_bytes", lambda: FREE)
-    monkeypatch.setattr(inputs, "load_image", lambda *_, **__: pytest.fail("read"))
+    monkeypatch.setattr(aligned, "load_image", lambda *_, **__: pytest.fail("read"))
     said = refusal(capfd, path)
     assert re.search(r"2000 x 2000 x 2000 voxels: needs about 22\d GB .* only 10 GB is free", said)
     assert re.search(r"use --crop \d+:\d+,\d+:\d+,\d+:\d+ \(6\d\d x 6\d\d x 6\d\d voxels\)", said)
@@ -160,12 +160,12 @@ def test_voxels_are_divided_whatever_memory_is_free(free, monkeypatch):
     if free is not None:
         monkeypatch.setattr(budget, "available_bytes", lambda: free)
     said = []
-    monkeypatch.setattr(inputs, "note", said.append)
+    monkeypatch.setattr(aligned, "note", said.append)
     image = tetopt.Image(np.zeros((8, 8, 8)), np.diag([2.0, 2.0, 2.0, 1.0]))
     labels = {Path("l.nii"): tetopt.Image(np.zeros((16, 16, 16)))}
-    assert inputs._divisions(image, labels, None) == (2, 2, 2)
-    monkeypatch.setattr(inputs, "MOST_DIVIDED", 4 * 8**3)
-    assert inputs._divisions(image, labels, None) == (1, 2, 2)
+    assert aligned._divisions(image, labels, None) == (2, 2, 2)
+    monkeypatch.setattr(aligned, "MOST_DIVIDED", 4 * 8**3)
+    assert aligned._divisions(image, labels, None) == (1, 2, 2)
     assert said[1].endswith("divided by 1 x 2 x 2 instead of 2 x 2 x 2, for at most 2048 voxels")
 
 

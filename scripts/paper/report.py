@@ -24,7 +24,6 @@ from tetopt.image import Image
 from tetopt.io.images import sha256
 from tetopt.io.mni import mni_path, mni_tissue
 from tetopt.job.events import note
-from tetopt.job.inputs import check_outputs
 from tetopt.job.options import WHOLE_BOX
 from tetopt.measure.segmentation import dice, segment, threshold_image
 from tetopt.mesh import Mesh
@@ -38,7 +37,7 @@ from tetopt.report.scene import (
     structure_before_slices,
 )
 from tetopt.report.summary import versions
-from tetopt.system.files import results_folder, save_json
+from tetopt.system.files import check_outputs, results_folder, save_json
 
 PAPER_PICTURES = (
     "fig1.png",

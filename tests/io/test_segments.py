@@ -7,9 +7,11 @@ import pytest
 from numpy.testing import assert_array_equal
 
 import tetopt
+from tetopt.commands.beside import voxels_of
 from tetopt.errors import InputError
 from tetopt.io.images import load_image
 from tetopt.io.label_tables import load_label_table
+from tetopt.job.options import MaskedPart
 from tetopt.study.compare_files import _label_source
 
 sitk = pytest.importorskip("SimpleITK")
@@ -142,6 +144,16 @@ def test_names_come_with_the_labels(tmp_path):
         )
         job = tetopt.Job(images=path, labels=path, output=tmp_path / "a.vtu", label_names=named)
         assert tetopt.read(job).source.table.names == {1: "A", 2: "B", 3: "C"}
+
+
+def test_names_come_with_the_labels_of_another_mesh(tmp_path):
+    """The cells of a mesh's file that take their labels from a segmentation take its names."""
+    path = seg_nrrd(tmp_path, LAYERS[:1], SEGMENTS[:2])
+    mesh = tetopt.lattice_mesh(load_image(path), nodes=60)
+    tetopt.save_mesh(tmp_path / "a.vtu", mesh)
+    loaded = tetopt.load_mesh(tmp_path / "a.vtu")
+    loaded = voxels_of(loaded, tmp_path / "a.vtu", None, MaskedPart(), path).loaded
+    assert loaded.label_table.names == {1: "liver", 2: "bone"}
 
 
 @pytest.mark.full

@@ -23,7 +23,7 @@ from tetopt.io.apart import read_apart
 from tetopt.io.images import load_image, parse_crop, parse_slice, sha256
 from tetopt.io.itk_headers import check_header
 from tetopt.io.meshes import load_mesh
-from tetopt.job.inputs import file_and_volume
+from tetopt.job.option_values import file_and_volume
 from tetopt.job.solver_files import parse_bins
 from tetopt.model.label_names import labels_named
 from tetopt.model.mappings import load_mapping

@@ -13,7 +13,7 @@ import tetopt
 from tetopt import InputError, Job
 from tetopt.cli.options import from_records
 from tetopt.io.images import sha256
-from tetopt.job.inputs import label_sizes_of
+from tetopt.job.option_values import label_sizes_of
 from tetopt.job.options import RunOptions, given_options
 from tetopt.job.request import checksum, job_request
 from tetopt.job.texts import option_words, with_options

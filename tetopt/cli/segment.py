@@ -14,7 +14,7 @@ from tetopt.cli.console import print_line, print_table, show_warning
 from tetopt.cli.options import FilesArgument, NumberOptions, mesh_and_image
 from tetopt.commands.beside import image_voxels, read_labels
 from tetopt.energy.sampling import overlap_of
-from tetopt.job.inputs import read_mesh
+from tetopt.job.mesh_file import read_mesh
 from tetopt.job.options import MaskedPart, Option
 from tetopt.report.tables import new_table
 from tetopt.system.files import check_output

@@ -18,8 +18,8 @@ from tetopt.io.tags import (
     number_parts,
     renumbered_labels,
 )
+from tetopt.io.text import list_names
 from tetopt.io.vtk import VTK_SUFFIXES
-from tetopt.job.inputs import list_names
 from tetopt.job.options import SolverOptions
 from tetopt.model.fields import GAUSS_MODULI
 from tetopt.model.label_names import TABLE_TEXT, labels_of, table_of_words

@@ -16,7 +16,8 @@ from tetopt import InputError
 from tetopt.cli.console import print_line
 from tetopt.cli.options import FilesArgument, ForceOption, ShownOptions, mesh_and_image
 from tetopt.commands.beside import check_part, voxels_of
-from tetopt.job.inputs import label_table, number_of, read_mesh
+from tetopt.job.mesh_file import label_table, read_mesh
+from tetopt.job.option_values import number_of
 from tetopt.job.options import BoxPart, MaskedPart, MaskPart, Option
 from tetopt.model.fields import cell_fields
 from tetopt.model.file import MeshFile, sets_beside

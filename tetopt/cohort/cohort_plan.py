@@ -27,7 +27,7 @@ from tetopt.cohort.subjects import (
 from tetopt.errors import InputError
 from tetopt.io.formats import BUILT_IN
 from tetopt.job.events import note
-from tetopt.job.inputs import file_and_volume, tissue_files
+from tetopt.job.option_values import file_and_volume, tissue_files
 from tetopt.job.options import JobOptions, RunOptions, given_options
 from tetopt.job.plan import Plan, changed_options, plan_job
 from tetopt.job.request import job_request

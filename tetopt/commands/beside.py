@@ -16,7 +16,7 @@ from tetopt.contents.content import Content, continuation, continue_image
 from tetopt.contents.labels import check_labels
 from tetopt.errors import InputError
 from tetopt.image import Image
-from tetopt.job.inputs import (
+from tetopt.job.aligned import (
     Align,
     Beside,
     image_and_others,
@@ -24,10 +24,9 @@ from tetopt.job.inputs import (
     read_companion,
     read_image,
     read_mask,
-    table_of_segmentation,
-    warn_of_other_image,
     warn_of_other_world,
 )
+from tetopt.job.mesh_file import table_of_segmentation, warn_of_other_image
 from tetopt.job.options import WHOLE_BOX, BoxPart, MaskedPart, stated_part
 from tetopt.measure.fidelity import cell_labels
 from tetopt.measure.judge import warn_of_other_mask
@@ -186,15 +185,18 @@ def _with_labels(
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     own = table_of_segmentation(path)
-    texts = {TABLE_TEXT: np.array([table_words(own)])} if own.names else {}
+    texts: dict[str, Any] = {TABLE_TEXT: table_words(own)} if own.names else {}
     inputs = {
         name: each
         for name, each in loaded.table("inputs").items()
         if name not in ("kept_labels", "filled_holes")
     }
     # of the labels that these replace
-    texts |= {"inputs": np.array([json.dumps(inputs)])} if inputs else {}
-    return loaded._replace(cell_data=fields, field_data={**loaded.field_data, **texts}), counted
+    texts |= {"inputs": inputs} if inputs else {}
+    field_data = loaded.field_data | {
+        name: np.array([json.dumps(words)]) for name, words in texts.items()
+    }
+    return loaded._replace(cell_data=fields, field_data=field_data), counted
 
 
 def cell_field(loaded: MeshFile, path: Path, name: str) -> NDArray:

@@ -18,7 +18,7 @@ from tetopt.geometry.surface import Surface, extract_surface
 from tetopt.geometry.topology import facets, largest_component
 from tetopt.io.surfaces import LABELLED_SUFFIXES, SurfaceCheck, check_surface, save_surface
 from tetopt.job.events import note, report_violation, warning
-from tetopt.job.inputs import label_table, read_mesh
+from tetopt.job.mesh_file import label_table, read_mesh
 from tetopt.job.options import LabelNamesOption, Option, SpaceOption
 from tetopt.measure.fidelity import FacetSurface, surface_areas
 from tetopt.model.file import MeshFile

@@ -20,10 +20,10 @@ from tetopt.io.abaqus import input_sets
 from tetopt.io.formats import format_of
 from tetopt.io.frd import read_frd
 from tetopt.io.images import sha256
-from tetopt.io.text import count_text
+from tetopt.io.text import count_text, list_names
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.events import note, progress, warning, warnings_heard
-from tetopt.job.inputs import list_names, read_mesh
+from tetopt.job.mesh_file import read_mesh
 from tetopt.job.options import ALL_LABELS, LabelChoice, LabelledPart, SolverOptions
 from tetopt.job.solver_files import (
     check_solver_options,

@@ -26,8 +26,9 @@ from tetopt.job.advice import (
     tell,
     unmet_requirements,
 )
+from tetopt.job.aligned import read_companion
 from tetopt.job.events import warning
-from tetopt.job.inputs import label_table, read_companion, read_mesh, warn_of_other_image
+from tetopt.job.mesh_file import label_table, read_mesh, warn_of_other_image
 from tetopt.job.options import WHOLE_IMAGE, ImagePart, MaskedPart, SourceOptions
 from tetopt.job.request import checksum
 from tetopt.job.source import Source, read_source

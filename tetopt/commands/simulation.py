@@ -15,7 +15,7 @@ from tetopt.image import Image
 from tetopt.io.formats import save_model
 from tetopt.io.images import sha256
 from tetopt.job.events import warning, warnings_heard
-from tetopt.job.inputs import read_mesh
+from tetopt.job.mesh_file import read_mesh
 from tetopt.job.options import LabelledPart, ModelOptions, stated_part
 from tetopt.job.solver_files import (
     check_model_options,

@@ -14,8 +14,9 @@ from tetopt.energy.sampling import overlap_of
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io.images import OUTPUT_SUFFIXES, save_image, save_voxels
+from tetopt.job.aligned import read_companion
 from tetopt.job.events import note, progress, warning
-from tetopt.job.inputs import read_companion, read_mesh
+from tetopt.job.mesh_file import read_mesh
 from tetopt.job.options import VoxelOptions
 from tetopt.model.fields import half_turned_fields
 from tetopt.model.file import MeshFile, words_of_other_box

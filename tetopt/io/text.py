@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Callable, Container, Iterable
+from collections.abc import Callable, Container, Iterable, Sequence
 
 # not from xml.sax, which imports urllib.request and network modules, 0.02 s
 from html import escape
@@ -12,6 +12,8 @@ from itertools import accumulate, chain, count
 from urllib.parse import quote
 
 from numpy.typing import NDArray
+
+NAMES_LISTED = 8  # as many as fit on a line
 
 NUMBERS_PER_LINE = 16  # the maximum in Abaqus
 # In a field's name, as some readers have lines of 256 characters: gmsh, and legacy VTK,
@@ -159,3 +161,9 @@ def blocks(numbers: NDArray, separator: str = " ") -> str:
     return "".join(
         f"{separator.join(texts[start : start + NUMBERS_PER_LINE])}\n" for start in starts
     )
+
+
+def list_names(names: Sequence[object], most: int = NAMES_LISTED) -> str:
+    """Return the first names as a text, with the number of further ones."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(map(str, names[:most])) + more

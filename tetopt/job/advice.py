@@ -15,8 +15,8 @@ from tetopt.contents.labels import BACKGROUND_LABEL
 from tetopt.engine.loop import MeshingResult
 from tetopt.engine.meshing import Mode
 from tetopt.engine.sliding import MOST_MEETING
+from tetopt.io.text import list_names
 from tetopt.job.events import note, report_violation, warning
-from tetopt.job.inputs import list_names
 from tetopt.job.options import Method
 from tetopt.measure.fidelity import LabelFidelity, MaskFidelity
 from tetopt.measure.interfaces import LabelInterface

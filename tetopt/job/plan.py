@@ -26,7 +26,8 @@ from tetopt.errors import InputError
 from tetopt.io.formats import FORMATS
 from tetopt.io.images import check_bounds, file_shape, parse_crop, parse_slice, smaller_words
 from tetopt.io.label_tables import NO_TABLE, LabelTable
-from tetopt.job.inputs import balance_of, check_outputs, label_sizes_of, number_of, read_companion
+from tetopt.job.aligned import read_companion
+from tetopt.job.option_values import balance_of, label_sizes_of, number_of
 from tetopt.job.options import JobOptions, Method, stated_part
 from tetopt.job.solver_files import check_solver_options
 from tetopt.model.mappings import named_file
@@ -37,7 +38,7 @@ from tetopt.start.memory import BOUND_MARGIN, CHANNEL_BYTES, meshing_bytes
 from tetopt.start.octree import nodes_of_sizes
 from tetopt.start.sizes import Sizes
 from tetopt.system.budget import check_memory
-from tetopt.system.files import check_output, results_folder
+from tetopt.system.files import check_output, check_outputs, results_folder
 
 VOXEL_BYTES = 16.0  # of an image that is read whole, in addition to meshing
 FEWEST_NODES = 5  # of the smallest mesh, an octree in 2-D: a square's corners and its middle

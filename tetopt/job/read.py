@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numba
 import numpy as np
 
 from tetopt.errors import InputError
@@ -13,8 +14,8 @@ from tetopt.image import Image
 from tetopt.io.formats import format_of
 from tetopt.job.advice import tell_label_sizes
 from tetopt.job.events import note, start_stage, warning
-from tetopt.job.inputs import label_table, read_mesh, set_threads, warn_of_other_image
 from tetopt.job.job import Job
+from tetopt.job.mesh_file import label_table, read_mesh, warn_of_other_image
 from tetopt.job.plan import (
     Plan,
     changed_options,
@@ -107,3 +108,13 @@ def _check_place(mesh: Mesh, image: Image, path: str) -> None:
             f"{path}: {np.mean(~is_in):.1%} of its cells lie outside the image, and are not "
             "affected by it"
         )
+
+
+def set_threads(threads: int | None) -> None:
+    """Set the number of threads, or leave it; raise InputError for more than the machine has."""
+    if threads is None:
+        return
+    most = int(numba.config.NUMBA_NUM_THREADS)
+    if not 1 <= threads <= most:
+        raise InputError(f"`threads`: expected 1 to {most} on this machine, got {threads}")
+    numba.set_num_threads(threads)

@@ -13,7 +13,7 @@ from typing import Any
 
 import tetopt
 from tetopt.io.images import sha256, status_checksum
-from tetopt.job.inputs import file_and_volume, tissue_files
+from tetopt.job.option_values import file_and_volume, tissue_files
 from tetopt.job.options import (
     JobOptions,
     OutputOptions,

@@ -20,7 +20,7 @@ from tetopt.image import Image
 from tetopt.io.formats import FIELDS, FORMATS, file_bytes, format_of, save_mesh, save_model
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.events import note, warning, warnings_heard
-from tetopt.job.inputs import label_table
+from tetopt.job.mesh_file import label_table
 from tetopt.job.options import ModelOptions, SolverOptions
 from tetopt.mesh import Mesh
 from tetopt.model.averages import DEFAULT_AVERAGE, parse_average

@@ -26,24 +26,25 @@ from tetopt.energy.sampling import cell_moments
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io.label_tables import NO_TABLE, LabelTable
-from tetopt.io.text import count_text
+from tetopt.io.text import count_text, list_names
 from tetopt.job.advice import required_of
-from tetopt.job.events import note, warning
-from tetopt.job.inputs import (
+from tetopt.job.aligned import (
     Align,
-    Balance,
     Beside,
     Originals,
-    balance_of,
-    file_and_volume,
     image_and_others,
-    label_table,
-    list_names,
     mask_for,
-    number_of,
     read_companion,
     read_image,
     read_mask,
+)
+from tetopt.job.events import note, warning
+from tetopt.job.mesh_file import label_table
+from tetopt.job.option_values import (
+    Balance,
+    balance_of,
+    file_and_volume,
+    number_of,
     tissue_files,
     tissue_volumes,
 )

@@ -13,7 +13,7 @@ from tetopt.image import Image
 from tetopt.io.formats import save_mesh
 from tetopt.io.images import sha256
 from tetopt.job.events import note
-from tetopt.job.inputs import check_outputs, label_table
+from tetopt.job.mesh_file import label_table
 from tetopt.measure.segmentation import threshold_image
 from tetopt.model.fields import cell_fields
 from tetopt.model.label_names import table_of_labels
@@ -32,7 +32,7 @@ from tetopt.study.compare_page import save_compare_page
 from tetopt.study.compare_report import ORDER_WORDS, ImageSource, LabelSource, Report, as_json
 from tetopt.study.options import CompareOptions
 from tetopt.study.program import pipelines_with
-from tetopt.system.files import results_folder, save_json
+from tetopt.system.files import check_outputs, results_folder, save_json
 
 # File and caption of each picture, in the order of the page.
 COMPARE_PICTURES = {

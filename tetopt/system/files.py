@@ -446,3 +446,8 @@ def _plain(value: Any) -> Any:
         # lone surrogates from names: no valid JSON
         return str(value).encode("utf-8", "backslashreplace").decode()
     return value
+
+
+def check_outputs(folder: Path, names: Iterable[str], force: bool) -> dict[str, Path]:
+    """Return files in a folder by name; raise InputError as `check_output`."""
+    return {name: check_output(folder / name, (Path(name).suffix,), force) for name in names}

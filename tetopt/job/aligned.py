@@ -1,21 +1,17 @@
-"""Read the files of a command; reject or report their faults."""
+"""Images of a run, and other files on their voxels."""
 
 from __future__ import annotations
 
-import re
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from math import prod
 from pathlib import Path
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from tetopt.contents.align import (
-    SAME_BOX_VOXELS,
-    SAME_GRID_VOXELS,
     divide_voxels,
     divisions,
     in_box,
@@ -29,46 +25,26 @@ from tetopt.contents.labels import check_labels
 from tetopt.contents.probabilities import resample_tissue
 from tetopt.errors import InputError, Remark
 from tetopt.image import Image
-from tetopt.io.images import (
-    file_shape,
-    load_image,
-    parse_crop,
-    parse_slice,
-    part_of,
-    reader_of,
-    sha256,
-)
-from tetopt.io.label_tables import LabelTable, load_label_table, own_label_table
-from tetopt.io.meshes import load_mesh
+from tetopt.io.images import load_image, parse_crop, parse_slice, part_of, reader_of
+from tetopt.io.label_tables import load_label_table
 from tetopt.io.read_dicom import frame_of_reference
 from tetopt.io.stacks import parse_spacing
+from tetopt.io.text import list_names
 from tetopt.job.events import note, warning
+from tetopt.job.option_values import file_and_volume
 from tetopt.job.options import WHOLE_BOX, BoxPart, ImagePart, MaskedPart, SourceOptions
-from tetopt.model.file import (
-    MeshFile,
-    count_of_other_voxels,
-    own_mask,
-    words_of_other_box,
-)
-from tetopt.model.label_names import (
-    NO_TABLE,
-    label_words,
-    labels_named,
-    labels_of,
-)
-from tetopt.model.mappings import named_file
-from tetopt.start.label_sizes import EVERY_LABEL, LabelSize, parse_label_sizes
-from tetopt.system.files import check_output
-from tetopt.system.incoming import rows_of
+from tetopt.model.file import MeshFile, count_of_other_voxels, own_mask
+from tetopt.model.label_names import label_words, labels_named
 
 # of a mask's or labels' voxels: grids' differences do not explain more outside the image
 OUTSIDE_FRACTION = 0.02
-# headings of the column of sizes in a table
-SIZE_HEADS = ("size", "size_mm", "mm", "edge", "length")
 # voxels, chosen: a run with labels takes 300 bytes per voxel, so up to 20 GB
 MOST_DIVIDED = 2**26
 MASK_LABELS_LISTED = 20  # in a message
-NAMES_LISTED = 8  # as many as fit on a line
+
+Align = Callable[[Image, Image, str], Image]
+Beside = Callable[[Path, Align], Image]
+Originals = Mapping[tuple[Path, Align], Image]
 
 
 def read_image(path: Path, part: BoxPart = WHOLE_BOX) -> Image:
@@ -81,11 +57,6 @@ def read_image(path: Path, part: BoxPart = WHOLE_BOX) -> Image:
         crop=None if part.crop is None else parse_crop(part.crop),
         spacing_mm=None if part.spacing_mm is None else parse_spacing(part.spacing_mm),
     )
-
-
-Align = Callable[[Image, Image, str], Image]
-Beside = Callable[[Path, Align], Image]
-Originals = Mapping[tuple[Path, Align], Image]
 
 
 class Aligned(NamedTuple):
@@ -228,83 +199,6 @@ def read_companion(path: Path, spacing_mm: str | None = None) -> Image:
         return load_image(file, volume=volume, spacing_mm=spacing)
 
 
-def file_and_volume(path: Path) -> tuple[Path, int | None]:
-    """Split `FILE:K` into a file and the volume that K names."""
-    name, colon, volume = str(path).rpartition(":")
-    if colon and re.fullmatch("[0-9]{1,18}", volume) and not path.exists():
-        return Path(name), int(volume)
-    return path, None
-
-
-def tissue_files(path: Path | None) -> list[Path]:
-    """Split an option into the files of tissues, separated by commas."""
-    return [] if path is None else [Path(name.strip()) for name in str(path).split(",")]
-
-
-def tissue_volumes(path: Path) -> dict[str, Path]:
-    """Return the files of tissues, or `FILE:K` for each volume of one, by the tissues' names;
-    raise InputError.
-    """
-    files = tissue_files(path)
-    if Path() in files or len(set(files)) < len(files):
-        raise InputError(f"`tissues`: expected different files, separated by commas, got {path}")
-    shape = file_shape(files[0]) if len(files) == 1 else None
-    if (
-        shape is not None
-        and len(shape) > 3
-        and shape[3] > 1
-        and file_and_volume(files[0])[1] is None
-    ):
-        return {f"tissue {k + 1}": Path(f"{path}:{k}") for k in range(shape[3])}
-    names = [file_and_volume(file)[0].name.split(".")[0] for file in files]
-    numbered = [
-        name if names.count(name) == 1 else f"{name} {k}" for k, name in enumerate(names, 1)
-    ]
-    return dict(zip(numbered, files, strict=True))
-
-
-def number_of(name: str, text: str) -> float:
-    """Convert an option's text to a number; raise InputError with the option's name if it is not
-    one.
-    """
-    try:
-        return float(text)
-    except ValueError:
-        raise InputError(f'{name}: expected a number, got "{text}"') from None
-
-
-class Balance(NamedTuple):
-    """Weights of images and labels."""
-
-    weights: list[float]
-    label_weight: float
-
-
-def balance_of(options: SourceOptions) -> Balance:
-    """Return the requested balance, with defaults."""
-    weights = [1.0] * len(options.images)
-    if options.weights is not None:
-        weights = [number_of("`weights`", part) for part in options.weights.split(",")]
-    return Balance(weights, 1.0 if options.label_weight is None else options.label_weight)
-
-
-def read_mesh(path: Path) -> MeshFile:
-    """Read a mesh of the user's; report inverted, dropped and renamed parts."""
-    loaded = load_mesh(path)
-    if loaded.n_turned:
-        warning(f"{path}: reoriented {loaded.n_turned} inverted cells")
-    if loaded.n_left:
-        note(f"{path}: dropped {loaded.n_left} cells of lower dimension")
-    for line in loaded.notes:
-        note(f"{path}: {line}")
-    if violated := loaded.table("violated"):
-        warning(
-            f"{path}: the run that built this mesh violated requirements: "
-            f"{list_names(list(violated))}"
-        )
-    return loaded
-
-
 def mask_for(
     options: MaskedPart | SourceOptions, image: Image, beside: Beside, loaded: MeshFile | None
 ) -> Image | None:
@@ -374,116 +268,3 @@ def read_mask(
             )
         chosen += labels
     return {(path, resample_mask): Image(np.isin(mask.data, chosen), mask.affine)}
-
-
-def table_of_segmentation(path: Path | None) -> LabelTable:
-    """Return the names and colours that the file of labels itself has, empty if it has none."""
-    return NO_TABLE if path is None else own_label_table(file_and_volume(path)[0])
-
-
-def label_table(
-    path: Path | None, loaded: MeshFile | None = None, labels_path: Path | None = None
-) -> LabelTable:
-    """Return names and colours of labels: those of the file, else in the mesh's file, else in
-    that of the labels.
-    """
-    if path is not None:
-        table = load_label_table(path)
-        labels = None if loaded is None else labels_of(loaded.cell_data, len(loaded.mesh.cells))
-        if labels is not None and not np.isin(labels, [*table.names, *table.colours]).any():
-            warning(
-                f"{path}: contains none of the mesh's labels, "
-                f"{list_names(np.unique(labels).tolist())}"
-            )
-        return table
-    table = NO_TABLE if loaded is None else loaded.label_table
-    return table if table.names else table_of_segmentation(labels_path)
-
-
-def label_sizes_of(text: str, table: LabelTable | None = None) -> dict[int | str, LabelSize]:
-    """Parse sizes by label, from an option or a file; a table of labels, if any, converts names
-    to numbers.
-    """
-    file = named_file(text)
-    if file is not None:
-        text = ",".join(
-            f"{name}={''.join(cells[:1])}"
-            for name, cells in rows_of(file, "table of sizes", SIZE_HEADS)
-        )
-    try:
-        sizes = parse_label_sizes(text)
-        return sizes if table is None else _by_number(sizes, table)
-    except InputError as error:
-        raise error if file is None else InputError(f"{file}: {error}") from error
-
-
-def _by_number(sizes: dict[int | str, LabelSize], table: LabelTable) -> dict[int | str, LabelSize]:
-    """Return the sizes by the labels' numbers instead of names."""
-    numbers = {name: label for label, name in table.names.items()}
-    known = {
-        name: size
-        for name, size in sizes.items()
-        if isinstance(name, int) or name in (*numbers, EVERY_LABEL)
-    }
-    if unknown := [name for name in sizes if name not in known]:
-        raise InputError(
-            f'label_size: no label has the name "{unknown[0]}"; '
-            f"{list_names([*numbers]) or 'the labels have no names'}"
-        )
-    by_label: dict[int | str, LabelSize] = {}
-    for name, size in known.items():
-        label = numbers.get(str(name), name)
-        if label in by_label:
-            raise InputError(f"label_size: label {label} has two sizes")
-        by_label[label] = size
-    return by_label
-
-
-def list_names(names: Sequence[object], most: int = NAMES_LISTED) -> str:
-    """Return the first names as a text, with the number of further ones."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(map(str, names[:most])) + more
-
-
-def warn_of_other_image(
-    loaded: MeshFile,
-    mesh_path: Path,
-    image_path: Path,
-    image: Image,
-    *,
-    is_registered: bool = False,
-    is_exact: bool = False,
-) -> bool:
-    """Warn if the mesh's file names another source image than this one; return whether it does.
-
-    Reject such an image unless it is registered or has the source's box to a voxel; with
-    `is_exact`, reject any image with another box.
-    """
-    made_from, words = loaded.text("image_sha256"), ""
-    is_other = made_from is not None and made_from != sha256(image_path)
-    if is_exact or is_other:
-        words = words_of_other_box(loaded, image, SAME_GRID_VOXELS if is_exact else SAME_BOX_VOXELS)
-    if words and (is_exact or not is_registered):
-        remedy = "if it is registered to that image of the same subject, pass `registered`"
-        remedy = "`check` needs that image, with its crop" if is_exact else remedy
-        name = f"{mesh_path}'s image, {loaded.text('image')}"
-        raise InputError(f"{image_path}: expected the box of {name}, {words}; {remedy}")
-    if is_other:
-        of_box = f": its box was {words}" if words else ""
-        warning(f"{mesh_path} was built from a different image, not {image_path}{of_box}")
-    return is_other
-
-
-def check_outputs(folder: Path, names: Iterable[str], force: bool) -> dict[str, Path]:
-    """Return files in a folder by name; raise InputError as `check_output`."""
-    return {name: check_output(folder / name, (Path(name).suffix,), force) for name in names}
-
-
-def set_threads(threads: int | None) -> None:
-    """Set the number of threads, or leave it; raise InputError for more than the machine has."""
-    if threads is None:
-        return
-    most = int(numba.config.NUMBA_NUM_THREADS)
-    if not 1 <= threads <= most:
-        raise InputError(f"`threads`: expected 1 to {most} on this machine, got {threads}")
-    numba.set_num_threads(threads)
