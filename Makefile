@@ -97,7 +97,7 @@ test-solvers: $(VENV)/.test
 	dpkg -s $(SOLVERS) >/dev/null 2>&1 || { apt-get update -qq && apt-get install -y -qq --no-install-recommends $(SOLVERS); }
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check mfem gmsh pyfebio
 	$(TESTED) tests/solvers tests/model tests/io/test_abaqus.py tests/io/test_febio.py tests/io/test_gmsh.py \
-	  tests/io/test_medit.py tests/io/test_mfem.py tests/io/test_vtk.py tests/io/test_xdmf.py
+	  tests/io/test_medit.py tests/io/test_mfem.py tests/io/test_vtk.py tests/io/test_xdmf.py tests/io/test_writers.py
 
 # The Dockerfile's steps as a script in a fresh environment, and its entry point as another user; needs root.
 test-container: $(VENV)/.test

@@ -9,7 +9,7 @@ from collections import Counter
 import meshio
 import numpy as np
 import pytest
-from models import loaded_model, sample_model, young_of
+from models import loaded_model, sample_model
 from numpy.testing import assert_allclose, assert_array_equal
 
 from tetopt import InputError, Mesh
@@ -69,24 +69,6 @@ def named(raw, keyword):
     }
 
 
-def test_meshio_reads_points_and_cells_back(model):
-    file = read_by_meshio(abaqus(model))
-    (block,) = file.cells
-    n_nodes, n_cells = len(model.mesh.points), len(model.mesh.cells)
-    assert_array_equal(file.points[:n_nodes], model.mesh.points)
-    assert_array_equal(block.data[:, :4], model.mesh.cells)
-    if model.order == 1:
-        assert block.type == "tetra"
-        assert len(file.points) == n_nodes
-        return
-    assert block.type == "tetra10"
-    assert block.data.shape == (n_cells, 10)
-    ends = file.points[block.data[:, np.array(MIDPOINTS) - 1]]
-    assert_allclose(file.points[block.data[:, 4:]], ends.mean(axis=2), rtol=1e-15, atol=1e-17)
-    assert len(np.unique(block.data)) == len(file.points)
-    assert len(np.unique(file.points, axis=0)) == len(file.points)
-
-
 def test_meshio_reads_node_and_cell_sets_back(model):
     file = read_by_meshio(abaqus(model))
     assert list(file.point_sets) == list(model.sets.facets)
@@ -110,42 +92,6 @@ def test_meshio_reads_node_and_cell_sets_back(model):
     assert [name for name in file.cell_sets if name not in own] == list(model.sets.cells)
     for name, cells in {**model.sets.cells, "all_cells": np.arange(len(model.mesh.cells))}.items():
         assert_array_equal(file.cell_sets[name][0], cells)
-
-
-def test_surfaces_are_the_facets_by_the_manual_s_faces(model):
-    surfaces = named(abaqus(model), "*SURFACE")
-    assert list(surfaces) == list(model.sets.facets)
-    for name, rows in model.sets.facets.items():
-        nodes = [
-            [model.mesh.cells[int(cell) - 1][k - 1] for k in FACES[face]]
-            for cell, face in surfaces[name]
-        ]
-        assert_array_equal([int(cell) - 1 for cell, _ in surfaces[name]], rows[:, 0])
-        # Faces are listed as seen from outside, clockwise: the same nodes, turned the other way.
-        expected = facet_triples(model.mesh.cells, rows)
-        assert_array_equal(np.sort(nodes, axis=1), np.sort(expected, axis=1))
-    assert {face for data in surfaces.values() for _, face in data} == set(FACES)
-
-
-def test_each_cell_has_its_material_and_no_other(model):
-    raw = abaqus(model)
-    elements, sections = named(raw, "*ELSET"), named(raw, "*SOLID SECTION")
-    words = blocks_of(raw)
-    elastic = {
-        words[k - 1][1]["NAME"]: data
-        for k, (word, _, data) in enumerate(words)
-        if word == "*ELASTIC"
-    }
-    assert list(elastic) == list(sections) == named_materials(model)
-    links = [parameters for word, parameters, _ in words if word == "*SOLID SECTION"]
-    assert all(parameters["ELSET"] == parameters["MATERIAL"] for parameters in links)
-    constants = np.full((len(model.mesh.cells), 2), np.nan)
-    for name, ((young, nu),) in elastic.items():
-        cells = [int(cell) - 1 for line in elements[name] for cell in line]
-        assert np.isnan(constants[cells]).all()
-        constants[cells] = float(young), float(nu)
-    assert_array_equal(constants[:, 0], young_of(model))
-    assert_array_equal(constants[:, 1], model.materials.nu[model.materials.of_cell])
 
 
 def test_the_step_holds_and_moves_all_three_components():

@@ -8,17 +8,15 @@ import xml.etree.ElementTree as ET
 
 import numpy as np
 import pytest
-from models import LOAD_CASES, displaced, loaded_model, sample_model
+from models import LOAD_CASES, displaced, loaded_model, sample_model, young_of
 from numpy.testing import assert_allclose, assert_array_equal
 
 from tetopt.errors import InputError
 from tetopt.fem.solution import solve
-from tetopt.geometry.quadratic import quadratic, quadratic_facet_nodes
 from tetopt.geometry.simplex import volumes
 from tetopt.io.febio import MOST_MATERIAL_PARTS, febio
 from tetopt.model.materials import materials
 from tetopt.model.model import elements, header_lines, in_space, in_units
-from tetopt.model.sets import facet_triples, nodes_of
 
 
 def with_moduli(nu):
@@ -104,36 +102,6 @@ class Feb:
         return result
 
 
-def assert_same(feb, model):
-    mesh, sets, table = model.mesh, model.sets, model.materials
-    assert feb.type == "tet4"
-    assert_array_equal(feb.node_ids, np.arange(1, len(mesh.points) + 1))
-    assert feb.points.tobytes() == mesh.points.tobytes()
-    assert_array_equal(feb.cells, mesh.cells)
-    assert list(feb.surfaces) == list(feb.node_sets) == list(sets.facets)
-    for name, members in sets.facets.items():
-        assert_array_equal(feb.surfaces[name], facet_triples(mesh.cells, members))
-        assert_array_equal(feb.node_sets[name], nodes_of(mesh, members))
-    assert list(feb.cell_sets) == list(sets.cells)
-    for name, cells in sets.cells.items():
-        assert_array_equal(feb.cell_sets[name], cells)
-    assert_array_equal(feb.moduli("E"), table.young[table.of_cell])
-    assert_array_equal(feb.moduli("v"), table.nu[table.of_cell])
-    assert set(feb.data) <= {"E", "v", "density"}
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("space", ["ras", "lps"])
-def test_everything_comes_back(kind, space):
-    model = in_space(sample(kind), space)
-    raw = febio(model)
-    feb = Feb(raw)
-    assert_same(feb, model)
-    assert len(feb.parts) == (len(model.materials.young) if kind == "parts" else 1)
-    head = raw.decode().split("-->")[0]
-    assert [line for line in head.splitlines() if line][2:] == header_lines(model)
-
-
 def test_no_name_is_taken_twice():
     """FEBio refuses a second node or element set of a name, and Nodes and Elements make one
     each.
@@ -145,23 +113,21 @@ def test_no_name_is_taken_twice():
             assert len(set(names)) == len(names) > 0
 
 
-def test_quadratic():
-    model = sample_model()._replace(order=2)
-    feb = Feb(febio(model))
-    points, cells = quadratic(model.mesh.points, model.mesh.cells)
-    assert feb.type == "tet10"
-    assert feb.points.tobytes() == points.tobytes()
-    assert_array_equal(feb.cells, cells)
-    for name, members in model.sets.facets.items():
-        nodes = quadratic_facet_nodes(cells, members)
-        assert_array_equal(feb.surfaces[name], nodes)
-        assert_array_equal(feb.node_sets[name], np.unique(nodes))
+@pytest.mark.parametrize("kind", KINDS)
+def test_few_materials_are_parts_and_many_are_maps(kind):
+    model = in_space(sample(kind), "lps")
+    raw = febio(model)
+    feb = Feb(raw)
+    assert len(feb.parts) == (len(model.materials.young) if kind == "parts" else 1)
+    assert set(feb.data) <= {"E", "v", "density"}
+    assert_array_equal(feb.moduli("v"), model.materials.nu[model.materials.of_cell])
+    head = raw.decode().split("-->")[0]
+    assert [line for line in head.splitlines() if line][2:] == header_lines(model)
 
 
 def test_one_ratio_is_no_map():
-    model = with_moduli(0.4)
-    feb = Feb(febio(model))
-    assert_same(feb, model)
+    feb = Feb(febio(with_moduli(0.4)))
+    assert set(feb.moduli("v")) == {0.4}
     assert feb.root.find("Material/material/v").attrib == {}
     assert "v" not in feb.data
 
@@ -247,7 +213,7 @@ def test_units_are_consistent_with_mm():
     for units, name, density in (("kPa", "mm-kg-s", 1e-6), ("MPa", "mm-N-s", 1e-9)):
         model = in_units(sample_model(), units)
         feb = Feb(febio(model))
-        assert_same(feb, model)
+        assert_array_equal(feb.moduli("E"), young_of(model))
         assert feb.root.find("Module/units").text == name
         assert {float(element.text) for element in feb.root.iter("density")} == {density}
 

@@ -9,11 +9,7 @@ import meshio
 import numpy as np
 import pytest
 from models import quadratic_model, sample_model
-from test_febio import Feb
-from test_medit import KEYWORD
-from test_medit import Read as Medit
-from test_mfem import Read as Mfem
-from test_xdmf import grids, item, named
+from test_writers import READERS
 
 import tetopt
 from tetopt import InputError
@@ -82,29 +78,12 @@ def found(path, model):
     if suffix == ".inp":
         file, sets = meshio.read(path), input_sets(path, model.mesh)
         return len(file.points), len(file.cells[0].data), *sets
-    if suffix == ".feb":
-        feb = Feb(path.read_bytes())
-        return len(feb.points), len(feb.cells), feb.surfaces, feb.cell_sets
-    if suffix == ".xdmf":
-        parts = grids(path.read_bytes())
-        points, cells = (
-            item(parts["mesh"].find(f"{each}/DataItem")) for each in ("Geometry", "Topology")
+    if suffix in (".feb", ".xdmf", ".mfem", ".mesh"):
+        read = READERS[suffix](path.read_bytes(), model)
+        names = (
+            [name for name in each if len(each[name])] for each in (read.facets, read.cell_sets)
         )
-        return (
-            len(points),
-            len(cells),
-            *(named(parts[each]) if each in parts else () for each in ("facets", "cells")),
-        )
-    if suffix == ".mfem":
-        mfem = Mfem(path.read_bytes())
-        return len(mfem.points), len(mfem.cells), mfem.facet_sets, mfem.cell_sets
-    if suffix == ".mesh":
-        medit = Medit(path.read_bytes())
-        facets, cells = (
-            {name for name in each if medit.refs_of(KEYWORD[dim], name)}
-            for each, dim in zip(model.sets, (2, 3), strict=True)
-        )
-        return len(medit.points), len(medit.nodes[KEYWORD[3]]), facets, cells
+        return len(read.points), len(read.cells), *names
     file = tetopt.load_mesh(path)
     return len(file.mesh.points), len(file.mesh.cells), *file.sets
 

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from models import (
     ABOUT,
-    all_nodes,
     each_once,
     labelled_model,
     quadratic_model,
@@ -32,7 +31,6 @@ from tetopt.io.gmsh import gmsh22, gmsh41, own_comments
 from tetopt.io.meshes import load_mesh
 from tetopt.model.build import build_model
 from tetopt.model.loads import load_words
-from tetopt.model.materials import materials
 from tetopt.model.model import element_facets, elements, in_space, in_units
 from tetopt.model.sets import FACE_NAMES, Sets, box_of, facet_triples
 
@@ -40,6 +38,7 @@ WRITERS = {"4.1": gmsh41, "2.2": gmsh22}
 MODELS = [(3, 3), (3, None), (2, 3), (2, None)]
 NODES_OF_TYPE = {1: 2, 2: 3, 4: 4, 8: 3, 9: 6, 11: 10}
 DIM_OF_TYPE = {1: 1, 2: 2, 4: 3, 8: 1, 9: 2, 11: 3}
+SWAPPED = [0, 1, 2, 3, 4, 5, 6, 7, 9, 8]  # gmsh's order of the middles of 10 nodes
 
 # Reading, after the chapters "MSH file format" and "MSH file format version 2" of gmsh's manual
 
@@ -177,38 +176,10 @@ def test_each_cell_without_label_is_in_the_one_group_of_its_material(version, n,
 @pytest.mark.parametrize("n", [3, 2])
 def test_the_label_is_the_number_of_group_and_entity(version, n):
     model = labelled_model(n)
-    labels, read = model.cell_data["label"], Read(WRITERS[version](model))
-    expected = {"label_0": (8, 0), "label_2": (2, 2), "label_3": (3, 3), "Right_kidney": (7, 7)}
-    assert {name: number for (dim, number), name in read.names.items() if dim == n} == {
-        name: number for name, (number, _) in expected.items()
-    }
-    for name, (number, label) in expected.items():
-        assert sorted(read.groups[n, name]) == (np.flatnonzero(labels == label) + 1).tolist()
-        assert {read.elements[k][1] for k in read.groups[n, name]} == {number}
-    assert "physical groups of cells are the labels; label 0 is 8" in read.comments
-
-
-@pytest.mark.parametrize("version", WRITERS)
-def test_materials_and_sets_that_divide_a_label_leave_its_group_whole(version):
-    """Entities divide it: numbers behind all groups, of which none is then the label's own."""
-    model = labelled_model()
-    table = materials(1.0 + np.arange(len(model.mesh.cells)) % 2, 0.3, len(model.mesh.cells))
-    within = np.flatnonzero(model.cell_data["label"] == 3)[::3]
-    model = model._replace(
-        materials=table, sets=model.sets._replace(cells=model.sets.cells | {"within": within})
-    )
     read = Read(WRITERS[version](model))
-    numbers = {}
-    for number, name in ((2, "label_2"), (3, "label_3"), (7, "Right_kidney"), (8, "label_0")):
-        assert (
-            sorted(read.groups[3, name])
-            == (np.flatnonzero(model.cell_data["label"] == number % 8) + 1).tolist()
-        )
-        numbers[number] = {read.elements[k][1] for k in read.groups[3, name]}
-    assert min(numbers[3]) > 1000
-    assert len(numbers[3]) == (2 if version == "4.1" else 4)
-    assert (numbers[2] == {2}) == (version == "4.1")  # where moduli are views
-    assert sorted(read.cells_of_set("within")) == within.tolist()
+    of_cells = {name: number for (dim, number), name in read.names.items() if dim == n}
+    assert of_cells == {"label_0": 8, "label_2": 2, "label_3": 3, "Right_kidney": 7}
+    assert "physical groups of cells are the labels; label 0 is 8" in read.comments
 
 
 @pytest.mark.parametrize("suffix", [".msh", ".msh2", ".mesh", ".mfem"])
@@ -280,13 +251,6 @@ def test_facet_sets_are_groups(version, n, bins):
 @pytest.mark.parametrize("n", [3, 2])
 def test_41_facets_face_out_of_the_cell_of_the_first_set(n):
     model = sample_model(n)
-    faces = {
-        tuple(nodes)
-        for nodes in facet_triples(model.mesh.cells, model.sets.facets["boundary"]).tolist()
-    }
-    read = Read(gmsh41(model))
-    assert {tuple(nodes) for nodes in read.nodes(read.groups[n - 1, "boundary"]).tolist()} == faces
-
     a = model.sets.facets["interface_0_1"]
     inner = each_once(facet_triples(model.mesh.cells, a))
     every = np.argwhere(np.ones(model.mesh.cells.shape))
@@ -305,20 +269,17 @@ def test_41_facets_face_out_of_the_cell_of_the_first_set(n):
             assert sorted(read.nodes(read.groups[n - 1, name]).tolist()) == expected
 
 
-@pytest.mark.parametrize(("n", "bins"), MODELS)
-def test_views_hold_cell_data_and_materials(n, bins):
-    model = sample_model(n, bins)
+@pytest.mark.parametrize("n", [3, 2])
+def test_views_hold_each_column_and_the_facets_values(n):
+    model = sample_model(n)
     several = np.random.default_rng(0).normal(size=(len(model.mesh.cells), 2))
     model = model._replace(cell_data={**model.cell_data, "contrast": several})
     read = Read(gmsh41(model))
-    table, numbers = model.materials, cell_numbers(model)
-    expected = {name: values for name, values in model.cell_data.items() if name != "contrast"}
-    expected |= {"contrast_0": several[:, 0], "contrast_1": several[:, 1]}
-    expected |= {"young": table.young[table.of_cell], "nu": table.nu[table.of_cell]}
-    assert set(read.views) == set(expected)
-    for name, values in expected.items():
-        assert [read.views[name][number] for number in numbers] == values.tolist()
-        assert list(read.views[name]) == list(read.elements)  # in their order, as meshio wants it
+    for k in (0, 1):
+        view = read.views[f"contrast_{k}"]
+        assert [view[number] for number in cell_numbers(model)] == several[:, k].tolist()
+    for view in read.views.values():
+        assert list(view) == list(read.elements)  # in their order, as meshio wants it
     of_facet = {
         tuple(sorted(nodes)): number
         for number, (_, _, nodes) in read.elements.items()
@@ -432,58 +393,6 @@ SUFFIX = {"4.1": ".msh", "2.2": ".msh2"}
 
 
 @pytest.mark.parametrize("version", WRITERS)
-@pytest.mark.parametrize(("n", "space"), [(2, "ras"), (3, "ras"), (3, "lps")])
-@pytest.mark.parametrize(("bins", "order"), [(3, 1), ("none", 1), ("many", 1), (3, 2)])
-def test_our_reader_finds_the_model(version, n, space, bins, order, tmp_path, monkeypatch):
-    """Points, cells, sets, moduli in their units, where the file came from; in 4.1 in another
-    order of cells.
-    """
-    model, path = (
-        (sample_model if order == 1 else quadratic_model)(n),
-        tmp_path / f"a{SUFFIX[version]}",
-    )
-    if bins == "none":
-        model = model._replace(materials=None)
-    if bins == "many" and version == "4.1":  # then they are no groups
-        monkeypatch.setattr(tetopt.io.gmsh, "MOST_MATERIAL_GROUPS", 2)
-    save_model(path, model, space=space, units="MPa")
-    back = load_mesh(path)
-    assert (back.space, back.n_turned, back.notes, back.order) == (space, 0, (), order)
-    if order == 2 and version == "4.1":
-        assert np.array_equal(
-            back.point_data["warmth"], all_nodes(model.point_data["warmth"], model.mesh)
-        )
-        if n == 3:
-            assert np.array_equal(back.point_data["displacement"], model.point_data["displacement"])
-    assert back.mesh.points.tobytes() == model.mesh.points.tobytes()
-    assert {name: values.tolist() for name, values in back.field_data.items()} == {
-        "units": ["MPa"],
-        "image": [ABOUT["image"]],
-        "image_sha256": [ABOUT["image_sha256"]],
-    }
-    place = {tuple(cell): k for k, cell in enumerate(model.mesh.cells.tolist())}
-    of_cell = np.array([place[tuple(cell)] for cell in back.mesh.cells.tolist()])
-    assert sorted(of_cell) == list(range(len(place)))
-    expected = dict(model.cell_data) if version == "4.1" else {"label": model.cell_data["label"]}
-    if bins != "none":
-        scaled = in_units(model, "MPa").materials
-        expected |= {
-            "young": scaled.young[scaled.of_cell] * 1000.0,
-            "nu": scaled.nu[scaled.of_cell],
-        }
-    assert set(back.cell_data) == set(expected)
-    for name, values in expected.items():
-        assert_array_equal(back.cell_data[name], values[of_cell])
-    assert set(back.sets.cells) == set(model.sets.cells)
-    for name, members in model.sets.cells.items():
-        assert_array_equal(back.sets.cells[name], np.flatnonzero(np.isin(of_cell, members)))
-    assert set(back.sets.facets) == set(model.sets.facets)
-    for name, rows in model.sets.facets.items():
-        triples = facet_triples(back.mesh.cells, back.sets.facets[name])
-        assert each_once(triples) == each_once(facet_triples(model.mesh.cells, rows))
-
-
-@pytest.mark.parametrize("version", WRITERS)
 def test_numbers_and_names_survive_a_round_trip(version, tmp_path):
     first, second = (tmp_path / f"{name}{SUFFIX[version]}" for name in "ab")
     save_model(first, labelled_model())
@@ -591,43 +500,6 @@ def test_comments_of_others_are_not_ours():
 # Others' readers
 
 
-@pytest.mark.parametrize("version", WRITERS)
-@pytest.mark.parametrize(("n", "bins", "order"), [(3, 3, 1), (2, None, 1), (3, 3, 2), (2, None, 2)])
-def test_meshio_reads_it(version, n, bins, order, tmp_path):
-    model = (sample_model if order == 1 else quadratic_model)(n, bins)
-    points, own = elements(model)
-    path = tmp_path / "model.msh"
-    path.write_bytes(WRITERS[version](model))
-    read = meshio.read(path)
-    assert np.array_equal(read.points[:, :n], points)
-    kind = {3: "triangle", 4: "tetra", 6: "triangle6", 10: "tetra10"}[own.shape[1]]
-    blocks = [k for k, block in enumerate(read.cells) if block.type == kind]
-    cells = np.concatenate([read.cells[k].data for k in blocks])
-    groups = np.concatenate([read.cell_data["gmsh:physical"][k] for k in blocks])
-    ours, theirs = np.lexsort(own.T), np.lexsort(cells.T)  # meshio drops the numbers of elements
-    assert np.array_equal(cells[theirs], own[ours])
-    labels = model.cell_data["label"]
-    assert np.array_equal(groups[theirs], np.where(labels == 0, 2, labels)[ours])
-    if version == "2.2":
-        assert np.array_equal(cells, own)
-        return
-    for name in ("mean", "young"):
-        assert len(read.cell_data[name]) == len(read.cells)
-    mean = np.concatenate([read.cell_data["mean"][k] for k in blocks])
-    assert np.array_equal(mean[theirs], model.cell_data["mean"][ours])
-    if order == 2:
-        assert np.array_equal(
-            read.point_data["warmth"], all_nodes(model.point_data["warmth"], model.mesh)
-        )
-    for name, rows in model.sets.facets.items():
-        members = [
-            block.data[chosen]
-            for block, chosen in zip(read.cells, read.cell_sets[name], strict=True)
-        ]
-        triples = np.concatenate([nodes for nodes in members if len(nodes)])
-        assert each_once(triples) == each_once(element_facets(own, rows))
-
-
 # gmsh is GPL: its library is loaded by a process of its own
 GMSH = """
 import json, sys
@@ -659,33 +531,40 @@ for kind in mesh.getElementTypes(dim):
     places, _ = mesh.getIntegrationPoints(kind, "Gauss3")
     determinants += mesh.getJacobians(kind, places)[1].tolist()
 said = [line for line in gmsh.logger.get() if not line.startswith("Info")]
-print(json.dumps([order.tolist(), points.tolist(), groups, nodes, views, said, determinants, tags]))
+of_entities = {each: mesh.getElements(*each)[2] for each in gmsh.model.getEntities()}
+entities = {str(each): members[0].tolist() for each, members in of_entities.items() if len(members)}
+found = [order.tolist(), points.tolist(), said, determinants, groups, nodes, views, tags, entities]
+print(json.dumps(found))
 """
 
 
-@pytest.mark.skipif(importlib.util.find_spec("gmsh") is None, reason="no gmsh (pip install gmsh)")
-@pytest.mark.parametrize("version", WRITERS)
-@pytest.mark.parametrize(("n", "bins", "order"), [(3, 3, 1), (2, None, 1), (3, 3, 2), (2, None, 2)])
-def test_gmsh_reads_it(version, n, bins, order, tmp_path):
-    """Cells, facets and their groups; that all cells are as large as ours, anywhere within,
-    tells their edges apart.
+def read_by_gmsh(path, model):
+    """What gmsh finds beside the nodes, after a look at these and at the size of cells anywhere
+    within: it says whether their edges are where it has them.
     """
-    model = (sample_model if order == 1 else quadratic_model)(n, bins)
-    own_points, own = elements(model)
-    path = tmp_path / "model.msh"
-    path.write_bytes(WRITERS[version](model))
+    if importlib.util.find_spec("gmsh") is None:
+        pytest.skip("no gmsh (pip install gmsh)")
     child = subprocess.run(
         [sys.executable, "-c", GMSH, str(path)], capture_output=True, text=True, check=True
     )
-    numbers, points, groups, nodes, views, said, determinants, tags = json.loads(
-        child.stdout.splitlines()[-1]
-    )
+    order, points, said, determinants, *rest = json.loads(child.stdout.splitlines()[-1])
+    n, (own_points, own) = model.mesh.ndim, elements(model)
     assert said == []
-    points = np.array(points).reshape(-1, 3)[np.argsort(numbers)]
-    assert np.array_equal(points[:, :n], own_points)
+    assert_array_equal(np.reshape(points, (-1, 3))[np.argsort(order)][:, :n], own_points)
     sizes = np.sort(np.reshape(determinants, (len(own), -1)) / [0, 0, 2, 6][n], axis=0)
     expected = np.sort(volumes(model.mesh.points, model.mesh.cells))
     assert_allclose(sizes, np.broadcast_to(expected[:, None], sizes.shape), rtol=1e-10)
+    return rest
+
+
+@pytest.mark.parametrize("version", WRITERS)
+@pytest.mark.parametrize(("n", "bins", "order"), [(3, 3, 1), (2, None, 1), (3, 3, 2), (2, None, 2)])
+def test_gmsh_reads_it(version, n, bins, order, tmp_path):
+    """Cells, facets and their groups."""
+    model = (sample_model if order == 1 else quadratic_model)(n, bins)
+    own, path = elements(model)[1], tmp_path / "model.msh"
+    path.write_bytes(WRITERS[version](model))
+    groups, nodes, views, tags, _ = read_by_gmsh(path, model)
     smaller = set()
     for name, rows in sorted(model.sets.facets.items(), key=lambda item: len(item[1])):
         triples = [each for _, each in groups.pop(f"{n - 1} {name}", [])]
@@ -702,7 +581,7 @@ def test_gmsh_reads_it(version, n, bins, order, tmp_path):
         assert tags[f"{n} label_{label}"] == number
         triples = sorted(groups.pop(f"{n} label_{label}"))
         assert [number for number, _ in triples] == (members + 1).tolist()
-        swapped = [0, 1, 2, 3, 4, 5, 6, 7, 9, 8] if own.shape[1] == 10 else slice(None)
+        swapped = SWAPPED if own.shape[1] == 10 else slice(None)
         assert np.array_equal(np.array([each for _, each in triples]) - 1, own[members][:, swapped])
     assert groups == {}
     assert ("young" in views) == (version == "4.1")

@@ -84,84 +84,24 @@ class Read:
         return self.facets[np.isin(self.facet_attributes, self.facet_sets[name])]
 
 
-@pytest.mark.parametrize(("n", "bins"), MODELS)
-def test_all_of_the_model_is_there(n, bins):
-    model = sample_model(n, bins)
-    read = Read(mfem(model))
-    assert read.n == n
-    assert np.array_equal(read.points, model.mesh.points)
-    assert np.array_equal(read.cells, model.mesh.cells)
-    table = model.materials
-    assert set(read.cell_sets) == {
-        *model.sets.cells,
-        *(f"material_{k + 1}" for k in range(len(table.young))),
-    }
-    for name, members in model.sets.cells.items():
-        assert np.array_equal(read.cells_of(name), members)
-    for k in range(len(table.young)):
-        assert np.array_equal(
-            read.cells_of(f"material_{k + 1}"), np.flatnonzero(table.of_cell == k)
-        )
-    assert list(read.facet_sets) == list(model.sets.facets)
-    for name, rows in model.sets.facets.items():
-        assert each_once(read.facets_of(name)) == each_once(facet_triples(model.mesh.cells, rows))
-    assert len(set(each_once(read.facets))) == len(read.facets)  # each once
-
-
-@pytest.mark.parametrize("n", [3, 2])
-def test_boundary_elements_face_out(n):
-    model = sample_model(n)
-    faces = facet_triples(model.mesh.cells, model.sets.facets["boundary"])
-    assert sorted(Read(mfem(model)).facets_of("boundary").tolist()) == sorted(faces.tolist())
-
-
-@pytest.mark.parametrize("n", [3, 2])
-@pytest.mark.parametrize("has_sets", [True, False])
-def test_the_attribute_is_the_label(n, has_sets):
-    """Also where labels are no sets: these are named in the file all the same."""
-    model = labelled_model(n)
-    labels = model.cell_data["label"]
-    read = Read(mfem(model if has_sets else model._replace(sets=Sets({}, {}))))
-    assert np.array_equal(read.attributes, np.where(labels == 0, 8, labels))
-    assert read.cell_sets == {"label_0": [8], "label_2": [2], "label_3": [3], "Right_kidney": [7]}
-    assert any(line.startswith("label 0 is attribute 8") for line in read.comments)
-    boundary = model.sets.facets["boundary"]
-    fewer = Read(mfem(model._replace(sets=Sets({"boundary": boundary}, {}))))
-    assert fewer.facet_sets == {"boundary": [1999]}  # of whatever mesh
-
-
-def test_parts_of_divided_labels_have_attributes_behind_all_others():
+def test_labels_that_are_no_sets_are_named_all_the_same():
+    """Also where materials divide them; parts by sets in comments; the boundary has its number
+    whatever the mesh.
+    """
     model = labelled_model()
-    labels = model.cell_data["label"]
-    within = np.flatnonzero(labels == 3)[::3]
-    read = Read(
-        mfem(model._replace(sets=model.sets._replace(cells=model.sets.cells | {"within": within})))
-    )
-    assert set(read.attributes[labels == 3]) == {2001, 2002}
-    assert np.array_equal(
-        read.attributes[labels != 3], np.where(labels == 0, 8, labels)[labels != 3]
-    )
-    assert np.array_equal(read.cells_of("within"), within)
-    assert any(" 2001 " in line and line.endswith("(label_3)") for line in read.comments)
+    labels, boundary = model.cell_data["label"], model.sets.facets["boundary"]
+    read = Read(mfem(model._replace(sets=Sets({"boundary": boundary}, {}))))
+    assert read.cell_sets == {"label_0": [8], "label_2": [2], "label_3": [3], "Right_kidney": [7]}
+    assert np.array_equal(read.attributes, np.where(labels == 0, 8, labels))
+    assert read.facet_sets == {"boundary": [1999]}
     table = materials(1.0 + np.arange(len(labels)) % 2, 0.3, len(labels))
-    divided = Read(mfem(model._replace(materials=table, sets=Sets({}, {}))))
-    assert divided.attributes.min() > 2000
+    divided = Read(mfem(model._replace(materials=table, sets=Sets({}, {}), order=2)))
     for name, label in (("label_0", 0), ("label_3", 3), ("Right_kidney", 7)):
         assert np.array_equal(divided.cells_of(name), np.flatnonzero(labels == label))
     assert not any(line.startswith("label 0 is") for line in divided.comments)  # two attributes are
-
-
-@pytest.mark.parametrize("n", [3, 2])
-def test_order_2_adds_the_middle_of_each_edge_once(n):
-    model = quadratic_model(n)
-    read, linear = Read(mfem(model)), Read(mfem(sample_model(n)))
-    assert np.array_equal(read.points, model.mesh.points)
-    assert np.array_equal(read.cells, model.mesh.cells)
-    assert np.array_equal(read.facets, linear.facets)
-    assert (read.cell_sets, read.facet_sets) == (linear.cell_sets, linear.facet_sets)
-    expected = quadratic(model.mesh.points, model.mesh.cells)[0][len(model.mesh.points) :]
-    assert sorted(read.middles.tolist()) == sorted(expected.tolist())
-    assert "point data (not supported by this format): displacement, warmth" in read.comments
+    within = model.sets._replace(cells={"within": np.flatnonzero(labels == 3)[::3]})
+    comments = Read(mfem(model._replace(sets=within))).comments
+    assert any(" 2001 " in line and line.endswith("(label_3)") for line in comments)
 
 
 @pytest.mark.parametrize(("n", "edges"), [(2, "01 12 20"), (3, "01 02 03 12 13 23")])

@@ -4,18 +4,16 @@ dolfinx has its own test.
 
 from xml.etree import ElementTree
 
-import meshio
 import numpy as np
 import pytest
 import pyvista
-from models import ABOUT, all_nodes, labelled_model, quadratic_model, sample_model, with_two_sides
+from models import ABOUT, all_nodes, quadratic_model, sample_model, with_two_sides
 
 from tetopt.errors import InputError
 from tetopt.io.xdmf import xdmf
 from tetopt.model.loads import load_words
-from tetopt.model.materials import materials
 from tetopt.model.model import elements, header_lines, in_space, in_units
-from tetopt.model.sets import Sets, facet_triples, standard_sets
+from tetopt.model.sets import Sets, standard_sets
 
 MODELS = {
     "3-D": sample_model,
@@ -70,20 +68,8 @@ def fields(grid, center="Cell"):
     return {each.get("Name"): item(each.find("DataItem")) for each in of_kind}
 
 
-def sorted_rows(rows):
-    return rows[np.lexsort(rows.T[::-1])]
-
-
 def turned_over(triples):
     return np.concatenate([triples[:, 1::-1], triples[:, 2:]], axis=1)
-
-
-def from_smallest(triples):
-    """The facets with their smallest node first and the same side out."""
-    if triples.shape[1] == 2:
-        return triples
-    start = triples.argmin(axis=1)[:, None]
-    return np.take_along_axis(triples, (start + np.arange(3)) % 3, axis=1)
 
 
 def facet_set(grid, name):
@@ -96,86 +82,12 @@ def facet_set(grid, name):
     return np.where(is_turned[:, None], turned_over(nodes), nodes)[is_in]
 
 
-def test_mesh_and_cell_data_are_the_models_own(model):
-    mesh, (points, cells) = grids(model)["mesh"], elements(model)
-    assert np.array_equal(item(mesh.find("Geometry/DataItem")), points)
-    assert np.array_equal(item(mesh.find("Topology/DataItem")), cells)
-    kind = {3: "Triangle", 4: "Tetrahedron", 6: "Triangle_6", 10: "Tetrahedron_10"}[cells.shape[1]]
-    assert mesh.find("Topology").get("TopologyType") == kind
-    columns, table = fields(mesh), model.materials
-    if table is not None:
-        assert next(iter(columns)) == "material"  # the one that dolfinx reads as tags
-        assert np.array_equal(columns.pop("material"), table.of_cell + 1)
-        assert np.array_equal(columns.pop("young"), table.young[table.of_cell])
-        assert np.array_equal(columns.pop("nu"), table.nu[table.of_cell])
-        lists = {
-            name: words for name, words in named(mesh).items() if name not in ("about", "load")
-        }
-        assert {name: [float(word) for word in words] for name, words in lists.items()} == {
-            "young": table.young.tolist(),
-            "nu": table.nu.tolist(),
-        }
-    assert list(columns) == list(model.cell_data)
-    for name, values in model.cell_data.items():
-        assert np.array_equal(columns[name], values), name
-        assert columns[name].dtype.kind == values.dtype.kind, name
-
-
-def test_every_facet_set_comes_back_with_its_side(model):
-    parts = grids(model)
-    assert ("facets" in parts) == bool(model.sets.facets)
-    if not model.sets.facets:
-        return
-    nodes, n = item(parts["facets"].find("Topology/DataItem")), model.mesh.ndim
-    triples = nodes[:, :n]
-    if model.order == 2:  # the middles of the edges 01, 12 and 20
-        points = elements(model)[0]
-        for k, edge in enumerate([(0, 1), (1, 2), (2, 0)][: 3 if n == 3 else 1], n):
-            assert np.array_equal(points[nodes[:, k]], points[nodes[:, edge]].mean(axis=1))
-    assert nodes.shape[1] == (n if model.order == 1 else 3 * n - 3)
-    # dolfinx knows one tag a facet
-    assert len(np.unique(np.sort(triples, axis=1), axis=0)) == len(triples)
-    assert {name for name in named(parts["facets"]) if not name.endswith(" turned")} == set(
-        model.sets.facets
-    )
-    for name, rows in model.sets.facets.items():
-        expected = facet_triples(model.mesh.cells, rows)
-        got = facet_set(parts["facets"], name)
-        assert np.array_equal(
-            sorted_rows(from_smallest(got)), sorted_rows(from_smallest(expected))
-        ), name
-
-
 def test_a_side_is_told_only_where_two_sets_differ():
     turned = {
         n: [name for name in named(grids(model)["facets"]) if "turned" in name]
         for n, model in enumerate([sample_model(), with_two_sides(sample_model())])
     }
     assert turned == {0: [], 1: ["bright turned"]}
-
-
-def test_every_cell_set_comes_back(model):
-    parts = grids(model)
-    assert ("cells" in parts) == bool(model.sets.cells)
-    if not model.sets.cells:
-        return
-    grid = parts["cells"]
-    tags, tags_of = fields(grid)["cells"], named(grid)
-    assert list(tags_of) == list(model.sets.cells)
-    members = item(grid.find("Topology/DataItem"))
-    for name, cells in model.sets.cells.items():
-        own = elements(model)[1][cells]
-        assert np.array_equal(members[np.isin(tags, np.array(tags_of[name], dtype=int))], own), name
-
-
-def test_the_tag_of_a_cell_is_its_label():
-    model = labelled_model()
-    labels, within = model.cell_data["label"], np.flatnonzero(model.cell_data["label"] == 3)[::3]
-    table = materials(1.0 + np.arange(len(labels)), 0.3, len(labels))
-    sets = model.sets._replace(cells=model.sets.cells | {"within": within})
-    tags = fields(grids(model._replace(materials=table, sets=sets))["cells"])["cells"]
-    assert np.array_equal(tags[labels != 3], np.where(labels == 0, 8, labels)[labels != 3])
-    assert tags[labels == 3].min() > 2000
 
 
 @pytest.mark.parametrize("n", [2, 3])
@@ -279,17 +191,3 @@ def test_values_that_vtk_cannot_read_are_refused(value):
                 point_data={"odd": np.array([value] + [1.0] * (len(model.mesh.points) - 1))}
             )
         )
-
-
-def test_meshio_reads_the_mesh_and_its_data(model, tmp_path):
-    (tmp_path / "model.xdmf").write_bytes(xdmf(model))
-    read, (points, cells) = meshio.read(tmp_path / "model.xdmf"), elements(model)
-    (block,) = read.cells
-    assert np.array_equal(block.data, cells)
-    assert np.array_equal(read.points, points)
-    whole = grids(model)["mesh"]
-    of_cells = {name: np.concatenate(values) for name, values in read.cell_data.items()}
-    for center, theirs in (("Cell", of_cells), ("Node", read.point_data)):
-        ours = fields(whole, center)
-        assert set(ours) == set(theirs)
-        assert all(np.array_equal(theirs[name], values) for name, values in ours.items())
