@@ -16,7 +16,7 @@ from tetopt.geometry.simplex import volumes
 from tetopt.model.label_names import TABLE_TEXT, LabelTable, table_words
 from tetopt.model.loads import parse_loads
 from tetopt.model.materials import bin_moduli, materials
-from tetopt.model.model import Model
+from tetopt.model.model import Model, in_space, in_units
 from tetopt.model.sets import (
     Sets,
     box_of,
@@ -140,6 +140,27 @@ def with_two_sides(model):
     """The model with the interface also as a set that holds it from its other side."""
     bright = enclosing_facets(model.mesh, model.sets.cells["label_1"])
     return model._replace(sets=Sets(model.sets.facets | {"bright": bright}, model.sets.cells))
+
+
+# Models by what a writer has to tell of them
+SAMPLES = {
+    "3-D": sample_model,
+    "2-D": lambda: sample_model(2),
+    "as many materials as cells": lambda: sample_model(3, None),
+    "as many materials as cells, 2-D": lambda: sample_model(2, None),
+    "no labels": lambda: unlabelled(sample_model()),
+    "two sides": lambda: with_two_sides(sample_model()),
+    "two sides, 2-D": lambda: with_two_sides(sample_model(2)),
+    "LPS, MPa": lambda: in_units(in_space(sample_model(), "lps"), "MPa"),
+    "quadratic": lambda: with_two_sides(quadratic_model()),
+    "quadratic, 2-D": lambda: with_two_sides(quadratic_model(2)),
+    "label sets only": lambda: sample_model()._replace(
+        sets=standard_sets(sample_model().mesh, labels=sample_model().cell_data["label"]), loads=()
+    ),
+    "bare": lambda: sample_model()._replace(
+        cell_data={}, sets=Sets({}, {}), materials=None, loads=(), about={}
+    ),
+}
 
 
 def our_compression(model, nu):

@@ -13,16 +13,26 @@ OBLIQUE = np.diag([1.0, 1.0, 1.2, 1.0])
 OBLIQUE[:3, :3] = [[0.9, -0.436, 0.0], [0.436, 0.9, 0.0], [0.0, 0.0, 1.2]]
 
 
-def row_of(k, run, **changes):
+def row_of(k, run):
     row = Row(f"sub-{k}", "done", "", (), {}, {}, {}, {}, {})
-    return with_numbers(row, run | {"label_names": {"17": "hippocampus"}})._replace(**changes)
+    return with_numbers(row, run | {"label_names": {"17": "hippocampus"}})
+
+
+def rows_of(changes):
+    """Rows of usual runs, each with its changes."""
+    rng = np.random.default_rng(4)
+    return [row_of(k, run_of(rng, **each)) for k, each in enumerate(changes)]
+
+
+def rows_of_signs(*signs):
+    """Rows of usual runs, of this orientation each."""
+    return rows_of({"affine": np.diag([sign, sign, 1.2, 1.0])} for sign in signs)
 
 
 def flagged(odd, n=20, **changes):
     """Columns and words of the flags of one odd subject among usual ones, which have none."""
-    rng = np.random.default_rng(4)
-    rows = [row_of(k, run_of(rng)) for k in range(n - 1)]
-    flags = flags_of([*rows, row_of(n - 1, run_of(rng, **odd), **changes)])
+    *rows, last = rows_of([{}] * (n - 1) + [odd])
+    flags = flags_of([*rows, last._replace(**changes)])
     assert [each for each in flags[:-1] if each] == []
     assert all(flag.words.isprintable() for flag in flags[-1])
     return [(flag.column, flag.words) for flag in flags[-1]]
@@ -65,19 +75,14 @@ def test_the_median_is_that_of_the_others():
 
 
 def test_a_label_that_few_have():
-    rng = np.random.default_rng(4)
-    rows = [row_of(k, run_of(rng)) for k in range(20)]
+    rows = rows_of([{}] * 20)
     rows[3] = rows[3]._replace(volumes={**rows[3].volumes, 99: 5.0})
     flags = flags_of(rows)
     assert [flag.words for flag in flags[3]] == ["label 99 in its image: 1 of 20 have it"]
 
 
 def test_no_majority_no_odd_one():
-    rng = np.random.default_rng(4)
-    runs = [
-        run_of(rng, affine=np.diag([sign, sign, 1.2, 1.0])) for sign in (1.0, 1.0, 1.0, -1.0, -1.0)
-    ]
-    rows = [row_of(k, run) for k, run in enumerate(runs)]
+    rows = rows_of_signs(1.0, 1.0, 1.0, -1.0, -1.0)
     assert flags_of(rows) == [[]] * 5  # three of five
     assert [bool(each) for each in flags_of(rows[1:4])] == [False, False, True]  # two of three
     assert flags_of(rows[2:4]) == [[], []]  # one of two
@@ -85,12 +90,7 @@ def test_no_majority_no_odd_one():
 
 def test_a_mixed_cohort_says_that_it_is_not_judged():
     """By what has no majority alone; and of few subjects, that they are few."""
-    rng = np.random.default_rng(4)
-    signs = [1.0, 1.0, 1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0]
-    rows = [
-        row_of(k, run_of(rng, affine=np.diag([sign, sign, 1.2, 1.0])))
-        for k, sign in enumerate(signs)
-    ]
+    rows = rows_of_signs(*[1.0] * 5, *[-1.0] * 4)
     [words] = comparisons_left_out(rows)
     assert re.match("The 9 3-D meshes are too mixed to judge by orientation: ", words)
     assert comparisons_left_out([rows[0], *rows[:4], *rows[:4]]) == []
@@ -107,15 +107,13 @@ def test_few_subjects_have_no_medians():
 
 
 def test_what_failed_says_nothing_of_others():
-    rng = np.random.default_rng(4)
-    rows = [row_of(k, run_of(rng)) for k in range(20)]
-    rows[0] = row_of(0, run_of(rng, mask_volume=1.0), status="failed")
+    rows = rows_of([{"mask_volume": 1.0}] + [{}] * 19)
+    rows[0] = rows[0]._replace(status="failed")
     assert flags_of(rows)[0] == []
 
 
 def test_planes_and_volumes_are_not_compared():
-    rng = np.random.default_rng(4)
-    rows = [row_of(k, run_of(rng)) for k in range(40)]
+    rows = rows_of([{}] * 40)
     for row in rows[20:]:
         row.numbers["quality.ndim"] = 2
         row.numbers["mask.volume"] /= 1e3

@@ -166,48 +166,34 @@ CORNERS = np.vstack([np.zeros(3), np.eye(3), np.ones((6, 3))])
         ("pyvista", CORNERS, "expected a pyvista or VTK grid, got ndarray"),
         ("pyvista", "a.vtu", "expected a pyvista or VTK grid, got str"),
         ("pyvista", None, "expected a pyvista or VTK grid, got NoneType"),
-        ("meshio", meshio.Mesh(CORNERS, [TETRA, ("hexahedron", [range(8)])]), "found hexahedron"),
-        (
-            "meshio",
-            meshio.Mesh(CORNERS, [TETRA, ("tetra10", [range(10)])]),
-            "found tetra cells of both order 1 and",
+        *(
+            ("meshio", meshio.Mesh(CORNERS, cells), message)
+            for cells, message in [
+                ([TETRA, ("hexahedron", [range(8)])], "found hexahedron"),
+                ([TETRA, ("tetra10", [range(10)])], "found tetra cells of both order 1 and"),
+                ([("line", [[0, 1]])], "found line"),
+                ([], "found no cells"),
+                ([("tetra", [[0, 1, 2, 44]])], r"uses? nodes 0\.\.44, but it has 0\.\.9"),
+                ([("tetra", [[0.0, 1.0, 2.5, 3.0]])], "4 integers each, got float64"),
+                ([("tetra", [[0, 1, 2]])], r"tetra cells of 4 integers each, got .*1, 3"),
+                ([("tetra10", [range(9)])], r"tetra10 cells of 10 integers"),
+            ]
         ),
-        ("meshio", meshio.Mesh(CORNERS, [("line", [[0, 1]])]), "found line"),
-        ("meshio", meshio.Mesh(CORNERS, []), "found no cells"),
+        *(
+            ("meshio", meshio.Mesh(points, [TETRA]), message)
+            for points, message in [
+                (np.zeros((10, 4)), r"two or three real coordinates, got float64 of shape \(10, 4"),
+                (CORNERS[:, :1], "two or three real coordinates"),
+                (CORNERS * 1j, "real coordinates, got complex128"),
+                ([["a"] * 3] * 4, "points of real numbers"),
+            ]
+        ),
         # one off it
         (
             "meshio",
             meshio.Mesh(np.eye(3), [("triangle", [[0, 1, 2]])]),
             "must lie in the plane z = 0",
         ),
-        (
-            "meshio",
-            meshio.Mesh(CORNERS, [("tetra", [[0, 1, 2, 44]])]),
-            r"uses? nodes 0\.\.44, but it has 0\.\.9",
-        ),
-        (
-            "meshio",
-            meshio.Mesh(CORNERS, [("tetra", [[0.0, 1.0, 2.5, 3.0]])]),
-            "4 integers each, got float64",
-        ),
-        (
-            "meshio",
-            meshio.Mesh(CORNERS, [("tetra", [[0, 1, 2]])]),
-            r"tetra cells of 4 integers each, got .*1, 3",
-        ),
-        (
-            "meshio",
-            meshio.Mesh(CORNERS, [("tetra10", [range(9)])]),
-            r"tetra10 cells of 10 integers",
-        ),
-        (
-            "meshio",
-            meshio.Mesh(np.zeros((10, 4)), [TETRA]),
-            r"two or three real coordinates, got float64 of shape \(10, 4",
-        ),
-        ("meshio", meshio.Mesh(CORNERS[:, :1], [TETRA]), "two or three real coordinates"),
-        ("meshio", meshio.Mesh(CORNERS * 1j, [TETRA]), "real coordinates, got complex128"),
-        ("meshio", meshio.Mesh([["a"] * 3] * 4, [TETRA]), "points of real numbers"),
         ("meshio", 3, "expected a meshio.Mesh, got int"),
         ("skfem", skfem.MeshQuad(), "expected a scikit-fem MeshTri or MeshTet, got MeshQuad"),
         ("skfem", skfem.MeshLine(), "got MeshLine"),

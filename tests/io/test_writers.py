@@ -13,13 +13,12 @@ import pytest
 import pyvista
 from models import (
     ABOUT,
+    SAMPLES,
     all_nodes,
     each_once,
     labelled_model,
     quadratic_model,
     sample_model,
-    unlabelled,
-    with_two_sides,
 )
 from numpy.testing import assert_allclose, assert_array_equal
 from test_abaqus import FACES, blocks_of, read_by_meshio
@@ -38,27 +37,8 @@ from tetopt.io.meshes import load_mesh
 from tetopt.io.tags import named_materials
 from tetopt.model.loads import load_words
 from tetopt.model.materials import materials
-from tetopt.model.model import element_facets, elements, in_space, in_units
-from tetopt.model.sets import Sets, facet_triples, standard_sets
-
-MODELS = {
-    "3-D": sample_model,
-    "2-D": lambda: sample_model(2),
-    "as many materials as cells": lambda: sample_model(3, None),
-    "as many materials as cells, 2-D": lambda: sample_model(2, None),
-    "no labels": lambda: unlabelled(sample_model()),
-    "two sides": lambda: with_two_sides(sample_model()),
-    "two sides, 2-D": lambda: with_two_sides(sample_model(2)),
-    "LPS, MPa": lambda: in_units(in_space(sample_model(), "lps"), "MPa"),
-    "quadratic": lambda: with_two_sides(quadratic_model()),
-    "quadratic, 2-D": lambda: with_two_sides(quadratic_model(2)),
-    "label sets only": lambda: sample_model()._replace(
-        sets=standard_sets(sample_model().mesh, labels=sample_model().cell_data["label"]), loads=()
-    ),
-    "bare": lambda: sample_model()._replace(
-        cell_data={}, sets=Sets({}, {}), materials=None, loads=(), about={}
-    ),
-}
+from tetopt.model.model import element_facets, elements, in_units
+from tetopt.model.sets import facet_triples
 
 
 class Contents(NamedTuple):
@@ -286,12 +266,12 @@ def oriented_rows(rows):
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", SAMPLES)
 def test_all_of_the_model_is_in_the_file(name, suffix, tmp_path):
     """Facets face out of their cells: where a set has facets of its own those of each, elsewhere
     the boundary's, which are there once. Abaqus has 20 characters for a number.
     """
-    model = MODELS[name]()
+    model = SAMPLES[name]()
     if suffix in (".inp", ".feb") and (
         model.mesh.ndim == 2 or (suffix == ".feb" and model.materials is None)
     ):

@@ -7,35 +7,17 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import pyvista
-from models import ABOUT, all_nodes, quadratic_model, sample_model, with_two_sides
+from models import ABOUT, SAMPLES, all_nodes, quadratic_model, sample_model, with_two_sides
 
 from tetopt.errors import InputError
 from tetopt.io.xdmf import xdmf
 from tetopt.model.loads import load_words
-from tetopt.model.model import elements, header_lines, in_space, in_units
-from tetopt.model.sets import Sets, standard_sets
-
-MODELS = {
-    "3-D": sample_model,
-    "2-D": lambda: sample_model(2),
-    "two sides": lambda: with_two_sides(sample_model()),
-    "two sides, 2-D": lambda: with_two_sides(sample_model(2)),
-    "as many materials as cells": lambda: sample_model(3, None),
-    "LPS, MPa": lambda: in_units(in_space(sample_model(), "lps"), "MPa"),
-    "quadratic": lambda: with_two_sides(quadratic_model()),
-    "quadratic, 2-D": lambda: with_two_sides(quadratic_model(2)),
-    "label sets only": lambda: sample_model()._replace(
-        sets=standard_sets(sample_model().mesh, labels=sample_model().cell_data["label"]), loads=()
-    ),
-    "bare": lambda: sample_model()._replace(
-        cell_data={}, sets=Sets({}, {}), materials=None, loads=(), about={}
-    ),
-}
+from tetopt.model.model import elements, header_lines
 
 
-@pytest.fixture(params=list(MODELS))
+@pytest.fixture(params=list(SAMPLES))
 def model(request):
-    return MODELS[request.param]()
+    return SAMPLES[request.param]()
 
 
 def item(node):
