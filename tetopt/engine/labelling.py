@@ -284,7 +284,7 @@ def mend(
         _mend_places(dual, labels, room, is_kept, faces, limits.has_pairs, marks, _work(dual))
 
 
-def _targets(dual: Dual, aim: NDArray[np.float64]) -> Targets:
+def _targets(dual: Dual, aim: NDArray) -> Targets:
     """`Targets` of labels with the volume `aim`, (K,) mm^n.
 
     The volume near a label's surface is that of its voxels but for those in cells that, like all
@@ -298,7 +298,7 @@ def _targets(dual: Dual, aim: NDArray[np.float64]) -> Targets:
     return Targets(np.asarray(aim, dtype=np.float64), aim - inner, fit)
 
 
-def _label_volumes(dual: Dual, labels: NDArray[np.int64]) -> NDArray[np.float64]:
+def _label_volumes(dual: Dual, labels: NDArray[np.int64]) -> NDArray:
     """Volume of each label's cells, (K,) mm^n."""
     return np.bincount(labels, dual.size, len(dual.bias))
 

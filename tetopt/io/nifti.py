@@ -59,7 +59,7 @@ MGH_FLAG = slice(28, 30)  # the bytes of an MGH header that are 0 if it has no s
 CIFTI_INTENTS = range(3000, 3100)  # of NIfTI-2 files without a grid of voxels
 PACKED_SUFFIXES = (".gz", ".mgz")
 PAIR = re.compile(r"(.*)\.(hdr|img)(\.gz)?", re.IGNORECASE | re.DOTALL)
-HEADER_KINDS = {
+HEADER_KINDS: dict[str, tuple[Any, ...]] = {
     ".nii": (nibabel.Nifti1Header, nibabel.Nifti2Header),
     ".hdr": (Nifti1PairHeader, Nifti2PairHeader),
     ".mgh": (MGHHeader,),
@@ -273,6 +273,7 @@ def _voxels(
     step = math.prod(sides[:-1]) * dtype.itemsize
     check_room(sides if is_packed else [stop - start for start, stop in bounds], dtype.itemsize)
     begin += first * step
+    source: io.BytesIO | str
     if is_packed:
         size, source = _unpack_gzip(
             path, begin, begin + (last - first) * step, whole + TRAILING_BYTES

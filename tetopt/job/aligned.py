@@ -192,8 +192,9 @@ def read_companion(path: Path, spacing_mm: str | None = None) -> Image:
     Voxel sizes are for a stack or folder of slices; files of other formats have their own.
     """
     file, volume = file_and_volume(path)
-    has_own = spacing_mm is None or reader_of(file).has_spacing
-    spacing = None if has_own else parse_spacing(spacing_mm)
+    spacing = None
+    if spacing_mm is not None and not reader_of(file).has_spacing:
+        spacing = parse_spacing(spacing_mm)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Remark)
         return load_image(file, volume=volume, spacing_mm=spacing)
