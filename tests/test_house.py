@@ -33,6 +33,9 @@ WIDE = {
 # Verbs that once stood for a dozen things each; a variable is a noun, see docs/glossary.md.
 VERBS = {"held", "wanted", "found", "given", "told", "asked"}
 
+KERNELS = {"helper", "entry", "unit", "njit"}  # decorators of compiled functions
+NOUNS = {"seed", "need", "speed", "feed"}  # that end like participles
+
 
 @cache
 def text_of(path):
@@ -59,17 +62,24 @@ def module_name(path):
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def constants():
-    """Each assignment to a module's constant: path, line, name, value."""
-    for path in SOURCES:
+def constants(paths=SOURCES):
+    """Each assignment to a module's constant, alone or in a tuple: path, line, name, value."""
+    for path in paths:
         for node in tree_of(path).body:
             if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
-                targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-                for target in targets:
+                pairs = []
+                for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
+                    is_many = isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple)
+                    pairs += (
+                        zip(target.elts, node.value.elts, strict=True)
+                        if is_many
+                        else [(target, node.value)]
+                    )
+                for target, value in pairs:
                     if isinstance(target, ast.Name) and re.fullmatch(
                         r"_?[A-Z][A-Z0-9_]*", target.id
                     ):
-                        yield path, node.lineno, target.id, node.value
+                        yield path, node.lineno, target.id, value
 
 
 def is_numeric(value):
@@ -129,6 +139,101 @@ def functions():
                 count += (node.args.vararg is not None) + (node.args.kwarg is not None)
                 rows.append((f"{module_name(path)}.{node.name}", count, len(own)))
     return rows
+
+
+def bare_kernel_numbers(path):
+    """Decimal numbers inside kernels without a comment beside or above, but for those to 16 in
+    steps of an eighth.
+    """
+    beside, alone = comment_lines(path)
+    for function in nodes_of(path):
+        if not isinstance(function, ast.FunctionDef) or not any(
+            isinstance(word, ast.Name | ast.Attribute)
+            and getattr(word, "id", getattr(word, "attr", None)) in KERNELS
+            for decorator in function.decorator_list
+            for word in ast.walk(decorator)
+        ):
+            continue
+        for node in ast.walk(function):
+            number = node.value if isinstance(node, ast.Constant) else None
+            if type(number) is not float or (number * 8 % 1 == 0 and number <= 16):
+                continue
+            if node.lineno not in beside and node.lineno - 1 not in alone:
+                yield f"{module_name(path)}:{node.lineno} {number}"
+
+
+def participles(path):
+    """Functions of a module that are called by a participle alone."""
+    for node in tree_of(path).body:
+        if isinstance(node, ast.FunctionDef):
+            name = node.name.strip("_")
+            if name not in NOUNS and re.fullmatch(r"[a-z]+ed|told|kept|seen|grown|slid", name):
+                yield f"{module_name(path)}.{node.name}"
+
+
+def label_literals(path):
+    """Places that name the labels in a file's data by a text instead of `LABEL_FIELD`."""
+    for node in nodes_of(path):
+        of, key = None, None
+        if isinstance(node, ast.Subscript):
+            of, key = node.value, node.slice
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.args:
+            of, key = node.func.value, node.args[0]
+        if getattr(of, "attr", None) == "cell_data" and getattr(key, "value", None) == "label":
+            yield f"{module_name(path)}:{node.lineno}"
+
+
+@pytest.mark.parametrize("law", [bare_kernel_numbers, participles, label_literals])
+def test_laws_of_names_and_numbers(law):
+    assert [place for path in SOURCES for place in law(path)] == []
+
+
+@pytest.mark.parametrize(
+    ("law", "bad", "good"),
+    [
+        (
+            bare_kernel_numbers,
+            "@helper\ndef f(x):\n    return x + 1e-9\n",
+            "@helper\ndef f(x):\n    # mm, chosen\n    return 0.5 * x + 1e-9\n",
+        ),
+        (participles, "def _checked(x):\n    pass\n", "def check_mesh(x):\n    pass\n"),
+        (
+            label_literals,
+            'of_cell = file.cell_data["label"]\n',
+            "of_cell = file.cell_data[LABEL_FIELD]\n",
+        ),
+        (
+            lambda path: [name for *_, name, _ in constants([path])],
+            "FLAT_SIZE, FAR_SIZE = 1, 2\n",
+            "flat, far = 1, 2\n",
+        ),
+    ],
+    ids=["kernel numbers", "participles", "labels", "constants in tuples"],
+)
+def test_laws_see_what_breaks_them(law, bad, good, monkeypatch):
+    for text, is_bad in [(bad, True), (good, False)]:
+        path = ROOT / f"tetopt/{'bad' if is_bad else 'good'}_{abs(hash(text))}.py"
+        monkeypatch.setitem(globals(), "text_of", lambda _, text=text: text)
+        assert bool(list(law(path))) == is_bad
+
+
+def test_modules_have_names_of_their_own():
+    """But for options and texts of rooms, and commands, which are named as what they run."""
+    names = Counter(
+        path.stem
+        for path in SOURCES
+        if path.stem not in ("__init__", "options") and "cli" not in path.parts
+    )
+    assert {name: count for name, count in names.items() if count > 1} == {}
+
+
+def test_the_layout_has_no_exceptions():
+    files = [
+        path
+        for top in ("tetopt", "tests", "scripts", "docs", "benchmarks")
+        for path in (ROOT / top).rglob("*.py")
+    ]
+    assert [path.name for path in files if re.search(r"# *fmt: *(skip|off)", text_of(path))] == []
 
 
 def test_a_constant_has_one_meaning():

@@ -35,6 +35,7 @@ from tetopt.model.file import (
     MeshFile,
 )
 from tetopt.model.label_names import (
+    LABEL_FIELD,
     TABLE_TEXT,
     table_words,
 )
@@ -181,7 +182,7 @@ def _with_labels(
 
     try:
         counted = _within(labels, part, beside, loaded)
-        fields = {**loaded.cell_data, "label": cell_labels(counted.image, loaded.mesh)}
+        fields = {**loaded.cell_data, LABEL_FIELD: cell_labels(counted.image, loaded.mesh)}
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     own = table_of_segmentation(path)

@@ -22,7 +22,7 @@ from tetopt.job.mesh_file import label_table, read_mesh
 from tetopt.job.options import LabelNamesOption, Option, SpaceOption
 from tetopt.measure.fidelity import FacetSurface, surface_areas
 from tetopt.model.file import MeshFile
-from tetopt.model.label_names import label_words, labels_named
+from tetopt.model.label_names import LABEL_FIELD, label_words, labels_named
 from tetopt.model.model import SPACES
 from tetopt.model.sets import FACE_NAMES, boundary_rows, face_sets
 
@@ -158,7 +158,7 @@ def _write_interfaces(
     """Write the mesh's facets between labels, with normals out of the smaller label, and read
     them back.
     """
-    labels = cell_field(loaded, path, "label").astype(np.int64)
+    labels = cell_field(loaded, path, LABEL_FIELD).astype(np.int64)
     every = label_surfaces(facets(loaded.mesh.cells), labels)
     sides = every.label, every.beyond
     if part.interface is not None:
@@ -250,7 +250,7 @@ def _with_label(
     loaded: MeshFile, path: Path, chosen: list[int], names: dict[int, str]
 ) -> NDArray[np.int64]:
     """Return the numbers of the cells with these labels."""
-    labels = cell_field(loaded, path, "label")
+    labels = cell_field(loaded, path, LABEL_FIELD)
     cells = np.flatnonzero(np.isin(labels, chosen))
     if len(cells) == 0:
         known = ", ".join(

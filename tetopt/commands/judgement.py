@@ -38,6 +38,7 @@ from tetopt.measure.judge import judge as judge_rows
 from tetopt.measure.measures import fidelity
 from tetopt.measure.quality import Quality, quality
 from tetopt.model.file import MASK_TEXT, MeshFile, words_of_other_box
+from tetopt.model.label_names import LABEL_FIELD
 from tetopt.report.summary import size_summary
 
 
@@ -290,7 +291,7 @@ def _merged_numbers(inputs: Mapping[str, Any], labels: Path, part: ImagePart) ->
 def _measure_fit(judgement: Judgement, names: Mapping[int, str]) -> Judgement:
     """Measure the fit of the cells to the image, mask and labels, and judge it."""
     source, loaded = cast(Source, judgement.source), judgement.loaded
-    mesh, of_cell = loaded.mesh, loaded.cell_data.get("label")
+    mesh, of_cell = loaded.mesh, loaded.cell_data.get(LABEL_FIELD)
     fit = image_fit(source.contrasts[0], mesh)
     measured = fidelity(source.labels, source.mask, mesh, of_cell, what=source.content)
     measured |= _names(measured.get("labels", []), names)
@@ -334,7 +335,7 @@ def _mesh_problems(judgement: Judgement) -> tuple[list[str], list[str]]:
     problems = check_mesh(
         mesh, image, is_whole=not judgement.is_masked, is_filled=judgement.is_filled
     )
-    labels, touching = judgement.loaded.cell_data.get("label"), []
+    labels, touching = judgement.loaded.cell_data.get(LABEL_FIELD), []
     if problems or labels is None:
         return problems, []
     if labels.ndim == 1 and ((np.rint(labels) == labels) & (labels >= 0)).all():

@@ -14,7 +14,7 @@ from tetopt.image import Image
 RANGE_TOLERANCE = 1e-3  # by which a probability may be below 0 or above 1, from rounding in files
 # by which the sum may exceed 1 without a warning: rounding to bytes for six tissues
 SUM_TOLERANCE = 0.02
-BYTE_SCALE, PERCENT = 255.0, 100.0  # whole numbers between them are probabilities times 255
+BYTE_SCALE, PERCENT_SCALE = 255.0, 100.0  # whole numbers between them are probabilities times 255
 
 
 def resample_tissue(tissue: Image, image: Image, name: str = "tissue") -> Image:
@@ -50,7 +50,7 @@ def resample_tissue(tissue: Image, image: Image, name: str = "tissue") -> Image:
     (16, 16, 16)
     """
     low, high = tissue.range
-    if PERCENT < high <= BYTE_SCALE and low >= 0.0 and tissue.is_whole:
+    if PERCENT_SCALE < high <= BYTE_SCALE and low >= 0.0 and tissue.is_whole:
         warn(f"{name}: whole numbers up to {high:g} are read as probabilities times 255")
         tissue = Image(tissue.data / BYTE_SCALE, tissue.affine)
     _check_range(name, tissue)

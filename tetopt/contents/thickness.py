@@ -385,6 +385,7 @@ def _way(
         if other != own:
             here = levels[channel[other], i, j, k] - levels[channel[own], i, j, k]
             there = levels[channel[own], a, b, c] - levels[channel[other], a, b, c]
+            # 1e-6 of a level, chosen: against division by 0
             return float(way + length * here / max(here + there, 1e-6))
         i, j, k, way = a, b, c, way + length
     return np.inf

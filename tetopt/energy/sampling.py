@@ -776,6 +776,7 @@ def triangle_flux(
     slope0, slope1 = -(n[0] / n[2]), -(n[1] / n[2])
     at = (a[0] * scale, a[1] * scale, a[2] * scale)
     size = abs(slope0) * (c[0] - a[0]) + abs(slope1) * (abs(b[1] - a[1]) + abs(c[1] - a[1]))
+    # voxels: rounding of about 20 operations in double precision, and a floor, chosen
     error = 1e-9 + 4e-15 * scale * size
     margin = 0.5 - error if error < 0.25 else -1.0
     lowest, highest = min(a[2], b[2], c[2]) >> bits, -((-max(a[2], b[2], c[2])) >> bits)

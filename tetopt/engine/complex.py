@@ -378,6 +378,7 @@ def shape_energy(x: NDArray, n_corners: int, power: float, is_graded: bool) -> f
         S = u[1] * u[1] + u[2] * u[2] + v[1] * v[1] + v[2] * v[2] + w[1] * w[1] + w[2] * w[2]
         if volume <= FLAT_FRACTION * S:
             return np.inf
+        # 4 sqrt(3): eta of an equilateral triangle is 1
         eta = S / (6.928203230275509 * volume)
         if is_graded:
             return eta**power
@@ -408,8 +409,10 @@ def tet_energy(determinant: float, S: float, power: float, is_graded: bool) -> f
     if volume <= 0.0 or volume * volume <= FLAT_FRACTION * FLAT_FRACTION * S * S * S:
         return np.inf
     if is_graded:
+        # 432: eta of a regular tetrahedron is 1
         cube = S * S * S / (432.0 * determinant * determinant)  # eta^3
         return cube if power == 3.0 else cube ** (power / 3.0)
+    # 20 = (n+1) (n+2) for n = 3
     E_G = volume * S / 20.0
     if power == 1.0:
         return E_G
@@ -417,6 +420,7 @@ def tet_energy(determinant: float, S: float, power: float, is_graded: bool) -> f
     if power == 3.0:
         t = 1.0 / np.cbrt(3.0 * volume)
         t *= t
+        # 144 = 12^2
         return E_G * S * S * t * t * (1.0 / 144.0)
     return E_G * (S / (12.0 * np.cbrt(9.0 * volume * volume))) ** (power - 1.0)
 

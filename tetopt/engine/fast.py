@@ -82,7 +82,7 @@ LEAST_EDGE_VOXELS = 1.0
 ATTRACTED_MIN_DIHEDRAL = 4.0
 # Most cells on a mask's boundary that may be removed if nothing lifts them: a fraction of all
 # cells, or this number.
-FLAT_FRACTION, FLAT_CELLS = 0.005, 10
+FLAT_CELLS_FRACTION, FLAT_CELLS = 0.005, 10
 MEND_ROUNDS = 3  # of lifting and removing cells, at the end
 FAR_TICKS = -(1 << 40)  # a place far from any other
 
@@ -639,7 +639,7 @@ class Run:
     @property
     def most_gone(self) -> float:
         """Largest number of flat cells that may be removed."""
-        return max(FLAT_FRACTION * self.n_cells, FLAT_CELLS)
+        return max(FLAT_CELLS_FRACTION * self.n_cells, FLAT_CELLS)
 
     def _take_out(self, is_gone: NDArray[np.bool_]) -> int:
         if is_gone.any():

@@ -75,6 +75,7 @@ def _shape(x: NDArray, state: State, cell: int) -> float:
         return np.inf
     _load_cell(x, state, cell)
     volume, E_G = volume_and_E_G(x, n_corners)
+    # 1e-300, chosen: against division by 0
     squares = E_G * (n_corners * (n_corners + 1)) / max(volume, 1e-300)
     return np.inf if volume <= FLAT_FRACTION * squares ** (0.5 * (n_corners - 1)) else E_G
 

@@ -87,9 +87,9 @@ def _list_by_bin(place: Ints1, listed: Ints1, bins: Ints2, facets: Ints2, counts
 @helper
 def _edge_square(p: tuple, along: tuple) -> float:
     """Squared distance of p from the segment between 0 and `along`."""
-    way = minus(
-        p, scale_vector(min(max(dot(p, along) / max(dot(along, along), 1e-300), 0.0), 1.0), along)
-    )
+    # 1e-300, chosen: against division by 0
+    fraction = min(max(dot(p, along) / max(dot(along, along), 1e-300), 0.0), 1.0)
+    way = minus(p, scale_vector(fraction, along))
     return float(dot(way, way))
 
 

@@ -17,7 +17,7 @@ from tetopt.interop.conversions import CELL_DIMENSIONS
 from tetopt.io.apart import read_apart
 from tetopt.io.gmsh import OwnComments, own_comments
 from tetopt.io.raw import Group, Raw, by_corners
-from tetopt.model.label_names import TABLE_TEXT, LabelTable, table_words
+from tetopt.model.label_names import LABEL_FIELD, TABLE_TEXT, LabelTable, table_words
 from tetopt.system.budget import check_memory, memory_words
 
 if TYPE_CHECKING:
@@ -104,7 +104,9 @@ def _label_cells(raw: Raw, comments: OwnComments | None) -> Raw:
             [of_group.get(number, number) for number in labels.tolist()], dtype=np.int64
         )
     labels[labels == zero] = 0
-    if "label" in raw.cell_data and not np.array_equal(raw.cell_data["label"][kind], labels):
+    if LABEL_FIELD in raw.cell_data and not np.array_equal(
+        raw.cell_data[LABEL_FIELD][kind], labels
+    ):
         return raw
     names = {of_group.get(group.number, group.number): group.label for group in groups}
     names = {number: name for number, name in names.items() if name != f"label_{number}"}
@@ -114,7 +116,7 @@ def _label_cells(raw: Raw, comments: OwnComments | None) -> Raw:
     table = (
         {TABLE_TEXT: np.array([json.dumps(table_words(LabelTable(names, {})))])} if names else {}
     )
-    cell_data = raw.cell_data | {"label": {kind: labels}}
+    cell_data = raw.cell_data | {LABEL_FIELD: {kind: labels}}
     return raw._replace(cell_data=cell_data, field_data=raw.field_data | table)
 
 

@@ -26,7 +26,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.topology import facets
 from tetopt.io.text import free_text
 from tetopt.mesh import Mesh
-from tetopt.model.label_names import TABLE_TEXT, labels_of, table_of_words
+from tetopt.model.label_names import LABEL_FIELD, TABLE_TEXT, labels_of, table_of_words
 from tetopt.model.loads import load_words
 from tetopt.model.model import Model, header_lines
 from tetopt.model.sets import (
@@ -167,7 +167,7 @@ def without_labels(model: Model) -> Model:
     return (
         model
         if group_labels(model) is None
-        else model._replace(cell_data={k: v for k, v in of_cells if k != "label"})
+        else model._replace(cell_data={k: v for k, v in of_cells if k != LABEL_FIELD})
     )
 
 

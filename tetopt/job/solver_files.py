@@ -27,7 +27,7 @@ from tetopt.model.averages import DEFAULT_AVERAGE, parse_average
 from tetopt.model.build import Choices, model_of_file
 from tetopt.model.fields import cell_fields, is_result
 from tetopt.model.file import MeshFile
-from tetopt.model.label_names import TABLE_TEXT, labels_of, table_of_words
+from tetopt.model.label_names import LABEL_FIELD, TABLE_TEXT, labels_of, table_of_words
 from tetopt.model.loads import FACET_FORCES, check_steps, known_set, parse_load
 from tetopt.model.mappings import MAPPED_OPTIONS, named_file, parse_any_mapping
 from tetopt.model.materials import Spacing
@@ -369,7 +369,7 @@ def save_for_solver(output: Path, model: Model, solver: SolverOptions) -> None:
     """Write the file with the fields of cells that the options or the format choose."""
     # a format without a place for them lists them
     choice = solver.fields or format_of(output).fields or "all"
-    names = [name for name in model.cell_data if name != "label" and not is_result(name)]
+    names = [name for name in model.cell_data if name != LABEL_FIELD and not is_result(name)]
     left = [
         name
         for name in names
@@ -399,7 +399,7 @@ def keep_early(mesh: Mesh, labels: NDArray[np.int64] | None, places: Iterable[Pa
     """Keep an optimised mesh in the first possible place until all is written, in case the
     process ends; return it.
     """
-    data, reason = {} if labels is None else {"label": labels}, ""
+    data, reason = {} if labels is None else {LABEL_FIELD: labels}, ""
     for place in places:
         try:
             save_mesh(place, mesh, data, order=1 if mesh.midpoints is None else 2)

@@ -56,6 +56,7 @@ from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
 from tetopt.model.file import MASK_TEXT, MeshFile
 from tetopt.model.label_names import (
+    LABEL_FIELD,
     TABLE_TEXT,
     kept_labels,
     label_words,
@@ -125,9 +126,9 @@ class Source(NamedTuple):
             moments = cell_moments(continue_image(contrast, self.content.continuation), mesh)
             fields |= {f"mean_{number}": moments.mean, f"variance_{number}": moments.variance}
         if labels is not None:
-            fields["label"] = labels
+            fields[LABEL_FIELD] = labels
         elif self.labels is not None:
-            fields["label"] = cell_labels(
+            fields[LABEL_FIELD] = cell_labels(
                 continue_image(self.labels, self.content.continuation), mesh
             )
         return fields

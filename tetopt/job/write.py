@@ -33,6 +33,7 @@ from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields, is_result
 from tetopt.model.file import MASK_TEXT, MeshFile
 from tetopt.model.label_names import (
+    LABEL_FIELD,
     TABLE_TEXT,
     LabelTable,
     colour_labels,
@@ -141,7 +142,9 @@ def _measured_fields(
         {"fields": partial(source.fields, result.mesh, result.labels)}, failed
     ):
         return dict(measured["fields"])
-    return cell_fields(result.mesh) | ({} if result.labels is None else {"label": result.labels})
+    return cell_fields(result.mesh) | (
+        {} if result.labels is None else {LABEL_FIELD: result.labels}
+    )
 
 
 def measures_of(
@@ -154,7 +157,7 @@ def measures_of(
         source.labels,
         source.mask,
         result.mesh,
-        model.cell_data.get("label"),
+        model.cell_data.get(LABEL_FIELD),
         failed,
         source.content,
     )
@@ -241,7 +244,7 @@ def draw(task: Task, outcome: Meshed, model: Model) -> None:
         source.mask,
         model.order,
     )
-    of_cell = model.cell_data.get("label")
+    of_cell = model.cell_data.get(LABEL_FIELD)
     # none for the mask of a mesh to start from
     if source.mask is not None and "boundary" in pictures[3].stem:
         figures.save_figure(

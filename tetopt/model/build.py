@@ -40,6 +40,7 @@ from tetopt.model.file import (
     words_of_other_box,
 )
 from tetopt.model.label_names import (
+    LABEL_FIELD,
     TABLE_TEXT,
     LabelTable,
     colour_labels,
@@ -319,7 +320,7 @@ def _of_result(
             "with an image instead"
         )
     if cell_data is None:
-        labels = {} if result.labels is None else {"label": result.labels}
+        labels = {} if result.labels is None else {LABEL_FIELD: result.labels}
         cell_data = cell_fields(mesh, content) | labels
     return mesh, content, result.order if order is None else order, cell_data
 

@@ -15,6 +15,7 @@ from tetopt.errors import InputError
 from tetopt.model.sets import label_set_names
 
 # key in a mesh's file and in a model's `about` for the result of `table_words`
+LABEL_FIELD = "label"  # cell data in files: the label of each cell
 TABLE_TEXT = "label_table"
 
 LABEL_DIGITS = 18  # of a number that fits into 64 bits; a longer one counts as a name
@@ -140,7 +141,7 @@ def labels_of(cell_data: Mapping[str, NDArray], n_cells: int) -> NDArray[np.int6
     """Return the field "label", (M,) int64, if it exists and holds whole numbers from 0; other
     programs' may not.
     """
-    labels = cell_data.get("label")
+    labels = cell_data.get(LABEL_FIELD)
     if labels is None or labels.shape != (n_cells,) or not np.isfinite(labels).all():
         return None
     whole = labels.astype(np.int64)

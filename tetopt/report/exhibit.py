@@ -14,7 +14,7 @@ from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
-from tetopt.model.label_names import NO_TABLE, LabelTable, table_of_labels
+from tetopt.model.label_names import LABEL_FIELD, NO_TABLE, LabelTable, table_of_labels
 from tetopt.report.colours import grey_limits, label_colours
 
 COLOUR_MAP = "viridis"  # perceptually even
@@ -40,8 +40,6 @@ FIELD_UNITS = {
     "young_nodes": "kPa",
     "density": "kg/m³",
 }
-# the cell data to which a table's names and colours belong, and by which labels are selected
-LABEL_FIELD = "label"
 DISPLACEMENT = "displacement"  # the point data that deform the mesh
 STEP_NAME = re.compile(r"(.+)_step([1-9]\d*)")  # of results of the second and further steps
 ROUNDED_FRACTION = 1e-9  # of the upper limit: a smaller lower limit is 0 up to rounding

@@ -483,6 +483,7 @@ def _around(size: NDArray, points: NDArray, cells: NDArray, gradation: float) ->
                     for d in range(points.shape[1]):
                         square += (points[a, d] - points[b, d]) ** 2
                     most = min(size[b], reached[b]) + gradation * np.sqrt(square)
+                    # 1e-12, chosen: far above the rounding of a sum, so that the sweep ends
                     if most < reached[a] * (1.0 - 1e-12):
                         reached[a] = most
                         is_changed = True

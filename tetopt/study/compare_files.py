@@ -16,7 +16,7 @@ from tetopt.job.events import note
 from tetopt.job.mesh_file import label_table
 from tetopt.measure.segmentation import threshold_image
 from tetopt.model.fields import cell_fields
-from tetopt.model.label_names import table_of_labels
+from tetopt.model.label_names import LABEL_FIELD, table_of_labels
 from tetopt.model.mappings import parse_mapping
 from tetopt.report.figures import save_figure
 from tetopt.study import compare
@@ -106,7 +106,7 @@ def compare_image(
         _mesh_name(name, order): each for order, of in made.items() for name, each in of.items()
     }
     for name, each in meshes.items():
-        own = {} if each.labels is None else {"label": each.labels}
+        own = {} if each.labels is None else {LABEL_FIELD: each.labels}
         save_mesh(paths[name], each.mesh, cell_fields(each.mesh, image) | own)
     drawn = _draw(paths, report, image, made)
     for name in set(paths) - {

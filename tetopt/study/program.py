@@ -31,6 +31,7 @@ from tetopt.io.meshes import MESH_SUFFIXES, load_mesh
 from tetopt.io.text import last_line
 from tetopt.mesh import Mesh
 from tetopt.model.file import MeshFile
+from tetopt.model.label_names import LABEL_FIELD
 from tetopt.study.endings import Crashed
 from tetopt.study.isosurfaces import class_labels
 from tetopt.study.pipelines import PIPELINES, Pipeline, PipelineInput, Produced
@@ -199,7 +200,7 @@ def _own_labels(
 
     A label that all cells share is the number of a file's only part.
     """
-    labels = loaded.cell_data.get("label")
+    labels = loaded.cell_data.get(LABEL_FIELD)
     if labels is None or job.labels is None or labels.ndim != 1 or len(np.unique(labels)) == 1:
         return None, []
     is_known = np.isin(labels[kept], np.unique(job.labels.data))
