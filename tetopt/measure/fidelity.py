@@ -12,6 +12,7 @@ percentiles are by area.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from itertools import combinations
 from math import ceil
 from typing import NamedTuple
@@ -329,79 +330,119 @@ def label_fidelity(
     label 0: Dice 1.00, off by 0.5 mm
     label 1: Dice 1.00, off by 0.5 mm
     """
-    labels, (pieces, n_pieces) = check_labels("labels", labels), mesh.straight_pieces()
+    labels = check_labels("labels", labels)
     owner = voxel_cells(labels, mesh) if owner is None else owner
     label_of_cell = (
         cell_labels(labels, mesh) if of_cell is None else check_cell_labels(of_cell, mesh)
     )
     values, true, label_of_cell = by_row(labels_in_mask(labels, mask), label_of_cell)
     outside = BACKGROUND_LABEL if mask is None else OUTSIDE_LABEL
-    painted, is_covered = (
-        painted_voxels(owner, label_of_cell, outside),
-        (owner >= 0) | (mask is not None),
-    )
-    n_true, n_cells = (
-        _voxel_counts(true, len(values)),
-        np.bincount(label_of_cell, minlength=len(values)),
-    )
-    n_covered = _voxel_counts(np.where(is_covered, true, OUTSIDE_LABEL), len(values))
-    is_met = (painted == true) | ~is_covered
-    dice = _voxel_dice(true, painted, n_true)
-    of_most = painted_voxels(owner, _most_frequent(true, owner, label_of_cell), outside)
-    dice_majority = _voxel_dice(true, of_most, n_true)
-    of_piece, n_owned = (
-        np.repeat(label_of_cell, n_pieces),
-        np.bincount(owner[owner >= 0], minlength=len(mesh.cells)),
-    )
-    mesh_volume = np.bincount(label_of_cell, mesh.cell_volumes, len(values))
-    n_empty = np.bincount(label_of_cell[n_owned == 0], minlength=len(values))
-    overlap, size, beyond = _overlaps(labels, true, pieces, of_piece, len(n_true))
-    has_outside = (np.arange(len(n_true)) == outside).astype(float)
-    boxes = scipy.ndimage.find_objects(true + 1)
-    shared = facets(pieces.cells)
-    nodes, sides = _labels_beside_facets(labels, pieces, of_piece, shared, outside)
-    one_layer = one_layer_fractions(
-        mesh, label_of_cell, shared if n_pieces == 1 else facets(mesh.cells)
-    )
-    face = _face(labels.voxel_volume, labels.ndim)
+    painted, is_covered = painted_voxels(owner, label_of_cell, outside), owner >= 0
+    is_covered |= mask is not None
+    columns = _label_columns(labels, mesh, true, painted, owner, label_of_cell, outside)
+    distances = _label_distances(labels, mesh, true, label_of_cell, outside)
     rows = []
-    for row in np.flatnonzero(n_true):
-        part, affine = _with_margin(labels, true, box := boxes[row])
-        n_components, lost = voxel_components(true[box] == row, is_met[box], labels.affine, box)
-        is_side = (sides == row).sum(axis=1) == 1
-        distances = np.concatenate(
-            _distances(
-                FacetSurface(pieces.points, nodes[is_side]),
-                half_level_surface(part == row, affine),
-                face,
-            )
-        )
+    for row, box, n_covered, _, n_components, lost in label_pieces(
+        true, painted, is_covered, labels.affine
+    ):
+        far = distances(row, box)
+        mean, p95 = _mean_and_p95(far)
         rows.append(
             LabelFidelity(
-                int(values[row]),
-                int(n_true[row]),
-                float(n_true[row] * labels.voxel_volume),
-                float(mesh_volume[row]),
-                int(n_cells[row]),
-                int(n_empty[row]),
-                float(dice[row]),
-                _dice(
-                    overlap[row] + has_outside[row] * beyond[0],
-                    n_true[row] * labels.voxel_volume,
-                    size[row] + has_outside[row] * beyond[1],
-                ),
-                *_mean_and_p95(distances),
-                n_components,
-                _n_components(mesh.cells[label_of_cell == row]),
-                bool(n_cells[row] == 0 and (row != outside or owner.min() >= 0)),
-                float(distances.max(initial=0.0)) if len(distances) else np.nan,
-                one_layer.get(int(row), np.nan),
-                float(dice_majority[row]),
-                int(n_covered[row]),
-                lost,
+                label=int(values[row]),
+                **{name: column[row].item() for name, column in columns.items()},
+                distance_mean=mean,
+                distance_p95=p95,
+                distance_max=float(far.max()) if len(far) else np.nan,
+                components=n_components,
+                mesh_components=_n_components(mesh.cells[label_of_cell == row]),
+                covered_voxels=n_covered,
+                lost_components=lost,
             )
         )
     return rows
+
+
+def label_pieces(
+    rows: NDArray[np.integer],
+    painted: NDArray[np.integer],
+    is_covered: NDArray[np.bool_],
+    affine: NDArray[np.float64],
+) -> Iterator[tuple[int, tuple[slice, ...], int, bool, int, tuple[LostComponent, ...]]]:
+    """Yield each label's row and box in the voxels, the number of its voxels that cells should
+    represent, True if one lies in its cells, and its number of components and the lost ones.
+
+    `rows` are those of the voxels, `painted` those of their cells; `is_covered` where cells should
+    be.
+    """
+    for row, box in enumerate(scipy.ndimage.find_objects(rows + 1)):
+        if box is not None:
+            own, is_seen = rows[box] == row, is_covered[box]
+            is_met = own & (painted[box] == row)
+            n_components, lost = voxel_components(own, is_met | ~is_seen, affine, box)
+            n_seen = int(np.count_nonzero(own & is_seen))
+            yield row, box, n_seen, bool(is_met.any()), n_components, lost
+
+
+def _label_columns(
+    labels: Image,
+    mesh: Mesh,
+    true: NDArray[np.integer],
+    painted: NDArray[np.integer],
+    owner: NDArray[np.integer],
+    label_of_cell: NDArray[np.int64],
+    outside: int,
+) -> dict[str, NDArray]:
+    """Volumes and overlaps of all labels, by the names of `LabelFidelity`."""
+    n_labels = int(max(true.max(), label_of_cell.max())) + 1
+    n_true, number = _voxel_counts(true, n_labels), np.arange(n_labels)
+    n_cells = np.bincount(label_of_cell, minlength=n_labels)
+    n_owned = np.bincount(owner[owner >= 0], minlength=len(mesh.cells))
+    pieces, n_pieces = mesh.straight_pieces()
+    of_piece = np.repeat(label_of_cell, n_pieces)
+    overlap, size, (overlap_beyond, size_beyond) = _overlaps(
+        labels, true, pieces, of_piece, n_labels
+    )
+    volume, is_outside = n_true * labels.voxel_volume, number == outside
+    both = overlap + is_outside * overlap_beyond
+    total = volume + (size + is_outside * size_beyond)
+    of_most = painted_voxels(owner, _most_frequent(true, owner, label_of_cell), outside)
+    one_layer = one_layer_fractions(mesh, label_of_cell, facets(mesh.cells))
+    return {
+        "voxels": n_true,
+        "volume": volume,
+        "mesh_volume": np.bincount(label_of_cell, mesh.cell_volumes, n_labels),
+        "n_cells": n_cells,
+        "n_empty_cells": np.bincount(label_of_cell[n_owned == 0], minlength=n_labels),
+        "dice": _voxel_dice(true, painted, n_true),
+        "volume_dice": 2.0 * both / np.where(total > 0.0, total, 1.0),
+        "dice_majority": _voxel_dice(true, of_most, n_true),
+        "is_lost": (n_cells == 0) & (~is_outside | (owner.min() >= 0)),
+        "one_layer_fraction": np.array([one_layer.get(row, np.nan) for row in range(n_labels)]),
+    }
+
+
+def _label_distances(
+    labels: Image,
+    mesh: Mesh,
+    true: NDArray[np.integer],
+    label_of_cell: NDArray[np.int64],
+    outside: int,
+) -> Callable[[int, tuple[slice, ...]], NDArray[np.float64]]:
+    """Return a function that measures the distances between the surfaces of a label, by its row
+    and the box of its voxels, both ways.
+    """
+    pieces, n_pieces = mesh.straight_pieces()
+    of_piece, shared = np.repeat(label_of_cell, n_pieces), facets(pieces.cells)
+    nodes, sides = _labels_beside_facets(labels, pieces, of_piece, shared, outside)
+    face = _face(labels.voxel_volume, labels.ndim)
+
+    def distances(row: int, box: tuple[slice, ...]) -> NDArray[np.float64]:
+        part, affine = _with_margin(labels, true, box)
+        ours = FacetSurface(pieces.points, nodes[(sides == row).sum(axis=1) == 1])
+        return np.concatenate(_distances(ours, half_level_surface(part == row, affine), face))
+
+    return distances
 
 
 def _overlaps(

@@ -36,6 +36,7 @@ from tetopt.geometry.manifold import OUTSIDE_LABEL
 from tetopt.geometry.simplex import dihedral_angles, edge_pairs, squared_edges
 from tetopt.geometry.topology import components
 from tetopt.image import Image, transform_vectors
+from tetopt.measure.fidelity import label_pieces, painted_voxels
 from tetopt.mesh import Mesh
 
 # least Dice of a mesh with its mask, below which cells are too large for the mask's detail
@@ -455,21 +456,20 @@ def _label_fits(
     members = content.memberships
     assert members is not None
     owner, rows = owner[planes], members.partition[planes]
-    is_covered, outside = owner >= 0, BACKGROUND_LABEL
+    row_of = {label: row for row, label in enumerate(members.labels.tolist())}
+    is_covered, outside = owner >= 0, row_of.get(BACKGROUND_LABEL, OUTSIDE_LABEL)
     if content.region is not None:
         is_covered, outside = content.region.inside[planes], OUTSIDE_LABEL
         rows = np.where(is_covered, rows, OUTSIDE_LABEL)
-    painted = np.append(of_cell, outside)[owner]
     numbers, place = np.unique(of_cell, return_inverse=True)
     sizes = np.bincount(place, mesh.cell_volumes) / (content.image.voxel_volume * members.parts)
     n_in_cells, fits = dict(zip(numbers.tolist(), sizes.tolist(), strict=True)), []
-    for row, box in enumerate(scipy.ndimage.find_objects(rows + 1)):
-        if box is not None:
-            label, own = int(members.labels[row]), rows[box] == row
-            is_met, n_covered = painted[box] == label, int(np.count_nonzero(own & is_covered[box]))
-            lost = voxel_components(own, is_met | ~is_covered[box], affine, box)[1]
-            ratio = n_in_cells.get(label, 0.0) / max(n_covered, 1)
-            fits.append(LabelFit(label, n_covered, ratio, bool((own & is_met).any()), lost))
+    row_of_cell = np.array([row_of.get(each, OUTSIDE_LABEL) for each in numbers.tolist()])[place]
+    painted = painted_voxels(owner, row_of_cell, outside)
+    for row, _, n_covered, is_met, _, lost in label_pieces(rows, painted, is_covered, affine):
+        label = int(members.labels[row])
+        ratio = n_in_cells.get(label, 0.0) / max(n_covered, 1)
+        fits.append(LabelFit(label, n_covered, ratio, is_met, lost))
     return fits
 
 
