@@ -83,7 +83,7 @@ METAIMAGE_NAMES = Names(
 class VoxelHeader(NamedTuple):
     """The contents of a header."""
 
-    stated: list[tuple[str, str]]  # fields, in order; those of NRRD in lower case without blanks
+    fields: dict[str, str]  # those of NRRD in lower case without blanks; the last of each name
     texts: dict[str, str]  # key:=value pairs of NRRD
     sizes: list[int]
     value_bytes: int  # all voxels
@@ -214,8 +214,7 @@ def _n_axes(text: str) -> int:
 def _parse_head(head: bytes, is_nrrd: bool) -> VoxelHeader:
     """Parse the first bytes of a file as a header; `Names` are those of the format's fields."""
     names = NRRD_NAMES if is_nrrd else METAIMAGE_NAMES
-    stated, texts, files, n_bytes = _lines(head, names)
-    fields = dict(stated)
+    fields, texts, files, n_bytes = _lines(head, names)
     for key in names[:4]:
         if key not in fields:
             raise InputError(f"{UNREADABLE_FILE} (its header has no {key})")
@@ -231,17 +230,15 @@ def _parse_head(head: bytes, is_nrrd: bool) -> VoxelHeader:
         ratio = 1 if fields.get("BinaryData", "True").lower() in TRUE else TEXT_RATIO
     value_bytes = math.prod(sizes) * int(channels) * _value_bytes(fields[names.kind])
     skip = fields.get(names.skip, "0")
-    return VoxelHeader(stated, texts, sizes, value_bytes, files, ratio, skip, n_bytes)
+    return VoxelHeader(fields, texts, sizes, value_bytes, files, ratio, skip, n_bytes)
 
 
-def _lines(
-    head: bytes, names: Names
-) -> tuple[list[tuple[str, str]], dict[str, str], list[str], int]:
-    """Return the fields in order, NRRD's key:=value pairs, the data files, and the number of
+def _lines(head: bytes, names: Names) -> tuple[dict[str, str], dict[str, str], list[str], int]:
+    """Return the fields, NRRD's key:=value pairs, the data files, and the number of
     bytes of the header.
     """
     is_nrrd = names is NRRD_NAMES
-    stated: list[tuple[str, str]] = []
+    fields: dict[str, str] = {}
     texts: dict[str, str] = {}
     files: list[str] = []
     raw = head.split(b"\n")
@@ -264,7 +261,7 @@ def _lines(
             key = key.lower().replace(" ", "")
         elif (key and not mark) or ":" in key:  # ITK also ends a key at a colon
             raise InputError(UNREADABLE_FILE)
-        stated.append((key, value))
+        fields[key] = value
         if key == names.files:
             is_list = value.upper().startswith("LIST")
             if is_list:
@@ -273,7 +270,7 @@ def _lines(
                 files.append(value)
             if is_list or not is_nrrd:
                 break
-    return stated, texts, files, len(b"\n".join(raw[: number + 1])) + 1
+    return fields, texts, files, len(b"\n".join(raw[: number + 1])) + 1
 
 
 def _value_bytes(kind: str) -> int:

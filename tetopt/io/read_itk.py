@@ -39,16 +39,14 @@ def read_itk(path: Path, request: Request, notes: list[str]) -> tuple[NDArray, N
     header, size = check_header(path)
     is_nrrd = path.suffix.lower() in NRRD_SUFFIXES
     about = (
-        notes_of_nrrd(dict(header.stated), header.sizes)
-        if is_nrrd
-        else notes_of_metaimage(header.stated)
+        notes_of_nrrd(header.fields, header.sizes) if is_nrrd else notes_of_metaimage(header.fields)
     )
     if header.ratio == 1 and header.skip.isdecimal():  # neither packed nor text
         rest = size - header.n_bytes - int(header.skip) - header.value_bytes
         about += notes_of_rest(
             rest, header.sizes, header.value_bytes // max(math.prod(header.sizes), 1)
         )
-    lengths = (_nrrd_units if is_nrrd else _metaimage_units)(dict(header.stated), about)
+    lengths = (_nrrd_units if is_nrrd else _metaimage_units)(header.fields, about)
     segments = segments_of(header.texts)
     data, affine = read_apart(
         _volume_of,

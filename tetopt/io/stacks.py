@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.io.apart import read_apart
-from tetopt.io.contradictions import SAME_SIZE
 from tetopt.io.pictures import MOST_PIXELS, PICTURE_SUFFIXES, frame_of, read_picture
 from tetopt.io.read_dicom import is_dicom
 from tetopt.io.text import plain
@@ -33,6 +32,7 @@ from tetopt.system.incoming import irregular
 
 TIFF_SUFFIXES = (".tif", ".tiff")
 MM_OF_RESOLUTION = {2: 25.4, 3: 10.0}  # TIFF's ResolutionUnit: inch, cm
+SAME_SIZE = 1e-3  # relative: rounded voxel sizes
 SCREEN_DPI = (72.0, 96.0)  # written by default, of no meaning
 MOST_CHANNELS = 7  # of an ImageJ composite; tifffile calls the slices of a plain stack channels
 IMAGEJ_LINE, IMAGEJ_NONE = "0", "20"  # numbers of ImageJ's curves from stored to calibrated values
