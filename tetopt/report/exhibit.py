@@ -116,9 +116,7 @@ def exhibit(
     Raises
     ------
     InputError
-        The mesh has triangles; the length of a field is not the number of cells, or is less than
-        the number of nodes; the image is not 3-D; a facet set does not consist of triples of the
-        mesh's nodes.
+        The mesh has triangles; the image is not 3-D.
     """
     if mesh.ndim != 3:
         raise InputError(
@@ -129,13 +127,6 @@ def exhibit(
         raise InputError(
             f"view: expected a 3-D image for a tetrahedral mesh, got a {image.ndim}-D one"
         )
-    for name, values in cell_data.items():
-        if len(values) != len(mesh.cells):
-            raise InputError(
-                f"view: expected one row of {name!r} for each of {len(mesh.cells)} cells, got "
-                f"{len(values)}; "
-                "pass the data of this mesh"
-            )
     arrays = {name: np.asarray(values) for name, values in cell_data.items()}
     scalars = {
         name: values
@@ -153,13 +144,14 @@ def exhibit(
     skipped = [name for name in cell_data if name not in scalars] + others
     if len(displacements) > 1:
         skipped = list(dict.fromkeys(STEP_NAME.sub(r"\1", name) for name in skipped))
-    checked = _check_sets(mesh, facet_sets or {})
     forces = {
         step if len(displacements) > 1 else 0: by_set for step, by_set in (reactions or {}).items()
     }
     n_nodes = max([len(mesh.points), *(len(rows) for rows in (point_data or {}).values())])
     shown = _by_step(fields, displacements)
-    return Exhibit(mesh, shown, skipped, image, title, checked, displacements, n_nodes, forces)
+    return Exhibit(
+        mesh, shown, skipped, image, title, facet_sets or {}, displacements, n_nodes, forces
+    )
 
 
 def opened_on(
@@ -236,12 +228,6 @@ def _nodal(
     displacements: dict[int, NDArray[np.float64]] = {}
     others = []
     for name, rows in point_data.items():
-        if len(rows) < len(mesh.points):
-            raise InputError(
-                f"view: expected one row of {name!r} for each of {len(mesh.points)} nodes, got "
-                f"{len(rows)}; "
-                "pass the data of this mesh"
-            )
         values = np.asarray(rows)[: len(mesh.points)]
         match = STEP_NAME.fullmatch(name)
         if (
@@ -316,25 +302,3 @@ def _categories(values: NDArray[np.float64], table: LabelTable) -> list[tuple[in
     return list(
         zip(labels.tolist(), map(to_hex, label_colours(labels, table.colours)), strict=True)
     )
-
-
-def _check_sets(mesh: Mesh, facet_sets: dict[str, NDArray]) -> dict[str, NDArray]:
-    """Return the sets as arrays; InputError unless each consists of triples (K, 3) of the mesh's
-    nodes.
-    """
-    sets = {name: np.asarray(nodes) for name, nodes in facet_sets.items()}
-    last = len(mesh.points) - 1
-    for name, nodes in sets.items():
-        if nodes.ndim != 2 or nodes.shape[1] != 3 or nodes.dtype.kind not in "iu":
-            raise InputError(
-                f"facet set {name!r}: expected (K, 3) whole numbers, the nodes of each facet, "
-                f"got {nodes.shape} of "
-                f"{nodes.dtype}"
-            )
-        if nodes.size and not (nodes.min() >= 0 and nodes.max() <= last):
-            raise InputError(
-                f"facet set {name!r}: expected nodes 0..{last}, got "
-                f"{nodes.min()}..{nodes.max()}; pass the sets of "
-                "this mesh"
-            )
-    return sets
