@@ -45,7 +45,7 @@ from tetopt.model.sets import Sets, box_of, label_set_names, surviving_sets
 from tetopt.report.summary import run_summary
 from tetopt.start.sizes import edge_ratios
 from tetopt.system.budget import peak_bytes, return_freed
-from tetopt.system.files import kept_places
+from tetopt.system.files import kept_places, save_bytes
 
 
 def model_with(
@@ -256,6 +256,7 @@ def draw(task: Task, outcome: Meshed, model: Model) -> None:
             source.labels, mesh, of_cell, other, source.table, model.order
         )
         figures.save_figure(figure, pictures[-2])
-    thumbnail.save_thumbnail(
-        pictures[-1], image, mesh, source.mask, source.labels, of_cell, source.table
+    picture = thumbnail.thumbnail_png(
+        image, mesh, source.mask, source.labels, of_cell, source.table
     )
+    save_bytes(pictures[-1], picture)

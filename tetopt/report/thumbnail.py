@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import PIL.Image
@@ -29,8 +29,7 @@ from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.model.label_names import NO_TABLE, LabelTable
 from tetopt.report.colours import grey_limits, label_colours
-from tetopt.report.figures import FIGURE_SUFFIXES, MASK_LINE, MESH_LINE
-from tetopt.system.files import check_suffix, save_bytes
+from tetopt.report.figures import MASK_LINE, MESH_LINE
 
 SIDE_PIXELS = 128  # of a view: enough for a head, where a page has 500 of them
 SAMPLES_PER_PIXEL = 2  # along each side: fine stripes would cause aliasing with single samples
@@ -49,17 +48,15 @@ VIEW_AXES = {
 }  # horizontal and vertical world axes: axial and sagittal views; a single view in 2-D
 
 
-def save_thumbnail(
-    path: Path,
+def thumbnail_png(
     image: Image,
     mesh: Mesh,
     mask: Image | None = None,
     labels: Image | None = None,
     of_cell: NDArray[np.int64] | None = None,
     table: LabelTable = NO_TABLE,
-) -> None:
-    """Write slices of an image with its mesh as a PNG, whole or not at all; the same inputs give
-    the same bytes.
+) -> bytes:
+    """Return slices of an image with its mesh as a PNG; the same inputs give the same bytes.
 
     A volume gives an axial slice on the left and a sagittal one on the right, 256 x 128 pixels,
     through the mesh's middle (or, if that is hollow, where most of it is); a 2-D image gives one
@@ -70,8 +67,6 @@ def save_thumbnail(
 
     Parameters
     ----------
-    path : Path
-        Ends in ".png".
     image : Image
     mesh : Mesh
         Drawn with orange edges and a stronger boundary.
@@ -83,96 +78,103 @@ def save_thumbnail(
         Label of each cell, with `labels`: cells of labels other than 0 get their colours.
     table : LabelTable
         Colours of labels.
-
-    Raises
-    ------
-    InputError
-        The name has another suffix.
     """
-    save_bytes(
-        check_suffix(path, FIGURE_SUFFIXES),
-        thumbnail_png(image, mesh, mask, labels, of_cell, table),
-    )
-
-
-def thumbnail_png(
-    image: Image,
-    mesh: Mesh,
-    mask: Image | None = None,
-    labels: Image | None = None,
-    of_cell: NDArray[np.int64] | None = None,
-    table: LabelTable = NO_TABLE,
-) -> bytes:
-    """Return the bytes of `save_thumbnail`."""
-    views = VIEW_AXES[image.ndim]
-    low, high = (
-        mesh.points[np.unique(mesh.cells)].min(axis=0),
-        mesh.points[np.unique(mesh.cells)].max(axis=0),
-    )
-    half = (0.5 + MARGIN_FRACTION) * float((high - low).max())
-    places = [(low + high) / 2.0] * len(views)
-    if image.ndim == 3:
-        places = [
-            _at(place, axis, _fullest(mesh, axis))
-            for place, axis in zip(places, (2, 0), strict=True)
-        ]
-    pixels = [
-        _sample_square(image, place, axes, half) for place, axes in zip(places, views, strict=True)
-    ]
-    inside = cell_of_voxel(image, mesh) >= 0
-    covered = Image(
-        inside if mask is None else inside & (mask.data >= INSIDE_FRACTION), image.affine
-    )
-    is_in = [
-        _sample_square(covered, place, axes, half) > 0.5
-        for place, axes in zip(places, views, strict=True)
-    ]
-    seen = [each[np.isfinite(each) & within] for each, within in zip(pixels, is_in, strict=True)]
-    limits = grey_limits(
-        [np.concatenate(seen)] if sum(map(len, seen)) else [np.zeros(1)], brightest=99.8
-    )
     colours = None
     if labels is not None and of_cell is not None:
         values, row = np.unique(of_cell, return_inverse=True)
         colours = np.where(of_cell[:, None] > 0, label_colours(values, table.colours)[row], np.nan)
+    views = _views(mesh)
+    pixels = [_sample_view(image, view) for view in views]
+    limits = _limits(image, mesh, mask, views, pixels)
     figure = Figure(figsize=(len(views), 1.0), dpi=SIDE_PIXELS, facecolor="black")
-    for k, (place, axes) in enumerate(zip(places, views, strict=True)):
+    for k, (view, values) in enumerate(zip(views, pixels, strict=True)):
         panel = figure.add_axes((k / len(views), 0.0, 1.0 / len(views), 1.0))
-        centre = place[list(axes)]
         panel.set_axis_off()
-        extent = (centre[0] - half, centre[0] + half, centre[1] - half, centre[1] + half)
-        shown = np.nan_to_num(pixels[k], nan=limits[0])
-        panel.imshow(
-            shown.T, origin="lower", extent=extent, cmap="gray", vmin=limits[0], vmax=limits[1]
-        )
+        look: dict[str, Any] = {"origin": "lower", "extent": view.extent, "cmap": "gray"}
+        shown = np.nan_to_num(values, nan=limits[0])
+        panel.imshow(shown.T, vmin=limits[0], vmax=limits[1], **look)
         if mask is not None:
-            inside = np.nan_to_num(_sample_square(mask, place, axes, half), nan=0.0)
+            inside = np.nan_to_num(_sample_view(mask, view), nan=0.0)
             if inside.min() < 0.5 <= inside.max():
                 panel.contour(
-                    inside.T, levels=[0.5], extent=extent, colors=MASK_LINE, linewidths=1.0
+                    inside.T, levels=[0.5], extent=view.extent, colors=MASK_LINE, linewidths=1.0
                 )
-        _draw_mesh(panel, mesh, place, axes, colours)
-        panel.set_xlim(extent[:2])
-        panel.set_ylim(extent[2:])
+        _draw_mesh(panel, mesh, view, colours)
+        panel.set_xlim(view.extent[:2])
+        panel.set_ylim(view.extent[2:])
         if image.ndim == 3:
-            for letter, x in zip(SIDE_LETTERS[axes[0]], (0.04, 0.96), strict=True):
-                panel.text(
-                    x,
-                    0.05,
-                    letter,
-                    transform=panel.transAxes,
-                    color="white",
-                    ha="center",
-                    va="center",
-                    fontsize=LETTER_POINTS,
-                )
+            _write_sides(panel, SIDE_LETTERS[view.axes[0]])
     return _png(figure)
 
 
-def _at(place: NDArray[np.float64], axis: int, value: float) -> NDArray[np.float64]:
-    moved = place.copy()
-    moved[axis] = value
-    return moved
+class _View(NamedTuple):
+    """A square around a place, along two world axes."""
+
+    place: NDArray[np.float64]
+    axes: tuple[int, int]  # horizontal and vertical
+    half: float  # mm, of its side
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """Its ends along the horizontal and the vertical axis."""
+        x, y = self.place[list(self.axes)].tolist()
+        return x - self.half, x + self.half, y - self.half, y + self.half
+
+
+def _views(mesh: Mesh) -> list[_View]:
+    """Return the squares around a mesh that are drawn."""
+    used = mesh.points[np.unique(mesh.cells)]
+    low, high = used.min(axis=0), used.max(axis=0)
+    half = (0.5 + MARGIN_FRACTION) * float((high - low).max())
+    views = []
+    for axes in VIEW_AXES[mesh.ndim]:
+        place = (low + high) / 2.0
+        if mesh.ndim == 3:
+            across = _across(axes)
+            place[across] = _fullest(mesh, across)
+        views.append(_View(place, axes, half))
+    return views
+
+
+def _across(axes: tuple[int, int]) -> int:
+    """Return the third world axis."""
+    return 3 - sum(axes)
+
+
+def _limits(
+    image: Image,
+    mesh: Mesh,
+    mask: Image | None,
+    views: Sequence[_View],
+    pixels: Sequence[NDArray[np.float64]],
+) -> tuple[float, float]:
+    """Return the values drawn black and white: of the pixels in the mesh and its mask."""
+    inside = cell_of_voxel(image, mesh) >= 0
+    covered = Image(
+        inside if mask is None else inside & (mask.data >= INSIDE_FRACTION), image.affine
+    )
+    seen = [
+        values[np.isfinite(values) & (_sample_view(covered, view) > 0.5)]
+        for view, values in zip(views, pixels, strict=True)
+    ]
+    return grey_limits(
+        [np.concatenate(seen)] if sum(map(len, seen)) else [np.zeros(1)], brightest=99.8
+    )
+
+
+def _write_sides(panel: Axes, letters: str) -> None:
+    """Write the letters of the left and of the right side into the lower corners."""
+    for letter, x in zip(letters, (0.04, 0.96), strict=True):
+        panel.text(
+            x,
+            0.05,
+            letter,
+            transform=panel.transAxes,
+            color="white",
+            ha="center",
+            va="center",
+            fontsize=LETTER_POINTS,
+        )
 
 
 def _fullest(mesh: Mesh, axis: int) -> float:
@@ -194,15 +196,13 @@ def _fullest(mesh: Mesh, axis: int) -> float:
     return float(ends[slab : slab + 2].mean())
 
 
-def _sample_square(
-    image: Image, place: NDArray[np.float64], axes: Sequence[int], half: float
-) -> NDArray[np.float64]:
-    """Sample the image in a square around a place, along two world axes; NaN outside the image."""
-    n = SIDE_PIXELS * SAMPLES_PER_PIXEL
-    steps = (np.arange(n) + 0.5) / n * 2.0 * half - half
+def _sample_view(image: Image, view: _View) -> NDArray[np.float64]:
+    """Sample the image in the pixels of a view; NaN outside the image."""
+    n, place, (across, up) = SIDE_PIXELS * SAMPLES_PER_PIXEL, view.place, view.axes
+    steps = (np.arange(n) + 0.5) / n * 2.0 * view.half - view.half
     points = np.broadcast_to(place, (n, n, len(place))).copy()
-    points[..., axes[0]] += steps[:, None]
-    points[..., axes[1]] += steps[None, :]
+    points[..., across] += steps[:, None]
+    points[..., up] += steps[None, :]
     index = np.moveaxis(image.to_index(points), -1, 0)
     sides = np.array(image.shape).reshape(-1, 1, 1)
     is_in = ((index >= -0.5) & (index <= sides - 0.5)).all(axis=0)
@@ -213,24 +213,18 @@ def _sample_square(
     return averaged
 
 
-def _draw_mesh(
-    panel: Axes,
-    mesh: Mesh,
-    place: NDArray[np.float64],
-    axes: Sequence[int],
-    colours: NDArray[np.float64] | None,
-) -> None:
-    """Draw the cells that the plane through a place cuts, in their colours (M, 3) if any, and
+def _draw_mesh(panel: Axes, mesh: Mesh, view: _View, colours: NDArray[np.float64] | None) -> None:
+    """Draw the cells that the plane of a view cuts, in their colours (M, 3) if any, and
     the mesh's boundary.
     """
-    flat, (mesh, n_pieces) = list(axes), mesh.straight_pieces()
-    if len(place) == 2:
+    flat, (mesh, n_pieces) = list(view.axes), mesh.straight_pieces()
+    if mesh.ndim == 2:
         corners, cells = mesh.points[mesh.cells], np.arange(len(mesh.cells))
         shared = facets(mesh.cells)
         boundary = mesh.points[shared.nodes[shared.n_cells == 1]]
     else:
-        across = ({0, 1, 2} - set(flat)).pop()
-        height = mesh.points[:, across] - place[across]
+        across = _across(view.axes)
+        height = mesh.points[:, across] - view.place[across]
         corners, cells = plane_cut(mesh.points, mesh.cells, height)
         # The plane cuts all cells of a facet that it cuts, so these cells suffice to find the
         # boundary.
