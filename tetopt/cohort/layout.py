@@ -1,10 +1,11 @@
 """Layout of a cohort's files, with names of BIDS derivatives.
 
-OUT/dataset_description.json                   identifies the folder as a cohort's OUT/cohort.tsv,
-cohort.html                    all subjects OUT/sub-X[/ses-Y]/KEY_desc-tetopt_mesh.vtu     with the
-run's numbers in a JSON file of the same name OUT/sub-X[/ses-Y]/figures/                     its
-pictures OUT/logs/KEY.log, KEY.failed.json              events of the last run, and why it failed
-OUT/.work/                                     unfinished outputs (`tetopt.system.work_directory`)
+- OUT/dataset_description.json identifies the folder as a cohort's
+- OUT/cohort.tsv, cohort.html: all subjects
+- OUT/sub-X[/ses-Y]/KEY_desc-tetopt_mesh.vtu, with the run's numbers in a JSON file of the same name
+- OUT/sub-X[/ses-Y]/figures/: its pictures
+- OUT/logs/KEY.log, KEY.failed.json: events of the last run, and why it failed
+- OUT/.work/: unfinished outputs (`tetopt.system.work_directory`)
 """
 
 from __future__ import annotations

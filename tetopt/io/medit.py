@@ -13,16 +13,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.io.tags import (
-    all_sets,
-    label_lines,
-    number_parts,
-    remarks,
-    tag_lines,
-    without_data,
-    without_labels,
-)
-from tetopt.io.text import comment_lines, rows
+from tetopt.io.tags import number_parts, part_comments
+from tetopt.io.text import rows
 from tetopt.model.model import Model, element_facets, elements
 
 ELEMENT_KEYWORDS = {1: "Edges", 2: "Triangles", 3: "Tetrahedra"}
@@ -45,18 +37,10 @@ def medit(model: Model) -> bytes:
         f"{ELEMENT_KEYWORDS[dim]}{'P2' if model.order == 2 else ''}"
         for dim in (mesh.ndim, mesh.ndim - 1)
     )
-    comments = [
-        *remarks(model),
-        *without_data(without_labels(model)),
-        *label_lines(model, in_cells, "reference"),
-    ]
-    comments += tag_lines(all_sets(in_cells), f"{cells} ref") + tag_lines(
-        on_facets.sets, f"{sides} ref"
-    )
     return "".join(
         [
             "MeshVersionFormatted 2\n\n",
-            comment_lines(comments, "# "),
+            part_comments(model, in_cells, on_facets, "reference", f"{cells} ref", f"{sides} ref"),
             f"\nDimension {mesh.ndim}\n",
             _section("Vertices", points, np.zeros(len(points), dtype=np.int64)),
             _section(cells, nodes + 1, in_cells.entities),

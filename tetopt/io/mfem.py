@@ -22,16 +22,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.io.tags import (
-    all_sets,
-    label_lines,
-    number_parts,
-    remarks,
-    tag_lines,
-    without_data,
-    without_labels,
-)
-from tetopt.io.text import blocks, comment_lines, rows
+from tetopt.io.tags import all_sets, number_parts, part_comments
+from tetopt.io.text import blocks, rows
 from tetopt.mesh import Mesh
 from tetopt.model.model import Model
 from tetopt.model.sets import facet_triples
@@ -58,16 +50,12 @@ def mfem(model: Model) -> bytes:
     mesh = model.mesh
     in_cells, on_facets = number_parts(model)
     cell_sets = all_sets(in_cells)
-    comments = [
-        *remarks(model),
-        *without_data(without_labels(model)),
-        *label_lines(model, in_cells, "attribute"),
-    ]
-    comments += tag_lines(cell_sets, "attribute") + tag_lines(on_facets.sets, "boundary attribute")
     return "".join(
         [
             "MFEM mesh v1.3\n\n",
-            comment_lines(comments, "# "),
+            part_comments(
+                model, in_cells, on_facets, "attribute", "attribute", "boundary attribute"
+            ),
             f"\ndimension\n{mesh.ndim}\n",
             "\nelements\n",
             _elements(in_cells.entities, mesh.ndim, mesh.cells),

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.topology import facets
-from tetopt.io.text import free_text
+from tetopt.io.text import comment_lines, free_text
 from tetopt.mesh import Mesh
 from tetopt.model.label_names import LABEL_FIELD, TABLE_TEXT, labels_of, table_of_words
 from tetopt.model.loads import load_words
@@ -440,6 +440,22 @@ def label_lines(model: Model, cells: Part, what: str) -> list[str]:
             f"({names})"
         )
     return lines
+
+
+def part_comments(
+    model: Model, cells: Part, sides: Part, label_word: str, cell_word: str, side_word: str
+) -> str:
+    """Return the comments of a file that has one number for each cell and each facet, and no
+    other data; the words are the format's for a cell's label, and for these numbers.
+    """
+    lines = [
+        *remarks(model),
+        *without_data(without_labels(model)),
+        *label_lines(model, cells, label_word),
+        *tag_lines(all_sets(cells), cell_word),
+        *tag_lines(sides.sets, side_word),
+    ]
+    return comment_lines(lines, "# ")
 
 
 def tag_lines(tags_of: dict[str, list[int]], what: str) -> list[str]:

@@ -30,8 +30,7 @@ them. The tag of a cell is its label, or another number if sets divide the label
         of_set = root.find(f".//Grid[@Name='{grid}']/Information[@Name='{name}']").get("Value")
         return tags.indices[np.isin(tags.values, np.array(of_set.split(), dtype=int))]
 
-    def on_cells(name):  # a field that is constant in each cell; dolfinx has changed the cells'
-    order
+    def on_cells(name):  # a field that is constant in each cell; dolfinx reorders cells
         text = root.find(f".//Grid[@Name='mesh']/Attribute[@Name='{name}']/DataItem").text
         field = fem.Function(fem.functionspace(mesh, ("DG", 0)))
         field.x.array[:] = np.array(text.split(), dtype=float)[mesh.topology.original_cell_index]
@@ -66,12 +65,14 @@ the program above and applies the loads of step 1::
         texts = "0 " * dim if kind == "hold" else rest[-1].replace("free", "nan").replace(",", " ")
         numbers = np.array(texts.split(), dtype=float)
         if kind == "gravity":
-            forces.append(ufl.inner(per_mm3 * on_cells("density") * fem.Constant(mesh, numbers), v)
-            * ufl.dx) continue
+            weight = per_mm3 * on_cells("density") * fem.Constant(mesh, numbers)
+            forces.append(ufl.inner(weight, v) * ufl.dx)
+            continue
         if kind in ("hold", "move"):
             for d in np.flatnonzero(np.isfinite(numbers)):
-                dofs = fem.locate_dofs_topological(V.sub(d), dim - 1, members(facet_tags, "facets",
-                rest[0])) conditions.append(fem.dirichletbc(numbers[d], dofs, V.sub(d)))
+                held = members(facet_tags, "facets", rest[0])
+                dofs = fem.locate_dofs_topological(V.sub(d), dim - 1, held)
+                conditions.append(fem.dirichletbc(numbers[d], dofs, V.sub(d)))
             continue
         of_set = root.find(f".//Grid[@Name='facets']/Information[@Name='{rest[0]}']").get("Value")
         on_set = ds(tuple(map(int, of_set.split())))
@@ -96,8 +97,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.geometry.topology import facets
-from tetopt.io.tags import Tagged, as_columns, group_labels, number_parts, tag_sets
+from tetopt.io.tags import (
+    Tagged,
+    as_columns,
+    facet_tags,
+    group_labels,
+    number_parts,
+    tag_sets,
+)
 from tetopt.io.text import rows, xml_attribute
 from tetopt.model.fields import NODE_MODULI, node_field
 from tetopt.model.loads import load_words
@@ -212,18 +219,16 @@ def _cell_grid(model: Model) -> str:
 
 
 def _facet_grid(model: Model) -> str:
-    sets, of_cell = model.sets.facets, facets(model.mesh.cells).of_cell
-    number = {name: of_cell[members[:, 0], members[:, 1]] for name, members in sets.items()}
-    numbers, first = np.unique(np.concatenate(list(number.values())), return_index=True)
-    listed = np.concatenate(list(sets.values()))[first]  # the row of each facet
+    """Return the grid of facets in sets, with those that a set holds from the other side."""
+    sets, scale = model.sets.facets, (model.mesh.ndim + 1, 1)
+    listed = facet_tags(model.mesh, sets).items @ scale
     turned = {
-        f"{name} turned": number[name][
-            listed[np.searchsorted(numbers, number[name]), 0] != members[:, 0]
-        ]
+        f"{name} turned": others
         for name, members in sets.items()
+        if len(others := members[~np.isin(members @ scale, listed)])
     }
-    combined = tag_sets(number | {name: those for name, those in turned.items() if len(those)})
-    nodes = element_facets(elements(model)[1], listed)
+    combined = facet_tags(model.mesh, sets | turned)
+    nodes = element_facets(elements(model)[1], combined.items)
     return _tag_grid("facets", model, model.mesh.ndim - 1, nodes, combined)
 
 
