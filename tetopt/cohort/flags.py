@@ -217,12 +217,10 @@ def _grids(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
 
 def _far(rows: Sequence[Row], names: dict[int, str], ndim: int) -> Flagged:
     """Yield flags of numbers far from the median."""
-    for quantity in QUANTITIES:
-        yield from _far_in(quantity, [row.numbers.get(quantity.column) for row in rows], ndim)
     numbers = sorted({number for row in rows for number in row.volumes if number > 0})
-    for number in numbers:
-        for quantity in label_quantities(number, names):
-            yield from _far_in(quantity, [row.numbers.get(quantity.column) for row in rows], ndim)
+    of_labels = [each for number in numbers for each in label_quantities(number, names)]
+    for quantity in (*QUANTITIES, *of_labels):
+        yield from _far_in(quantity, [row.numbers.get(quantity.column) for row in rows], ndim)
 
 
 def _far_in(quantity: Quantity, values: Sequence[Value], ndim: int) -> Flagged:

@@ -99,15 +99,15 @@ def volume_index(trailing: Sequence[int], volume: int | None, axes: str = "") ->
     return tuple(int(i) for i in np.unravel_index(volume, trailing, order="F"))
 
 
-def check_room(
-    sizes: Sequence[int], value_bytes: int, remedy: str = "crop or resample it first"
-) -> None:
+def check_room(sizes: Sequence[int], value_bytes: int) -> None:
     """Raise InputError if one volume, the first three axes, does not fit into memory, as read
     and as an `Image`.
     """
     count = math.prod(sizes[:3])
     shape = " x ".join(str(size) for size in sizes[:3])
-    check_memory(count * (value_bytes + IMAGE_BYTES), f"its {shape} voxels", remedy)
+    check_memory(
+        count * (value_bytes + IMAGE_BYTES), f"its {shape} voxels", "crop or resample it first"
+    )
 
 
 def exact_type(bits: int, scales: Iterable[tuple[float, float]]) -> type[np.floating[Any]]:

@@ -90,22 +90,17 @@ def save_run_figures(
 def slice_figure(
     image: Image,
     meshes: Sequence[tuple[str, Mesh]],
-    axis: int | None = None,
-    index: int | None = None,
     means_of: Image | None = None,
     mask: Image | None = None,
 ) -> Figure:
     """Draw a slice of the volume with the section of each mesh, and below it the mean of each cell.
 
-    `axis` and `index` choose the slice in voxel indices; by default it is the middle slice across
-    the axis nearest to the world's z (an axial slice), or the mesh's middle one if the mesh does
-    not reach it. A 2-D image is shown whole. Black and white are those of the voxels in the last
-    mesh and its mask. The means are those of `means_of`, by default of the image itself. In their
-    row, parts of the image that a mesh does not cover are light blue.
+    It is the middle slice across the axis nearest to the world's z (an axial slice), or the mesh's
+    middle one if the mesh does not reach it. A 2-D image is shown whole. Black and white are those
+    of the voxels in the last mesh and its mask. The means are those of `means_of`, by default of
+    the image itself. In their row, parts of the image that a mesh does not cover are light blue.
     """
-    view = SliceView(
-        image, axis, _slice_through(meshes[-1][1], image, axis) if index is None else index
-    )
+    view = SliceView(image, None, _slice_through(meshes[-1][1], image))
     figure = Figure(figsize=(5.2 * len(meshes), 10.0 * view.aspect + 1.0), layout="constrained")
     grid = figure.subplots(2, len(meshes), squeeze=False)
     limits = limits_within(image, meshes[-1][1], [view], mask)
@@ -132,13 +127,13 @@ def _curved_words(mesh: Mesh) -> str:
     )
 
 
-def _slice_through(mesh: Mesh, image: Image, axis: int | None) -> int | None:
+def _slice_through(mesh: Mesh, image: Image) -> int | None:
     """Return the index of the middle slice of a mesh that does not reach the image's middle one;
     None otherwise.
     """
     if image.ndim == 2:
         return None
-    across = world_axes(image.affine).index(2) if axis is None else axis
+    across = world_axes(image.affine).index(2)
     along, last = image.to_index(mesh.points)[:, across], image.shape[across] - 1
     if along.min() <= image.shape[across] // 2 <= along.max():
         return None
