@@ -17,7 +17,7 @@ from tetopt.commands.simulation import PAPER_PERCENT, SolvedModel, solve_file
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.options import LabelledPart, ModelOptions, Option
 from tetopt.model.mappings import ByLabel, parse_any_mapping
-from tetopt.report.tables import new_table, nodes_in_words
+from tetopt.report.tables import new_table, nodes_in_words, range_words
 from tetopt.system.files import check_output
 
 STEPS_BESIDE = 3  # columns of a table
@@ -98,8 +98,7 @@ def _of_what(solved: SolvedModel) -> Iterator[tuple[str, str]]:
         parse_any_mapping(str(options.young)), ByLabel
     ):
         yield "average over a cell", options.average
-    low, high = nu.min(), nu.max()
-    yield "Poisson's ratio", f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
+    yield "Poisson's ratio", range_words(nu)
 
 
 def _print(name: str, solved: SolvedModel, shown: slice) -> None:

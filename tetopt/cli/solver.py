@@ -18,7 +18,7 @@ from tetopt.io.tags import (
     number_parts,
     renumbered_labels,
 )
-from tetopt.io.text import list_names
+from tetopt.io.text import counted, list_names
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.options import SolverOptions
 from tetopt.model.fields import GAUSS_MODULI
@@ -27,7 +27,7 @@ from tetopt.model.loads import SHOWN_LOAD_DIGITS, count_of_steps, load_words
 from tetopt.model.materials import Materials
 from tetopt.model.model import STRESS_UNITS, Model, element_facets, elements
 from tetopt.model.sets import area_vectors, standard_names
-from tetopt.report.tables import new_table, nodes_in_words
+from tetopt.report.tables import new_table, nodes_in_words, range_words
 
 MOST_SETS = 32  # printed of facets, of cells, and of materials
 GMSH_SUFFIXES = (".msh", ".msh2")
@@ -106,48 +106,52 @@ def _gmsh_lines(model: Model, suffix: str) -> Iterator[str]:
         )
 
 
-def _lines(output: Path, model: Model, solver: SolverOptions) -> Iterator[str]:
-    form = format_of(output)
-    materials = None if form.is_surface else model.materials
-    if materials is not None:
-        young, nu = materials.young, materials.nu
-        ratios = f"{nu.min():.4g}" if nu.min() == nu.max() else f"{nu.min():.4g} to {nu.max():.4g}"
-        count = f"{len(young)} material{'s' * (len(young) > 1)}"
-        moduli = (
-            f"{young.min():.4g}"
-            if young.min() == young.max()
-            else f"{young.min():.4g} to {young.max():.4g}"
-        )
-        yield f"{count}, Young's modulus {moduli} kPa, nu {ratios}"
-        yield from _materials_by_name(model, materials)
-    if materials is not None and model.gauss_young is not None:
-        yield (
-            "one modulus per cell, its geometric mean, and, for tetopt fem, one per Gauss point "
-            f"({GAUSS_MODULI})"
-            if output.suffix.lower() in VTK_SUFFIXES
-            else "one modulus per cell, its geometric mean; VTK files also have one per Gauss point"
-        )
-    if materials is not None and materials.binning is not None:
-        mean, largest = materials.binning.mean, materials.binning.largest
-        yield f"bins: modulus error {mean:.2%} on average by volume, {largest:.2%} at most"
-    if model.node_young is not None and not form.is_surface:
+def _moduli_lines(output: Path, model: Model) -> Iterator[str]:
+    """Yield lines on the materials, and on moduli that vary within cells."""
+    if (table := model.materials) is not None:
+        moduli = f"Young's modulus {range_words(table.young)} kPa, nu {range_words(table.nu)}"
+        yield f"{counted(len(table.young), 'material')}, {moduli}"
+        yield from _materials_by_name(model, table)
+        if model.gauss_young is not None:
+            yield (
+                "one modulus per cell, its geometric mean, and, for tetopt fem, one per Gauss "
+                f"point ({GAUSS_MODULI})"
+                if output.suffix.lower() in VTK_SUFFIXES
+                else "one modulus per cell, its geometric mean; VTK files also have one per Gauss "
+                "point"
+            )
+        if table.binning is not None:
+            mean, largest = table.binning
+            yield f"bins: modulus error {mean:.2%} on average by volume, {largest:.2%} at most"
+    if model.node_young is not None:
         low, high = model.node_young.min(), model.node_young.max()
         yield (
             f"the modulus is linear within cells, {low:.4g} to {high:.4g} kPa at their corners"
-            if form.has_node_moduli
+            if format_of(output).has_node_moduli
             else "the format has one modulus per cell: the mean of the linear modulus"
         )
-    for load in () if form.is_surface else model.loads:
+
+
+def _load_lines(output: Path, model: Model) -> Iterator[str]:
+    """Yield lines on the loads, and on what the format makes of them."""
+    for load in model.loads:
         yield f"load: {load_words(load, SHOWN_LOAD_DIGITS)}"
-    if (n_steps := count_of_steps(model.loads)) > 1 and not form.is_surface:
+    if (n_steps := count_of_steps(model.loads)) > 1:
         yield f"{n_steps} steps, each from the undeformed state"
-    if model.loads and not (form.runs or form.is_surface):
+    if model.loads and not format_of(output).runs:
         yield (
             "loads are kept as text, which tetopt convert and fem read"
             if output.suffix.lower() in VTK_SUFFIXES
             else "the format defines no analysis step: loads are written as text or not at all"
         )
-    if (suffix := output.suffix.lower()) in GMSH_SUFFIXES:
+
+
+def _lines(output: Path, model: Model, solver: SolverOptions) -> Iterator[str]:
+    form, suffix = format_of(output), output.suffix.lower()
+    if not form.is_surface:
+        yield from _moduli_lines(output, model)
+        yield from _load_lines(output, model)
+    if suffix in GMSH_SUFFIXES:
         yield from _gmsh_lines(model, suffix)
     elif suffix in CELL_NUMBERS:
         lines = label_lines(model, number_parts(model)[0], CELL_NUMBERS[suffix])

@@ -332,80 +332,69 @@ def _stack_of(path: str, is_page: bool) -> Tiff:
         tiff = _tiff_of(first)
         if is_page:
             return tiff
-        series = file.series
-        pixels = _ome_pixels(first.description)
-        axes = {
-            name: int(size)
-            for name, size in zip(series[0].axes, series[0].shape, strict=True)
-            if size > 1
-        }
-        axes |= {
-            name: int(pixels.get(f"Size{name}", 1))
-            for name in "CT"
-            if int(pixels.get(f"Size{name}", 1)) > 1
-        }
-        if (
-            len(file.pages) == 1
-            and set(axes) <= set("YXS")
-            and not words
-            and int(pixels.get("SizeZ", 1)) == 1
-        ):
+        series, axes = file.series, _stack_axes(file)
+        n_slices = int(_ome_pixels(first.description).get("SizeZ", 1))
+        if len(file.pages) == 1 and set(axes) <= set("YXS") and not words and n_slices == 1:
             return tiff
         if words:
             raise InputError(f"truncated or damaged; copy it again ({words[0]})")
-        # A program may write a page at a time, each as a picture of its own.
-        is_apart = {each.kind for each in series} == {"shaped"} and {
-            each.axes for each in series
-        } == {"YX"}
-        if len({(each.shape, each.dtype) for each in series}) > 1 or (
-            len(series) > 1 and not is_apart
-        ):
-            shapes = ", ".join(" x ".join(map(str, each.shape)) for each in series[:4])
-            raise InputError(
-                f"expected slices of one size and type, got {shapes}; export one stack"
-            )
         notes = [*tiff.notes]
-        is_imagej = first.description.startswith("ImageJ=")
-        if (
-            is_imagej
-            and set(axes) == set("CYX")
-            and axes["C"] > MOST_CHANNELS
-            and "\nspacing=" in first.description
-        ):
-            notes.append(
-                f"its {axes.pop('C')} channels have a slice spacing: they are read as slices"
-            )
-        if wrong := [f"{axes[name]} {word}" for name, word in AXIS_WORDS.items() if name in axes]:
-            raise InputError(
-                f"expected a stack of grey slices, got {' and '.join(wrong)}; export one part"
-            )
-        shape = [int(size) for size in (len(series), *series[0].shape) if size > 1]
-        if len(shape) != 3 or not {"Y", "X"} <= set(axes):
-            said = f"axes {series[0].axes} of {series[0].shape}"
-            raise InputError(f"expected a stack of slices of one size, got {said}; export it again")
-        if pixels and series[0].kind != "ome":
-            raise InputError(
-                f"expected the {pixels.get('SizeZ')} slices of its OME metadata, which are in "
-                "other files, or not as "
-                "it says; export it again as one file"
-            )
-        if first.photometric == 3 and not is_imagej:
-            raise InputError(
-                "expected grey slices, got a palette of colours; convert it to grey first"
-            )
-        tag = first.tags.get(ORIENTATION_TAG)
-        orientation = 1 if tag is None else int(tag.value)
-        flips = FLIPPED_AXES.get(orientation)
-        if flips is None:
-            raise InputError(
-                f"its Orientation {orientation} swaps rows and columns; export it upright"
-            )
+        shape = _stack_shape(file, axes, notes)
+        flips = _axes_to_flip(first)
         check_room(shape, series[0].dtype.itemsize)
         parts = [_values(each) for each in series]
         data = (parts[0] if len(parts) == 1 else np.stack(parts)).reshape(shape)
         if words:
             raise InputError(f"truncated or damaged; copy it again ({words[0]})")
         return tiff._replace(voxels=np.flip(data, flips).T, notes=notes)
+
+
+def _stack_axes(file: Any) -> dict[str, int]:
+    """Return the lengths of a file's axes, if above 1, by tifffile's letters, also those of OME."""
+    pixels, series = _ome_pixels(file.pages.first.description), file.series[0]
+    axes = zip(series.axes, series.shape, strict=True)
+    of_ome = ((name, pixels.get(f"Size{name}", 1)) for name in "CT")
+    return {name: int(size) for name, size in (*axes, *of_ome) if int(size) > 1}
+
+
+def _stack_shape(file: Any, axes: dict[str, int], notes: list[str]) -> list[int]:
+    """Return the numbers of slices, rows and columns; InputError unless the pages are one stack."""
+    series, description = file.series, file.pages.first.description
+    # A program may write a page at a time, each as a picture of its own.
+    is_apart = all((each.kind, each.axes) == ("shaped", "YX") for each in series)
+    if len({(each.shape, each.dtype) for each in series}) > 1 or (len(series) > 1 and not is_apart):
+        shapes = ", ".join(" x ".join(map(str, each.shape)) for each in series[:4])
+        raise InputError(f"expected slices of one size and type, got {shapes}; export one stack")
+    is_imagej = description.startswith("ImageJ=") and "\nspacing=" in description
+    if is_imagej and set(axes) == set("CYX") and axes["C"] > MOST_CHANNELS:
+        notes.append(f"its {axes.pop('C')} channels have a slice spacing: they are read as slices")
+    if wrong := [f"{axes[name]} {word}" for name, word in AXIS_WORDS.items() if name in axes]:
+        raise InputError(
+            f"expected a stack of grey slices, got {' and '.join(wrong)}; export one part"
+        )
+    shape = [int(size) for size in (len(series), *series[0].shape) if size > 1]
+    if len(shape) != 3 or not {"Y", "X"} <= set(axes):
+        said = f"axes {series[0].axes} of {series[0].shape}"
+        raise InputError(f"expected a stack of slices of one size, got {said}; export it again")
+    if (pixels := _ome_pixels(description)) and series[0].kind != "ome":
+        raise InputError(
+            f"expected the {pixels.get('SizeZ')} slices of its OME metadata, which are in other "
+            "files, or not as it says; export it again as one file"
+        )
+    return shape
+
+
+def _axes_to_flip(page: Any) -> tuple[int, ...]:
+    """Return the axes of a stack that run the other way; InputError for colours, or swapped
+    axes.
+    """
+    if page.photometric == 3 and not page.description.startswith("ImageJ="):
+        raise InputError("expected grey slices, got a palette of colours; convert it to grey first")
+    tag = page.tags.get(ORIENTATION_TAG)
+    orientation = 1 if tag is None else int(tag.value)
+    if orientation not in FLIPPED_AXES:
+        raise InputError(f"its Orientation {orientation} swaps rows and columns; export it upright")
+    return FLIPPED_AXES[orientation]
 
 
 def _tiff_of(page: Any) -> Tiff:

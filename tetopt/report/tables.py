@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
@@ -59,6 +60,12 @@ def size_text(number: float, decimals: int) -> str:
         return "-"
     digits = f"{number:.{decimals}f}"
     return f"{number:.3g}" if 0.0 < abs(number) < 10.0 ** (2 - decimals) else digits
+
+
+def range_words(numbers: NDArray[np.float64]) -> str:
+    """Format the range of numbers, or the one number that all are."""
+    low, high = numbers.min(), numbers.max()
+    return f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
 
 
 def nodes_in_words(mesh: Mesh, order: int) -> str:
