@@ -23,6 +23,7 @@ from tetopt.geometry.box import upright_axis
 from tetopt.geometry.quadratic import shape_slopes, shape_values
 from tetopt.image import Image
 from tetopt.mesh import Mesh
+from tetopt.model.on_image import places_in_cells
 
 # ratio of successive voxel sizes tried for the grid, which misses the limit by less than 6 %
 STEP_GROWTH = 1.02
@@ -176,7 +177,8 @@ def compare(
         voxels = inside[begin : begin + VOXELS_AT_ONCE]
         cell, near = owner[voxels], is_near[voxels]
         there, strain = at_centres(exact.modulus, exact.u, voxels)
-        places = _places(exact.modulus, elements, cell, voxels)
+        index = np.stack(np.unravel_index(voxels, exact.modulus.shape), axis=1)
+        places = places_in_cells(mesh, cell, exact.modulus.to_world(index))
         error += _squares(_displacements(elements, order, u, cell, places) - there)
         scale += _squares(there - at_centres(exact.modulus, exact.u_homogeneous, voxels)[0])
         size += _squares(there)
@@ -287,21 +289,6 @@ def nearest(image: Image, grid: Image) -> Image:
         for new, old in zip(grid.shape, image.shape, strict=True)
     ]
     return Image(image.data[np.ix_(*places)], grid.affine)
-
-
-def _places(
-    image: Image, elements: Elements, cell: NDArray[np.int64], voxels: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """Barycentric coordinates (K, n + 1) of the centres of voxels in their cells."""
-    n = image.ndim
-    centres = image.to_world(
-        np.stack(np.unravel_index(voxels, image.shape), axis=1).astype(np.float64)
-    )
-    arms = centres - elements.points[elements.cells[cell, 0]]
-    places = np.empty((len(voxels), n + 1))
-    places[:, 1:] = np.einsum("kai,ki->ka", elements.gradients[cell, 1:], arms)
-    places[:, 0] = 1.0 - places[:, 1:].sum(axis=1)
-    return places
 
 
 def _displacements(

@@ -17,13 +17,19 @@ from tetopt.model.fields import node_field
 from tetopt.model.loads import (
     Load,
     count_of_steps,
-    facet_forces,
     in_step,
     load_words,
     spring_constants,
 )
 from tetopt.model.materials import Materials, cells_of, without_moduli
-from tetopt.model.model import Model, element_facets, elements, header_lines, mass_densities
+from tetopt.model.model import (
+    Model,
+    element_facets,
+    elements,
+    header_lines,
+    mass_densities,
+    traction_forces,
+)
 from tetopt.model.sets import Sets
 from tetopt.system.incoming import regular_file
 
@@ -261,11 +267,7 @@ def _conditions(loads: tuple[Load, ...]) -> str:
 
 def _forces(model: Model, loads: tuple[Load, ...]) -> str:
     """Return nodal forces of tractions, by component."""
-    total = np.zeros_like(elements(model)[0])
-    for load in loads:
-        if load.kind == "traction":
-            nodes, forces = facet_forces(model.mesh, model.sets, load, model.order)
-            total[nodes] += forces
+    total = traction_forces(model, loads)
     node, dof = np.nonzero(total)
     return rows(node + 1, dof + 1, _fitting(total[node, dof]), separator=", ")
 

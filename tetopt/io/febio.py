@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 from tetopt.io.tags import named_materials
 from tetopt.io.text import rows, xml_attribute, xml_comment
-from tetopt.model.loads import Load, count_of_steps, facet_forces, spring_constants
+from tetopt.model.loads import Load, count_of_steps, spring_constants
 from tetopt.model.materials import cells_of, density_of
 from tetopt.model.model import (
     STRESS_UNITS,
@@ -23,6 +23,7 @@ from tetopt.model.model import (
     elements,
     header_lines,
     mass_densities,
+    traction_forces,
 )
 
 MOST_MATERIAL_PARTS = 100  # with more, FEBio Studio's list of parts is unusable
@@ -282,12 +283,9 @@ def _loads(model: Model) -> list[str]:
 
 def _dead_forces(model: Model) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the nodes with forces from tractions and weight, and these forces, (P, 3)."""
-    total = np.zeros_like(elements(model)[0])
+    total = traction_forces(model, model.loads)
     for load in model.loads:
-        if load.kind == "traction":
-            nodes, forces = facet_forces(model.mesh, model.sets, load, model.order)
-            total[nodes] += forces
-        elif load.kind == "gravity" and (table := model.materials) is not None:
+        if load.kind == "gravity" and (table := model.materials) is not None:
             density = density_of(table)[table.of_cell]
             # imported here, as it loads scipy's solvers
             from tetopt.fem.solution import weight_forces

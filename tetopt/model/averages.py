@@ -126,9 +126,7 @@ def cell_young(
     parsed = parse_average(average)
     if parsed.place == "nodes":
         return gauss_young(node_young(image, mesh, mapping), mesh, 1)[:, 0]
-    seen, owner = _see_voxels(image, mesh)
-    field = young_image(seen, mapping)
-    _check_above_zero(parsed, image, field, owner)
+    field, owner = _moduli(image, mesh, mapping, parsed)
     return _of_cells(field, mesh, owner, parsed.power)
 
 
@@ -167,9 +165,7 @@ def node_young(image: Image, mesh: Mesh, mapping: ModulusMapping = None) -> NDAr
         For the reasons of `young_from` and `tetopt.energy.sampling.cell_of_voxel`; a modulus of 0
         in the mesh.
     """
-    seen, owner = _see_voxels(image, mesh)
-    field = young_image(seen, mapping)
-    _check_above_zero(parse_average("nodes"), image, field, owner)
+    field, owner = _moduli(image, mesh, mapping, parse_average("nodes"))
     n_nodes = len(mesh.points)
     weight, total = np.zeros(n_nodes), np.zeros(n_nodes)
     for voxels, hats in _places(field, mesh, owner):
@@ -206,14 +202,12 @@ def element_young(
     InputError
         For the reasons of `cell_young`.
     """
-    place = parse_average(average).place
-    if place == "nodes":
+    parsed = parse_average(average)
+    if parsed.place == "nodes":
         return gauss_young(node_young(image, mesh, mapping), mesh, order)
-    if place == "cells" or order == 1:
+    if parsed.place == "cells" or order == 1:
         return cell_young(image, mesh, mapping, average)
-    seen, owner = _see_voxels(image, mesh)
-    field = young_image(seen, mapping)
-    _check_above_zero(parse_average(average), image, field, owner)
+    field, owner = _moduli(image, mesh, mapping, parsed)
     places, _ = gauss_rule(mesh.ndim, order)
     part = np.full(len(owner), -1)
     for voxels, hats in _places(field, mesh, owner):
@@ -277,12 +271,17 @@ def _places(
         yield voxels, np.maximum(hats, 0.0)  # rounding could give values below 0
 
 
-def _check_above_zero(
-    average: Average, image: Image, field: Image, owner: NDArray[np.int64]
-) -> None:
-    """Raise InputError if an average would be 0 because of a single modulus of 0."""
+def _moduli(
+    image: Image, mesh: Mesh, mapping: ModulusMapping, average: Average
+) -> tuple[Image, NDArray[np.int64]]:
+    """Return the modulus field, with unused voxels as in `_see_voxels`, and the cell of each voxel.
+
+    Raises InputError if an average would be 0 because of a single modulus of 0.
+    """
+    seen, owner = _see_voxels(image, mesh)
+    field = young_image(seen, mapping)
     if average.power is not None and average.power > 0.0:
-        return
+        return field, owner
     empty = np.flatnonzero((owner >= 0) & (field.data.ravel() == 0.0))
     if len(empty):
         raise InputError(
@@ -292,6 +291,7 @@ def _check_above_zero(
             "as in "
             '`young` "0:0.1,255:6", or use `average` mean'
         )
+    return field, owner
 
 
 def _of_cells(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -21,7 +21,7 @@ from tetopt.model.fields import (
     node_field,
     scaled_fields,
 )
-from tetopt.model.loads import FACET_FORCES, SHOWN_LOAD_DIGITS, Load, load_words
+from tetopt.model.loads import FACET_FORCES, SHOWN_LOAD_DIGITS, Load, facet_forces, load_words
 from tetopt.model.materials import Materials
 from tetopt.model.sets import Sets, facet_triples
 from tetopt.model.skfem import skfem_mesh
@@ -386,6 +386,16 @@ def header_lines(model: Model) -> list[str]:
 def elements(model: Model) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return points and cells of the model's order: the mesh's own, or those of `quadratic`."""
     return of_order(model.mesh.points, model.mesh.cells, model.order, model.mesh.midpoints)
+
+
+def traction_forces(model: Model, loads: Iterable[Load]) -> NDArray[np.float64]:
+    """Return the nodal forces of the tractions among some loads, (N, n)."""
+    total = np.zeros_like(elements(model)[0])
+    for load in loads:
+        if load.kind == "traction":
+            nodes, forces = facet_forces(model.mesh, model.sets, load, model.order)
+            total[nodes] += forces
+    return total
 
 
 def mass_densities(model: Model) -> NDArray[np.float64]:

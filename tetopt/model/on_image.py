@@ -133,20 +133,26 @@ def _order_of(mesh: Mesh, n_rows: int, at: At | None) -> int:
     return orders[0]
 
 
+def places_in_cells(
+    mesh: Mesh, own: NDArray[np.int64], world: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the barycentric places (K, n+1) of points (K, n), mm, in their straight cells (K,)."""
+    corners = mesh.cells[own]
+    slopes = volume_gradients(mesh.points, corners) / volumes(mesh.points, corners)[:, None, None]
+    places = np.empty(corners.shape)
+    places[:, 1:] = np.einsum("kad,kd->ka", slopes[:, 1:], world - mesh.points[corners[:, 0]])
+    places[:, 0] = 1.0 - places[:, 1:].sum(axis=1)
+    return places
+
+
 def _places(
     mesh: Mesh,
     own: NDArray[np.int64],
     world: NDArray[np.float64],
     around: NDArray[np.float64] | None,
 ) -> NDArray[np.float64]:
-    """Barycentric places (K, n+1) of points (K, n), mm, in their cells (K,), with nodes (K, A,
-    n) if curved.
-    """
-    corners, n = mesh.cells[own], mesh.ndim
-    slopes = volume_gradients(mesh.points, corners) / volumes(mesh.points, corners)[:, None, None]
-    places = np.empty((len(own), n + 1))
-    places[:, 1:] = np.einsum("kad,kd->ka", slopes[:, 1:], world - mesh.points[corners[:, 0]])
-    places[:, 0] = 1.0 - places[:, 1:].sum(axis=1)
+    """Return `places_in_cells`, of cells with nodes (K, A, n) if curved."""
+    places = places_in_cells(mesh, own, world)
     if around is None or len(own) == 0:
         return places
     edge = np.linalg.norm(around[:, 1] - around[:, 0], axis=1)
