@@ -116,18 +116,17 @@ def test_chunks_that_are_missing(tmp_path):
     assert_refused(path, "all of its 2 chunks are missing")
 
 
-def test_a_phantom_by_chunks_is_the_one_in_memory(tmp_path, monkeypatch):
+def test_a_phantom_in_chunks_comes_back(tmp_path, monkeypatch):
     monkeypatch.setattr(zarr_images, "CHUNK_EDGE", 16)
     phantom, options = (
         load_phantom("layered_oblique"),
         {"voxel_mm": [2, 2, 3], "blur_mm": 1.0, "noise_sd": 5.0},
     )
     whole, path = phantom.image(**options), tmp_path / "a.zarr"
-    low, high = save_zarr(path, whole.affine, whole.data, np.int16)
+    values = np.rint(whole.data).astype(np.int16)
+    save_zarr(path, whole.affine, values)
     image = load_image(path)
-    stored = image.data
-    np.testing.assert_array_equal(stored, np.rint(whole.data))
-    assert (low, high) == (stored.min(), stored.max())
+    np.testing.assert_array_equal(image.data, values)
     array = zarr.open(path / "0", mode="r")
     assert (array.chunks, array.dtype) == ((16, 16, 16), np.int16)
     # sheared, which scale and translation are not
@@ -135,18 +134,9 @@ def test_a_phantom_by_chunks_is_the_one_in_memory(tmp_path, monkeypatch):
     assert [each.name for each in tmp_path.iterdir()] == ["a.zarr"]
 
 
-def test_what_does_not_fit_leaves_the_old_folder(tmp_path):
-    path = tmp_path / "a.zarr"
-    image = Image(ramp(4, 4, 4))
-    save_zarr(path, image.affine, image.data, np.int16)
-    with pytest.raises(
-        InputError, match="expected values from -32768 to 32767 for int16, got 1 to 64000"
-    ):
-        save_zarr(path, image.affine, image.data * 1000.0 - 999.0 * (image.data == 1), np.int16)
-    np.testing.assert_array_equal(load_image(path).data, image.data)
-    assert [each.name for each in tmp_path.iterdir()] == ["a.zarr"]
+def test_a_slice_is_refused(tmp_path):
     with pytest.raises(InputError, match="expected a 3-D image for Zarr, got a 2-D one"):
-        save_zarr(path, np.eye(3), ramp(4, 4), np.int16)
+        save_zarr(tmp_path / "a.zarr", np.eye(3), ramp(4, 4))
 
 
 @pytest.mark.parametrize("dtype", ["u1", "i2", "f4", "f8"])
@@ -165,19 +155,17 @@ def test_an_image_written_as_zarr_comes_back(tmp_path, dtype):
     assert stored.affine.tobytes() == image.affine.tobytes()
 
 
-def test_a_full_disk_leaves_the_old_folder(tmp_path):
-    class Full:
-        shape = (4, 4, 4)
-
-        def __getitem__(self, box):
-            raise OSError(28, "No space left on device")
+def test_a_full_disk_leaves_the_old_folder(tmp_path, monkeypatch):
+    def fail(array, box, values):
+        raise OSError(28, "No space left on device")
 
     image = Image(ramp(4, 4, 4))
     save_image(tmp_path / "a.zarr", image)
     before = sha256(tmp_path / "a.zarr")
+    monkeypatch.setattr(zarr.Array, "__setitem__", fail)
     for name in ("a.zarr", "b.zarr"):
         with pytest.raises(OSError, match=f"cannot be written: No space left on device.*{name}"):
-            save_zarr(tmp_path / name, image.affine, Full(), np.int16)
+            save_zarr(tmp_path / name, image.affine, ramp(4, 4, 4))
     assert sha256(tmp_path / "a.zarr") == before
     assert [each.name for each in tmp_path.iterdir()] == ["a.zarr"]
 

@@ -232,9 +232,9 @@ def save_image(path: str | Path, image: Image) -> None:
     """
     path = check_suffix(path, (*OUTPUT_SUFFIXES, ZARR_SUFFIX))
     if path.name.lower().endswith(ZARR_SUFFIX):
-        save_zarr(path, image.affine, image.data, _for_file(image.data).dtype)
-        return
-    save_voxels(path, _for_file(image.data), image)
+        save_zarr(path, image.affine, _for_file(image.data))
+    else:
+        save_voxels(path, _for_file(image.data), image)
 
 
 def save_voxels(path: Path, values: NDArray, image: Image) -> None:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.image import check_affine, check_kind, shifted_affine
@@ -39,7 +39,7 @@ MOST_CHUNKS = 2**24
 # In a chunk's file: headers of codecs, and per voxel a number of 8 bytes and the overhead of shards
 # and codecs.
 PACKED_BYTES, PACKED_VOXEL_BYTES = 2**16, 32
-# voxels, in written files: 4 MB of 16 bits, and a part of a mesh reads a few chunks
+# voxels, in written files: 4 MB of 16 bits, and a crop reads a few chunks
 CHUNK_EDGE = 128
 # Row of the affine and sign of an axis in RAS+, by its orientation (NGFF's RFC-4) or name.
 WAYS = {
@@ -240,10 +240,8 @@ def zarr_levels(path: Path, notes: list[str]) -> list[ZarrLevel]:
         ) from error
 
 
-def save_zarr(
-    path: Path, affine: NDArray[np.float64], voxels: Any, dtype: DTypeLike
-) -> tuple[float, float]:
-    """Write an OME-Zarr image (NGFF 0.5, Zarr's format 3) chunk by chunk, whole or not at all.
+def save_zarr(path: Path, affine: NDArray[np.float64], values: NDArray) -> None:
+    """Write an OME-Zarr image (NGFF 0.5, Zarr's format 3), whole or not at all.
 
     Its axes are named x, y, z in the order of the indices. Scale and translation are the lengths of
     a voxel's edges and the position of the first voxel, which is all that NGFF supports; the
@@ -255,69 +253,41 @@ def save_zarr(
         Replaces an existing Zarr folder; call `tetopt.system.files.check_output` first.
     affine : (4, 4) array
         Placement of the voxels.
-    voxels : Any
-        Three-dimensional; returns voxels for a tuple of slices, chunk by chunk.
-    dtype : dtype
-        Type for storage; values are rounded for an integer type.
-
-    Returns
-    -------
-    tuple of float
-        The smallest and the largest value.
+    values : array
+        The voxels, three-dimensional, in the type for storage.
 
     Raises
     ------
     InputError
-        zarr is not installed; the image is not 3-D; values exceed the range of the dtype.
+        zarr is not installed; the image is not 3-D.
     OSError
         For the reasons of `tetopt.system.files.folder_written_whole`.
     """
     zarr = _library()
-    if (n := len(voxels.shape)) != 3:
-        raise InputError(f"{path}: expected a 3-D image for Zarr, got a {n}-D one; use .nii.gz")
+    if values.ndim != 3:
+        raise InputError(
+            f"{path}: expected a 3-D image for Zarr, got a {values.ndim}-D one; use .nii.gz"
+        )
     axes = [{"name": name, "type": "space", "unit": "millimeter"} for name in "xyz"]
     place = [
         {"type": "scale", "scale": np.sqrt((affine[:3, :3] ** 2).sum(axis=0)).tolist()},
         {"type": "translation", "translation": affine[:3, 3].tolist()},
     ]
     scales = {"axes": axes, "datasets": [{"path": "0", "coordinateTransformations": place}]}
-    ends = [range(0, size, CHUNK_EDGE) for size in voxels.shape]
-    low, high = np.inf, -np.inf
     with folder_written_whole(path) as folder:
         group = zarr.open_group(folder, mode="w", zarr_format=3)
         array = group.create_array(
             "0",
-            shape=voxels.shape,
-            chunks=[min(size, CHUNK_EDGE) for size in voxels.shape],
-            dtype=dtype,
+            shape=values.shape,
+            chunks=[min(size, CHUNK_EDGE) for size in values.shape],
+            dtype=values.dtype,
             fill_value=0,
             dimension_names=["x", "y", "z"],
             attributes={"affine": affine.tolist()},
             config={"write_empty_chunks": True},
         )
         group.attrs.update({"ome": {"version": "0.5", "multiscales": [scales]}})
-        for corner in itertools.product(*ends):
-            box = tuple(
-                slice(at, min(at + CHUNK_EDGE, size))
-                for at, size in zip(corner, voxels.shape, strict=True)
-            )
-            block = _of_type(path, np.asarray(voxels[box]), array.dtype)
-            low, high = min(low, float(block.min())), max(high, float(block.max()))
-            array[box] = block
-    return low, high
-
-
-def _of_type(path: Path, block: NDArray, dtype: np.dtype) -> NDArray:
-    """Convert values for storage; InputError if they do not fit."""
-    if dtype.kind in "iu":
-        block, limits = np.rint(block), np.iinfo(dtype)
-        if block.min() < limits.min or block.max() > limits.max:
-            raise InputError(
-                f"{path}: expected values from {limits.min} to {limits.max} for {dtype}, got "
-                f"{block.min():g} to "
-                f"{block.max():g}; scale them"
-            )
-    return block.astype(dtype)
+        array[:] = values
 
 
 def _library() -> Any:
