@@ -32,8 +32,7 @@ def convert_command(
         Option(
             "[IMAGE] MESH OUT",
             f"The mesh, and the file to write: {', '.join(FORMATS)}, or an image: "
-            f"{', '.join(OUTPUT_SUFFIXES)}. An "
-            "image before them is that of `image`.",
+            f"{', '.join(OUTPUT_SUFFIXES)}. An image before them is that of `image`.",
             is_argument=True,
         ),
     ],
@@ -61,8 +60,6 @@ def convert_command(
         raise InputError(f"expected MESH and OUT, the file to write, got only {paths[0]}")
     mesh_path, image_path = mesh_and_image(paths[:-1], image_path)
     output, is_image = paths[-1], is_image_name(paths[-1])
-    if not is_image:
-        format_of(output)
     _check_options(output, voxels if not is_image else None, part, choice, solver)
     output = check_output(output, OUTPUT_SUFFIXES if is_image else tuple(FORMATS), numbers.force)
     numbers.check()
@@ -105,6 +102,7 @@ def _check_options(
     other way round.
     """
     if voxels is not None:
+        format_of(output)  # raises InputError for an unknown format
         wrong, what = given_options(voxels), "a mesh's file; name an image, such as field.nii.gz"
     else:
         wrong = given_options(replace(part, registered=False)) | given_options(choice)

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.table import Table
 
 import tetopt
 from tetopt import Content, InputError, Mesh, save_image
@@ -76,27 +77,31 @@ def segment_command(
     for number, (fraction, mean) in enumerate(zip(fractions, means, strict=True)):
         last = [] if truth is None else [str(names.get(number, "none"))]
         table.add_row(str(number), f"{fraction:.4f}", "" if mean is None else f"{mean:.4g}", *last)
-    overlaps = new_table("label", "Dice, mesh", "Dice, thresholded voxels")
+    tables = [table]
     if truth_path is not None and truth is not None:
-        by_mesh, by_voxels = (
-            dice(labels, truth),
-            dice(threshold_image(image, classes, inside), truth),
-        )
-        overlap = {"mesh": by_mesh, "voxels": by_voxels}
+        overlap = {
+            "mesh": dice(labels, truth),
+            "voxels": dice(threshold_image(image, classes, inside), truth),
+        }
         report |= {"truth": truth_path.name, "stands_for": names, "dice": overlap}
-        if lost := [str(label) for label in by_mesh if label not in names.values()]:
-            show_warning(
-                f"no class matches label {', '.join(lost)}: its Dice is 0; try more --classes"
-            )
-        for label in by_mesh:
-            overlaps.add_row(str(label), f"{by_mesh[label]:.4f}", f"{by_voxels[label]:.4f}")
+        tables.append(_overlaps_table(overlap, names))
     save_image(output, labels)
     numbers.save(report)
-    print_table(table)
-    if truth is not None:
-        print_table(overlaps)
+    for each in tables:
+        print_table(each)
     print_line(f"{output}: {classes} classes on {labels.data.size} voxels")
     return 0
+
+
+def _overlaps_table(overlap: dict[str, dict[int, float]], names: dict[int, int]) -> Table:
+    """Return a table of Dice by true label; warn of labels that no class matches."""
+    by_mesh, by_voxels = overlap["mesh"], overlap["voxels"]
+    if lost := [str(label) for label in by_mesh if label not in names.values()]:
+        show_warning(f"no class matches label {', '.join(lost)}: its Dice is 0; try more --classes")
+    table = new_table("label", "Dice, mesh", "Dice, thresholded voxels")
+    for label in by_mesh:
+        table.add_row(str(label), f"{by_mesh[label]:.4f}", f"{by_voxels[label]:.4f}")
+    return table
 
 
 def _voxels_in(mesh: Mesh, what: Content, path: Path, image_path: Path) -> NDArray[np.bool_]:
