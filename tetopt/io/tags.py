@@ -75,7 +75,7 @@ def tag_sets(sets: dict[str, NDArray[np.int64]]) -> Tagged:
 
     Examples
     --------
-    >>> tagged_items = tagged({"a": np.array([4, 7]), "b": np.array([7, 9])})
+    >>> tagged_items = tag_sets({"a": np.array([4, 7]), "b": np.array([7, 9])})
     >>> tagged_items.items.tolist(), tagged_items.tags.tolist(), tagged_items.tags_of
     ([4, 7, 9], [1, 2, 3], {'a': [1, 2], 'b': [2, 3]})
     """
