@@ -18,7 +18,7 @@ from tetopt.io.tags import (
     number_parts,
     renumbered_labels,
 )
-from tetopt.io.text import counted, list_names
+from tetopt.io.text import count_text, list_names
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.options import SolverOptions
 from tetopt.model.fields import GAUSS_MODULI
@@ -110,7 +110,7 @@ def _moduli_lines(output: Path, model: Model) -> Iterator[str]:
     """Yield lines on the materials, and on moduli that vary within cells."""
     if (table := model.materials) is not None:
         moduli = f"Young's modulus {range_words(table.young)} kPa, nu {range_words(table.nu)}"
-        yield f"{counted(len(table.young), 'material')}, {moduli}"
+        yield f"{count_text(len(table.young), 'material')}, {moduli}"
         yield from _materials_by_name(model, table)
         if model.gauss_young is not None:
             yield (
