@@ -191,17 +191,13 @@ def label_interfaces(
     turns = _turns(pieces.points, surfaces, ridges)
     turns[ridges.nodes.min(axis=1) >= len(mesh.points)] = np.nan  # within a curved facet
     area = counts(surfaces.label, surface_areas(FacetSurface(pieces.points, surfaces.nodes)))
-    n_folded, n_paired = (
-        counts(ridges.label[turns > FOLD_DEGREES]),
-        counts(ridges.label[np.isfinite(turns)]),
-    )
+    n_folded = counts(ridges.label[turns > FOLD_DEGREES])
+    n_paired = counts(ridges.label[np.isfinite(turns)])
     rows = []
     for row in present.tolist():
         is_label = np.pad(voxels[boxes[row]] == row, 1)
         is_large = np.count_nonzero(is_label) >= NET_VOXELS[mesh.ndim]
-        nets = smooth_surface(is_label, labels.affine)
-        volume = np.count_nonzero(is_label) * labels.voxel_volume
-        smooth_area = area_at_volume(nets, volume) if is_large else float(surface_areas(nets).sum())
+        smooth_area = _smooth_area(is_label, labels, is_large)
         rows.append(
             LabelInterface(
                 label=int(values[row]),
@@ -217,6 +213,13 @@ def label_interfaces(
             )
         )
     return rows
+
+
+def _smooth_area(is_label: NDArray[np.bool_], labels: Image, is_large: bool) -> float:
+    """Area of the smooth surface of a label's voxels; at their volume if these are enough."""
+    nets = smooth_surface(is_label, labels.affine)
+    volume = np.count_nonzero(is_label) * labels.voxel_volume
+    return area_at_volume(nets, volume) if is_large else float(surface_areas(nets).sum())
 
 
 def smooth_surface(is_label: NDArray[np.bool_], affine: NDArray[np.float64]) -> FacetSurface:
