@@ -1129,7 +1129,7 @@ def test_target_error_with_the_most_nodes(capfd):
     (first, left), (last, reached) = re.findall(
         r"run \d of up to 6: (\d+) nodes leave ([\d.]+) of the variance", err
     )
-    pattern = r"an error of 0.001 requires about (\d+) nodes.*?; (more than .*? has \d+ nodes)"
+    pattern = r"an error of 0.001 requires about (\d+) nodes; (more than .*? has \d+ nodes)"
     ((predicted, words),) = re.findall(pattern, err)
     assert (int(first), int(last), words) == (
         200,

@@ -23,7 +23,7 @@ import tetopt.cli.run
 import tetopt.job.source
 import tetopt.measure.measures
 from tetopt.cli.ending import is_ended, mesh_kept, signal_code, signals_heard
-from tetopt.engine.meshing import Attempt, MeshSearch
+from tetopt.engine.meshing import search_mesh
 
 pytestmark = pytest.mark.deep
 NEEDS_SIGNALS = pytest.mark.skipif(os.name == "nt", reason="Windows has no such signals")
@@ -346,17 +346,15 @@ def measured_run(tmp_path_factory):
     ]
     once = []
 
-    class Remembered(MeshSearch):
-        def __iter__(self):
-            if once:  # what is said and checked before goes on in each run
-                yield Attempt(once[0].initial, lambda **_: once[0])
-                self.result = once[0]
-            else:
-                yield from super().__iter__()
-                once.append(self.result)
+    def remembered(image, aim, attempt, **options):
+        if once:  # what is said and checked before goes on in each run
+            attempt(lambda **_: once[0], once[0].initial, aim, [])
+        else:
+            once.append(search_mesh(image, aim, attempt, **options))
+        return once[0]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tetopt.job.mesh_stage, "MeshSearch", Remembered)
+        patch.setattr(tetopt.job.mesh_stage, "search_mesh", remembered)
         exit_code(*words, "-o", folder / "a.vtu", "--json", folder / "a.json")
         numbers = numbers_in(folder / "a.json")
         assert numbers["failed"] == {}

@@ -1,4 +1,4 @@
-"""The front door: each mode is what its parts make, and so is a search by attempts."""
+"""The front door: each mode is what its parts make, and so is a search by several runs."""
 
 import sys
 import threading
@@ -9,9 +9,9 @@ import pytest
 
 import tetopt
 from tetopt.contents.content import plain
-from tetopt.engine.meshing import Aim, MeshSearch, _next_nodes, sizes_of_order
+from tetopt.engine.aim import Aim, needed_corners
+from tetopt.engine.meshing import search_mesh, sizes_of_order
 from tetopt.geometry.quadratic import node_count, quadratic
-from tetopt.measure.judge import ERROR_RATE
 from tetopt.start.clip import lattice_within
 
 IMAGE = tetopt.load_phantom("sphere").image(voxel_mm=4.0)
@@ -101,12 +101,12 @@ def test_no_run_is_repeated(options, n_runs):
     seen = []
     image = tetopt.content(IMAGE, mask=MASK) if "target_error" in options else IMAGE
 
-    search = MeshSearch(image, Aim(**{"order": 2} | options), iterations=2)
-    for attempt in search:
-        seen.append(attempt.run())
-        search.tell(seen[-1])
+    def attempt(run, *_):
+        seen.append(run())
+        return seen[-1]
+
+    result = search_mesh(image, Aim(**{"order": 2} | options), attempt, iterations=2)
     assert len(seen) == n_runs
-    result = search.result
     assert result.mesh.points.tobytes() == seen[-1].mesh.points.tobytes()
 
 
@@ -135,23 +135,23 @@ def test_a_search_ends_at_the_most_nodes(order, nodes_max, n_runs):
     """With their mesh, and the error that it leaves, if the target takes more; no run has more."""
     x, y = np.indices((120, 100))
     image = tetopt.Image(10.0 * np.sin(x / 9.0) * np.cos(y / 8.0) + x)
-    aim, attempts, counts = Aim(target_error=0.001, order=order, nodes_max=nodes_max), [], []
-    search = MeshSearch(image, aim, iterations=3)
-    for attempt in search:
-        attempts.append(attempt)
-        search.tell(result := attempt.run())
+    aim, needed, counts = Aim(target_error=0.001, order=order, nodes_max=nodes_max), [], []
+
+    def attempt(run, _, aim, runs):
+        needed.append(needed_corners(aim, runs))
+        result = run()
         counts.append(node_count(result.mesh.points, result.mesh.cells, order))
-    assert len(attempts) == n_runs
-    assert attempts[0].predicted is None
-    assert all(each.predicted > len(search.result.mesh.points) for each in attempts[1:])
+        return result
+
+    result = search_mesh(image, aim, attempt, iterations=3)
+    assert len(needed) == n_runs
+    assert all(each > len(result.mesh.points) for each in needed[1:])
     assert abs(counts[-1] / nodes_max - 1.0) <= (0.01 if order == 2 else 0.0)
     assert counts == sorted(counts)
-    assert search.result.fraction > 0.001
-    assert search.result.violated["error"].startswith(
-        f"{search.result.fraction:.4g} of the image's variance is"
-    )
+    assert result.fraction > 0.001
+    assert result.violated["error"].startswith(f"{result.fraction:.4g} of the image's variance is")
     if order == 1:
-        assert_same(search.result, tetopt.mesh_image(image, nodes_max, iterations=3))
+        assert_same(result, tetopt.mesh_image(image, nodes_max, iterations=3))
 
 
 def test_by_the_paper():
@@ -172,14 +172,15 @@ def test_a_mesh_to_start_from():
 
 
 @pytest.mark.full
-def test_a_search_by_attempts():
-    """Each run towards an error shows its initial mesh, and what is told is what counts."""
+def test_a_search_by_several_runs():
+    """Each run towards an error shows its initial mesh, and what it returns is what counts."""
     starts, rows = [], []
-    search = MeshSearch(IMAGE, Aim(target_error=0.2), iterations=3)
-    for attempt in search:
-        starts.append(attempt.initial)
-        search.tell(attempt.run(callback=rows.append))
-    result = search.result
+
+    def attempt(run, initial, *_):
+        starts.append(initial)
+        return run(callback=rows.append)
+
+    result = search_mesh(IMAGE, Aim(target_error=0.2), attempt, iterations=3)
     assert_same(result, tetopt.mesh_image(IMAGE, target_error=0.2, iterations=3))
     assert sum(row.iteration == 0 for row in rows) == len(starts) > 1
     assert any(initial is result.initial for initial in starts)
@@ -241,15 +242,3 @@ def test_an_argument_of_another_name_is_named(arguments, words):
 def test_the_paper_takes_one_image():
     with pytest.raises(tetopt.InputError, match="one image, without labels or mask"):
         tetopt.mesh_image(tetopt.content(IMAGE, mask=MASK), 100, mode="paper")
-
-
-def test_the_rate_of_an_image_is_that_of_its_runs():
-    """The error of this image falls with nodes^-0.4: two runs above the target tell the number
-    that meets it.
-    """
-    image, target = tetopt.Image(np.zeros((200, 200, 200))), 0.02
-    error = {n: 3.0 * n**-0.4 for n in (1500, 5000)}
-    aim = 0.925 * target
-    assert _next_nodes(image, error, target) == pytest.approx((3.0 / aim) ** (1.0 / 0.4), rel=1e-3)
-    first = 1500 * (error[1500] / aim) ** (1.0 / ERROR_RATE)
-    assert _next_nodes(image, {1500: error[1500]}, target) == pytest.approx(first, rel=1e-3)

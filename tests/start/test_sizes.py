@@ -13,7 +13,8 @@ from shapes import grid
 from test_octree import OBLIQUE, ball
 
 import tetopt
-from tetopt.engine.meshing import Aim, MeshSearch
+from tetopt.engine.aim import Aim
+from tetopt.engine.meshing import search_mesh
 from tetopt.start import octree
 from tetopt.start.octree import _Blocks, _divide_blocks, nearest_octree, nodes_of_sizes, octree_mesh
 from tetopt.start.sizes import (
@@ -407,11 +408,12 @@ def test_a_stop_keeps_what_has_the_error():
     image = ball(40, 40, 40)
     for stops_at, has_error in ((1, False), (3, True)):
         initials = []
-        search = MeshSearch(image, Aim(target_error=0.0005), iterations=8)
-        for attempt in search:
-            initials.append(attempt.initial)
-            search.tell(attempt.run(stop=(lambda: True) if len(initials) >= stops_at else None))
-        result = search.result
+
+        def attempt(run, initial, _, runs, initials=initials, stops_at=stops_at):
+            initials.append(initial)
+            return run(stop=lambda: len(runs) + 1 >= stops_at)
+
+        result = search_mesh(image, Aim(target_error=0.0005), attempt, iterations=8)
         assert len(initials) == stops_at
         fraction = result.history[-1].E_D / (
             float(np.var(image.data, dtype=np.float64)) * image.volume

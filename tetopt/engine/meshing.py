@@ -11,18 +11,29 @@ from __future__ import annotations
 import inspect
 import time
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable
 from difflib import get_close_matches
 from functools import partial
 from math import ceil, prod
 from operator import index
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.contents.content import Content, plain
 from tetopt.contents.content import content as make_content
+from tetopt.engine.aim import (
+    QUADRATIC_NODES,
+    Aim,
+    Mode,
+    SearchRun,
+    best_of,
+    may_differ,
+    most_corners,
+    next_corners,
+    nodes_per_corner,
+)
 from tetopt.engine.curving import curve_mesh
 from tetopt.engine.fast import optimize
 from tetopt.engine.loop import (
@@ -45,13 +56,9 @@ from tetopt.errors import InputError
 from tetopt.geometry.quadratic import node_count
 from tetopt.image import Image
 from tetopt.measure.judge import (
-    ERROR_AIM,
-    ERROR_RATE,
-    ERROR_REACHED,
     Requirements,
     judge,
     measure,
-    nodes_ratio,
     unexplained_by,
 )
 from tetopt.mesh import Mesh
@@ -63,11 +70,10 @@ from tetopt.start.octree import is_near, nearest_octree, nodes_of_sizes, octree_
 from tetopt.start.sizes import Sizes
 from tetopt.system.budget import at_most, check_memory
 
-Mode = Literal["graded", "uniform", "paper", "start"]
-# points of the initial mesh, and nodes requested and reached
-EarlierRuns = list[tuple[NDArray, int, int]]
 # an optimisation ready to start; takes further options of `optimize`
-Run = Callable[..., MeshingResult]
+Optimisation = Callable[..., MeshingResult]
+# makes a run with an optimisation, its initial mesh, the aim and the runs before
+Attempt = Callable[[Optimisation, Mesh, Aim, list[SearchRun]], MeshingResult]
 
 
 class ModeDefaults(NamedTuple):
@@ -92,16 +98,8 @@ MODE_ARGUMENTS: dict[Mode, tuple[str, ...]] = {  # arguments that determine the 
 }
 # In the order in which they are checked.
 AIM_NAMES = ("nodes", "target_error", "nodes_max", "spacing", "kind", "start", "sizes")
-# nodes of order 2 per corner, by dimension, in graded meshes of the MNI152 T1
-QUADRATIC_NODES = {2: 3.9, 3: 7.2}
-NODES_NEAR = 0.01  # of the number of nodes of order 2: a run this near is accepted
-NODE_RUNS = 3  # towards a number of nodes of order 2, at most; the second usually meets it
-# in the first run towards an error, by dimension: few enough to take hardly any time
-FIRST_NODES = {2: 200, 3: 1500}
 # of the nodes of equilateral cells: targets are met down to these (docs/understand/sizes.md)
 SIZES_MET = 0.9
-RATE_LIMITS = (0.3, 1.0)  # of a measured `ERROR_RATE`
-ERROR_RUNS = 6  # towards an error, at most
 SHORTEST_SECONDS = 1e-9  # of a run for which the initial mesh leaves no time
 
 
@@ -232,200 +230,151 @@ def mesh_image(
         image = make_content(image, labels, mask)
     image = plain(image)
     aim = Aim(nodes, target_error, sizes, order, mode, start, spacing, kind, nodes_max)
-    search = MeshSearch(image, aim, k_D=k_D, iterations=iterations, **options)
-    for attempt in search:
-        search.tell(attempt.run())
-    return search.result._replace(content=image, order=order)
+    result = search_mesh(image, aim, k_D=k_D, iterations=iterations, **options)
+    return result._replace(content=image, order=order)
 
 
-class Aim(NamedTuple):
-    """The mesh that `mesh_image` is to make, by its arguments."""
+def search_mesh(
+    image: Image | Content,
+    aim: Aim,
+    attempt: Attempt = lambda optimisation, *_: optimisation(),
+    required: Requirements = Requirements(),  # noqa: B008 - a tuple
+    **options: Any,
+) -> MeshingResult:
+    """Return the mesh of an aim, by as many runs as `next_corners` asks for; only the best mesh so
+    far is kept.
 
-    nodes: int | None = None
-    target_error: float | None = None
-    sizes: Sizes | None = None
-    order: int = 1
-    mode: Mode | None = None
-    start: Mesh | None = None
-    spacing: float | None = None
-    kind: str | None = None
-    nodes_max: int | None = None
-
-
-class Attempt(NamedTuple):
-    """A run of a search; `predicted` corners, by the runs before it, take the target error."""
-
-    initial: Mesh
-    run: Run
-    predicted: int | None = None
-
-
-# yields attempts, and returns the result that counts
-Search = Generator[Attempt, None, MeshingResult]
-# one attempt, with the number of nodes that exchanges lead to, and that predicted
-Attempted = Callable[..., Search]
-
-
-class MeshSearch:
-    """The runs that lead to a mesh: iterate over the attempts, and `tell` the result of each; then
-    take the `result`.
-
-    Parameters are those of `mesh_image`, which raises the same errors; `required` has words for the
-    verdict.
+    `attempt` makes each run, and `required` has words for the verdict; `options` are those of
+    `mesh_image`, which raises the same errors.
     """
-
-    result: MeshingResult
-    _told: MeshingResult  # of the last attempt
-
-    def __init__(
-        self,
-        image: Image | Content,
-        aim: Aim,
-        required: Requirements = Requirements(),  # noqa: B008 - a tuple
-        **options: Any,
-    ) -> None:
-        self._required = required
-        self._begin, self._seconds = time.perf_counter(), 0.0  # in attempts
-        content = plain(image)
-        mode = ("graded" if aim.start is None else "start") if aim.mode is None else aim.mode
-        _check_names(options, optimize_paper if mode == "paper" else optimize)
-        aim = aim._replace(mode=mode)
-        _check_aim(content, aim)
-        if mode == "graded" and aim.sizes is not None:
-            aim = aim._replace(sizes=with_label_sizes(aim.sizes, content, aim.nodes, aim.order)[0])
-        if (
-            aim.nodes is None
-            and aim.target_error is None
-            and aim.spacing is None
-            and mode != "start"
+    begin, seconds = time.perf_counter(), 0.0  # in runs
+    content = plain(image)
+    mode = aim.mode or ("graded" if aim.start is None else "start")
+    _check_names(options, optimize_paper if mode == "paper" else optimize)
+    aim, options = _complete_aim(content, aim._replace(mode=mode)), _with_defaults(mode, options)
+    content = content._replace(is_flat=content.is_flat and aim.order == 1)
+    runs, starts, best = list[SearchRun](), list[NDArray](), list[MeshingResult]()
+    ended = ""
+    while (corners := next_corners(aim, runs)) is not None:
+        initial, n_dropped, dropped = _initial(content, aim, corners)
+        # Limits on sizes may take more nodes than the error, or allow fewer; a mask's octree is
+        # only roughly near.
+        count = len(initial.points)
+        if aim.target_error is not None and content.region is None and not is_near(count, corners):
+            corners = count
+        if corners > most_corners(aim, runs) or any(
+            np.array_equal(initial.points, points) and not may_differ(aim, run, corners)
+            for points, run in zip(starts, runs, strict=True)
         ):
-            is_graded = mode == "graded"
-            nodes = (
-                default_nodes(content, aim.sizes, aim.order)
-                if is_graded
-                else DEFAULT_NODES[content.image.ndim]
-            )
-            aim = aim._replace(nodes=nodes)
-        if aim.target_error is not None and aim.nodes_max is None:
-            aim = aim._replace(nodes_max=TARGET_NODES_MAX)
-        self._options = _with_defaults(mode, options)
-        if mode == "graded":
-            aim = aim._replace(sizes=sizes_of_order(content, aim.nodes, aim.sizes, aim.order))
-        self._content, self._aim = content._replace(is_flat=content.is_flat and aim.order == 1), aim
-
-    def __iter__(self) -> Iterator[Attempt]:
-        """Yield the attempts, each once the result of the last one is told."""
-        result = yield from _search_mesh(self._content, self._aim, self._attempted)
-        self.result = self._finished(result)
-
-    def tell(self, result: MeshingResult) -> None:
-        """Take the result of the attempt."""
-        self._told = result
-
-    def _attempted(self, initial: Mesh, nodes: int | None, predicted: int | None = None) -> Search:
-        """Yield the attempt with an initial mesh, and return its result."""
-        initial, n_dropped, dropped = self._carved(initial)
-        check_memory_of(self._content, max(nodes or 0, len(initial.points)))
-        start_of_run = time.perf_counter()
-        yield Attempt(initial, partial(self._optimised, initial, nodes), predicted)
-        self._seconds += time.perf_counter() - start_of_run
-        return _with_dropped(self._told, n_dropped, dropped)._replace(initial=initial, nodes=nodes)
-
-    def _carved(self, initial: Mesh) -> tuple[Mesh, int, Counter[int]]:
-        """Carve an initial mesh within a mask; also return the number and volumes of dropped
-        components.
-        """
-        content = self._content
-        if content.region is None or self._aim.mode == "start":
-            return initial, 0, Counter()
-        carving = carve_mesh(
-            initial, content.image, content.region, content.keeps_components, content.memberships
-        )
-        return part_of(initial, carving.is_kept), carving.n_dropped, Counter(carving.volumes)
-
-    def _optimised(self, initial: Mesh, nodes: int | None, **more: Any) -> MeshingResult:
-        """Optimise an initial mesh with further options."""
-        options, mode = (
-            self._options | _time_left(self._options, self._begin) | more,
-            self._aim.mode,
-        )
-        if mode == "paper":
-            return optimize_paper(self._content.image, initial, **options)
-        exchanged = nodes if mode == "graded" else None
-        return optimize(self._content, initial, nodes=exchanged, sizes=self._aim.sizes, **options)
-
-    def _finished(self, result: MeshingResult) -> MeshingResult:
-        """Judge the result by the aim, and curve its surfaces for order 2."""
-        content, aim = self._content, self._aim
-        if aim.order == 2:
-            mesh, curving = curve_mesh(result.mesh, content, result.labels)
-            result = result._replace(mesh=mesh, curving=curving)
-        result = self._with_verdict(result)
-        seconds = time.perf_counter() - self._begin
-        return result._replace(seconds_start=seconds - self._seconds, seconds_run=self._seconds)
-
-    def _with_verdict(self, result: MeshingResult) -> MeshingResult:
-        """Measure the mesh, and add the requirements that it violates."""
-        content, aim, options = self._content, self._aim, self._options
-        first, last = result.history[0], result.history[-1]
-        rows = measure(
-            result.mesh,
-            content,
-            result.labels,
-            is_filled=aim.mode != "start" and content.region is None,
-            initial=result.initial,
-            n_initial=first.n_voxels,
-            counted=last.counted,
-        )
-        has_angles = aim.mode != "paper"
-        required = self._required._replace(
-            min_dihedral=options.get("min_dihedral", MIN_DIHEDRAL) if has_angles else 0.0,
-            target_error=aim.target_error,
-            cut_short=result.ended if result.ended in CUT_SHORT else "",
-            is_initial=last.iteration == 0,
-        )
-        fraction = None if isinstance(rows["error"], Exception) else rows["error"]
-        return result._replace(violated=judge(rows, required), fraction=fraction)
+            break
+        check_memory_of(content, max(corners, count))
+        optimisation = partial(_optimise, content, aim, options, begin, initial, corners)
+        begin_of_run = time.perf_counter()
+        result = attempt(optimisation, initial, aim, runs)
+        seconds += time.perf_counter() - begin_of_run
+        starts.append(initial.points)
+        runs.append(_run_of(content, aim, corners, result))
+        ended = result.ended
+        if best_of(aim, runs) == len(runs) - 1:
+            best = [
+                result._replace(
+                    initial=initial,
+                    nodes=aim.nodes or corners or None,
+                    n_dropped=n_dropped + result.n_dropped,
+                    dropped=dropped + Counter(result.dropped),
+                )
+            ]
+    if not best:
+        raise _beyond(aim, aim.fewest if corners is None else corners)
+    result = best[0]._replace(ended=ended) if ended in CUT_SHORT else best[0]
+    if aim.order == 2:
+        mesh, curving = curve_mesh(result.mesh, content, result.labels)
+        result = result._replace(mesh=mesh, curving=curving)
+    result = _with_verdict(result, content, aim, required, options)
+    return result._replace(seconds_start=time.perf_counter() - begin - seconds, seconds_run=seconds)
 
 
-def _search_mesh(content: Content, aim: Aim, attempted: Attempted) -> Search:
-    """Search for the mesh of an aim."""
-    if aim.target_error is not None:
-        return meshed_to_error(content, aim, attempted)
+def _initial(content: Content, aim: Aim, corners: int) -> tuple[Mesh, int, Counter[int]]:
+    """Build the initial mesh with a number of corners, carved within a mask; also return the number
+    and volumes of dropped components.
+    """
     if aim.start is not None:
-        return attempted(aim.start, None)
-    if aim.order == 2 and aim.nodes is not None:
-        return meshed_in_all(content, aim, attempted)
-    return attempted(_initial(content, aim, aim.nodes), aim.nodes)
-
-
-def _initial(content: Content, aim: Aim, corners: int | None) -> Mesh:
-    """Build the initial mesh with a number of corners."""
+        return aim.start, 0, Counter()
     if aim.mode == "graded":
         # The longest edge of order 2 may allow no octree with so few corners: exchanges remove as
         # many as they can.
-        return (octree_mesh if aim.order == 1 else nearest_octree)(content, corners or 0, aim.sizes)
-    return lattice_within(
-        content.image, content.region, aim.kind, nodes=corners, spacing=aim.spacing
+        is_exact = aim.order == 1 and aim.target_error is None
+        initial = (octree_mesh if is_exact else nearest_octree)(content, corners, aim.sizes)
+    else:
+        initial = lattice_within(
+            content.image, content.region, aim.kind, nodes=corners or None, spacing=aim.spacing
+        )
+    if content.region is None:
+        return initial, 0, Counter()
+    carving = carve_mesh(
+        initial, content.image, content.region, content.keeps_components, content.memberships
     )
+    return part_of(initial, carving.is_kept), carving.n_dropped, Counter(carving.volumes)
 
 
-def _time_left(options: dict[str, Any], begin: float) -> dict[str, float]:
-    """The remaining `max_seconds` for a run, if time is limited, out of that for all runs and
-    initial meshes.
+def _optimise(
+    content: Content,
+    aim: Aim,
+    options: dict[str, Any],
+    begin: float,
+    initial: Mesh,
+    corners: int,
+    **more: Any,
+) -> MeshingResult:
+    """Optimise an initial mesh with further options; `max_seconds` counts from `begin`, over all
+    runs and initial meshes.
     """
-    if options.get("max_seconds") is None:
-        return {}
-    return {
-        "max_seconds": max(options["max_seconds"] - (time.perf_counter() - begin), SHORTEST_SECONDS)
-    }
+    if options.get("max_seconds") is not None:
+        left = options["max_seconds"] - (time.perf_counter() - begin)
+        options = options | {"max_seconds": max(left, SHORTEST_SECONDS)}
+    options = options | more
+    if aim.mode == "paper":
+        return optimize_paper(content.image, initial, **options)
+    nodes = corners if aim.mode == "graded" else None
+    return optimize(content, initial, nodes=nodes, sizes=aim.sizes, **options)
 
 
-def _with_dropped(result: MeshingResult, number: int, by_label: Counter[int]) -> MeshingResult:
-    """Add components dropped from the initial mesh to those that a run dropped."""
-    return result._replace(
-        n_dropped=number + result.n_dropped, dropped=by_label + Counter(result.dropped)
+def _run_of(content: Content, aim: Aim, corners: int, result: MeshingResult) -> SearchRun:
+    """Return the numbers of a run of a search."""
+    mesh, error = result.mesh, 0.0
+    if aim.target_error is not None:
+        error = unexplained_by(content, mesh, *result.history[-1].counted)
+    nodes = node_count(mesh.points, mesh.cells, aim.order)
+    return SearchRun(corners, len(mesh.points), nodes, error, result.ended)
+
+
+def _with_verdict(
+    result: MeshingResult,
+    content: Content,
+    aim: Aim,
+    required: Requirements,
+    options: dict[str, Any],
+) -> MeshingResult:
+    """Measure the mesh, and add the requirements that it violates."""
+    first, last = result.history[0], result.history[-1]
+    rows = measure(
+        result.mesh,
+        content,
+        result.labels,
+        is_filled=aim.mode != "start" and content.region is None,
+        initial=result.initial,
+        n_initial=first.n_voxels,
+        counted=last.counted,
     )
+    has_angles = aim.mode != "paper"
+    required = required._replace(
+        min_dihedral=options.get("min_dihedral", MIN_DIHEDRAL) if has_angles else 0.0,
+        target_error=aim.target_error,
+        cut_short=result.ended if result.ended in CUT_SHORT else "",
+        is_initial=last.iteration == 0,
+    )
+    fraction = None if isinstance(rows["error"], Exception) else rows["error"]
+    return result._replace(violated=judge(rows, required), fraction=fraction)
 
 
 def process_bytes(content: Content, nodes: int) -> float:
@@ -470,7 +419,7 @@ def _with_defaults(mode: Mode, options: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _check_names(options: dict[str, Any], optimisation: Run) -> None:
+def _check_names(options: dict[str, Any], optimisation: Optimisation) -> None:
     """Raise TypeError, like Python's own calls, for options unknown to `mesh_image` and the
     optimisation.
     """
@@ -480,11 +429,6 @@ def _check_names(options: dict[str, Any], optimisation: Run) -> None:
             near = get_close_matches(name, [*inspect.signature(mesh_image).parameters, *known], 1)
             hint = f"; did you mean {near[0]!r}?" if near else ""
             raise TypeError(f"mesh_image() got an unexpected keyword argument {name!r}{hint}")
-
-
-def nodes_per_corner(ndim: int, order: int) -> float:
-    """Usual number of nodes of an order per corner of a graded mesh."""
-    return QUADRATIC_NODES[ndim] if order == 2 else 1.0
 
 
 def default_nodes(content: Content, sizes: Sizes | None, order: int) -> int:
@@ -516,6 +460,31 @@ def with_label_sizes(
         if made is None
         else (made.sizes, made._replace(nodes=round(many * made.nodes)))
     )
+
+
+def _complete_aim(content: Content, aim: Aim) -> Aim:
+    """Check the aim, and fill in its defaults and the numbers of its image."""
+    _check_aim(content, aim)
+    image, sizes, nodes = content.image, aim.sizes, aim.nodes
+    if aim.mode == "graded" and sizes is not None:
+        sizes = with_label_sizes(sizes, content, nodes, aim.order)[0]
+    if aim.mode != "start" and (nodes, aim.target_error, aim.spacing) == (None, None, None):
+        nodes = (
+            default_nodes(content, sizes, aim.order)
+            if aim.mode == "graded"
+            else DEFAULT_NODES[image.ndim]
+        )
+    if aim.mode == "graded":
+        sizes = sizes_of_order(content, nodes, sizes, aim.order)
+    most = max(prod(image.shape) // 8, 64)
+    aim = aim._replace(nodes=nodes, sizes=sizes, ndim=image.ndim, most=most)
+    if aim.target_error is None:
+        return aim
+    _check_reachable(content, aim.target_error)
+    aim = aim._replace(nodes_max=aim.nodes_max or TARGET_NODES_MAX)
+    fewest = 0 if sizes is None else nodes_of_sizes(content, sizes)[0]
+    corners = most_corners(aim, [])
+    return aim._replace(fewest=int(corners) if SIZES_MET * fewest <= corners < fewest else fewest)
 
 
 def _check_aim(content: Content, aim: Aim) -> None:
@@ -570,118 +539,6 @@ def sizes_of_order(
     return sizes._replace(longest=sizes.longest_edge(content.image, corners, content.volume))
 
 
-def corners_of(nodes: int, ndim: int, ratio: float) -> int:
-    """Number of corners to request for `nodes` in all of order 2, `ratio` times as many."""
-    return max(round(nodes / ratio), 2 ** (ndim + 1))
-
-
-def _is_repeated(runs: EarlierRuns, initial: Mesh, nodes: int, has_exchanges: bool = True) -> bool:
-    """True if a run would end as an earlier one: the same initial mesh, and exchanges, if any,
-    cannot come nearer.
-    """
-    for points, earlier, reached in runs:
-        low, high = (
-            (1.0 - NODES_NEAR) * min(earlier, nodes),
-            (1.0 + NODES_NEAR) * max(earlier, nodes),
-        )
-        may_differ = has_exchanges and earlier != nodes and low <= reached <= high
-        if not may_differ and np.array_equal(points, initial.points):
-            return True
-    return False
-
-
-def meshed_in_all(content: Content, aim: Aim, attempted: Attempted) -> Search:
-    """Repeat runs with other numbers of corners until corners and mid-edge nodes together are the
-    aim's nodes.
-
-    Returns the result of the nearest run, or of one that was cut short.
-    """
-    nodes, ndim, has_exchanges = int(aim.nodes or 0), content.image.ndim, aim.mode == "graded"
-    ratio, runs = QUADRATIC_NODES[ndim], EarlierRuns()
-    nearest: list[tuple[float, MeshingResult]] = []  # the one so far: no more results are kept
-    for _ in range(NODE_RUNS):
-        initial = _initial(content, aim, corners := corners_of(nodes, ndim, ratio))
-        if _is_repeated(runs, initial, corners, has_exchanges):
-            break
-        result = (yield from attempted(initial, corners))._replace(nodes=nodes)
-        runs.append((initial.points, corners, len(result.mesh.points)))
-        if nearest and result.ended in CUT_SHORT:
-            return nearest[0][1]._replace(ended=result.ended)
-        count = node_count(result.mesh.points, result.mesh.cells, 2)
-        ratio = count / len(result.mesh.points)
-        miss = abs(count / nodes - 1.0)
-        nearest = [min([*nearest, (miss, result)], key=lambda each: each[0])]
-        if miss <= NODES_NEAR or result.ended in CUT_SHORT:
-            break
-    return nearest[0][1]
-
-
-def meshed_to_error(content: Content, aim: Aim, attempted: Attempted) -> Search:
-    """Repeat runs with up to `nodes_max` nodes until the unexplained variance is just below a
-    target.
-
-    Returns the result, with the octree and the number of nodes, of the run with the fewest nodes
-    that meets the target; if none does, of the run with the least error, or of one that was cut
-    short. It is the same as with that number of nodes from the start, unless limits on sizes forbid
-    it. At least 2^(n + 2) nodes are tried, and at least as many as targets of sizes require.
-
-    Raises
-    ------
-    InputError
-        As for `_check_reachable` and `octree_mesh`; or sizes require more than `nodes_max`.
-    """
-    target_error, nodes_max, sizes = aim.target_error or 0.0, aim.nodes_max or 0, aim.sizes
-    _check_reachable(content, target_error)
-    fewest = 0 if sizes is None else nodes_of_sizes(content, sizes)[0]
-    nodes, predicted, ratio = (
-        FIRST_NODES[content.image.ndim],
-        None,
-        nodes_per_corner(content.image.ndim, aim.order),
-    )
-    if SIZES_MET * fewest <= nodes_max / ratio < fewest:
-        fewest = round(nodes_max / ratio)
-    fractions = dict[int, float]()  # unexplained variance by number of nodes
-    best: list[MeshingResult] = []  # the one so far: no more results are kept
-    runs = EarlierRuns()
-    for _ in range(ERROR_RUNS):
-        most = round(nodes_max / ratio)
-        if (nodes := max(min(nodes, most), fewest)) <= most:
-            initial = nearest_octree(content, nodes, sizes)
-            # Limits on sizes may take more nodes than the error, or allow fewer; a mask's octree is
-            # only roughly near.
-            if content.region is None and not is_near(len(initial.points), nodes):
-                nodes = len(initial.points)
-        if nodes > most and not best:
-            raise _beyond(nodes_max, round(ratio * nodes))
-        if nodes > most or _is_repeated(runs, initial, nodes):
-            break
-        result = yield from attempted(initial, nodes, predicted)
-        count, fraction = (
-            len(result.mesh.points),
-            unexplained_by(content, result.mesh, *result.history[-1].counted),
-        )
-        runs.append((initial.points, nodes, count))
-        if result.ended in CUT_SHORT:
-            is_worse = bool(best) and fractions[len(best[0].mesh.points)] <= max(
-                target_error, fraction
-            )
-            return best[0]._replace(ended=result.ended) if is_worse else result
-        if count in fractions:
-            break
-        fractions[count] = fraction
-        if not best or _is_better(count, len(best[0].mesh.points), fractions, target_error):
-            best = [result]
-        if ERROR_REACHED * target_error <= fraction <= target_error:
-            return result
-        nodes = predicted = max(_next_nodes(content.image, fractions, target_error), fewest)
-        ratio = (total := node_count(result.mesh.points, result.mesh.cells, aim.order)) / count
-        if nodes in fractions or (
-            total > (1.0 - NODES_NEAR) * nodes_max and fraction > target_error
-        ):
-            break
-    return best[0]
-
-
 def _check_reachable(content: Content, target_error: float) -> None:
     """Raise InputError for a fraction out of range, or below that of the image's noise, which no
     mesh should follow.
@@ -702,43 +559,9 @@ def _check_reachable(content: Content, target_error: float) -> None:
         )
 
 
-def _beyond(nodes_max: int, needed: int) -> InputError:
+def _beyond(aim: Aim, corners: int) -> InputError:
+    needed = round(nodes_per_corner(aim.ndim, aim.order) * corners)
     return InputError(
-        f"nodes_max: sizes require about {needed} nodes, got {nodes_max}; allow as many, or "
+        f"nodes_max: sizes require about {needed} nodes, got {aim.nodes_max}; allow as many, or "
         "larger cells"
     )
-
-
-def _is_better(new: int, old: int, fractions: dict[int, float], target: float) -> bool:
-    """True if a number of nodes is better than another: it meets the target with fewer, or is
-    nearer to it.
-    """
-    if (fractions[new] <= target) != (fractions[old] <= target):
-        return fractions[new] <= target
-    return new < old if fractions[new] <= target else fractions[new] < fractions[old]
-
-
-def _next_nodes(image: Image, fractions: dict[int, float], target: float) -> int:
-    """The number of nodes to try next: between the nearest ones on either side, or beyond the
-    nearest.
-    """
-    above = max((n for n, fraction in fractions.items() if fraction > target), default=None)
-    below = min((n for n, fraction in fractions.items() if fraction <= target), default=None)
-    aim = ERROR_AIM * target
-    least = 0.03 * aim  # the error may be 0
-    if above is not None and below is not None and above < below:
-        part = np.log(fractions[above] / aim) / np.log(
-            fractions[above] / max(fractions[below], least)
-        )
-        return int(above * (below / above) ** part)
-    nearest = min(fractions) if above is None else above
-    rate, other = ERROR_RATE, max((n for n in fractions if n < nearest), default=None)
-    if above is not None and other is not None:  # the rate of this image, by its last two runs
-        rate = float(
-            np.clip(
-                np.log(fractions[other] / fractions[nearest]) / np.log(nearest / other),
-                *RATE_LIMITS,
-            )
-        )
-    number = nearest * nodes_ratio(max(fractions[nearest], least), target, rate)
-    return int(np.clip(number, 2 ** (image.ndim + 2), max(prod(image.shape) // 8, 64)))

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.contents.labels import BACKGROUND_LABEL
+from tetopt.engine.aim import Mode
 from tetopt.engine.loop import MeshingResult
-from tetopt.engine.meshing import Mode
 from tetopt.engine.sliding import MOST_MEETING
 from tetopt.io.text import list_names
 from tetopt.job.events import note, report_violation, warning

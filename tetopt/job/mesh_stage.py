@@ -15,17 +15,17 @@ from numpy.typing import NDArray
 
 from tetopt.contents.content import Content
 from tetopt.contents.domain import INSIDE_FRACTION
-from tetopt.engine.fast import prepare_kernels
-from tetopt.engine.loop import IterationRecord, MeshingResult
-from tetopt.engine.meshing import (
+from tetopt.engine.aim import (
     ERROR_RUNS,
     NODE_RUNS,
     NODES_NEAR,
     Aim,
-    MeshSearch,
-    Run,
-    check_memory_of,
+    SearchRun,
+    needed_corners,
 )
+from tetopt.engine.fast import prepare_kernels
+from tetopt.engine.loop import IterationRecord, MeshingResult
+from tetopt.engine.meshing import Optimisation, check_memory_of, search_mesh
 from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import squared_edges
 from tetopt.job.events import KERNEL_WORDS, ended_words, note, progress, start_stage, time_words
@@ -55,7 +55,6 @@ from tetopt.system.files import check_space, kept_places
 CELL_BYTES = 40
 # iteration after which the time left is told: the first ones, with most exchanges, take longer
 FIRST_TOLD = 3
-TIME_RATE = 0.65  # a run's time grows with nodes^0.65, on the MNI152 T1 from 1,500 to 50,000 nodes
 PACE_OF = 2  # iterations: the last ones, by which it is estimated
 START_WORDS = "building the initial mesh"
 
@@ -66,12 +65,10 @@ def mesh_task(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
     ends = None if job.max_seconds is None else begin + job.max_seconds
     limit = _memory_limit(task, content)
     before = peak_bytes(), resident_bytes()
+    begins, early = list[float](), list[Path]()
 
     def most_bytes(nodes: int) -> float:
         return max(before[0], before[1] + bytes_of(content, nodes))
-
-    early: list[Path] = []
-    result: MeshingResult | None = None
 
     def keep(mesh: Mesh, labels: NDArray[np.int64] | None) -> None:
         if labels is None and task.source.labels is not None:
@@ -80,38 +77,28 @@ def mesh_task(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
         place = keep_early(mesh, labels, early[-1:] or (job.output, *beside))
         early.extend([] if place is None else [place])
 
-    start_stage("start", START_WORDS)
-    search, first = MeshSearch(content, _aim(task), task.source.required, **options), 0.0
-    for number, (initial, run, predicted) in enumerate(search, 1):
-        if number == 1:
+    def attempt(run: Optimisation, initial: Mesh, aim: Aim, runs: list[SearchRun]) -> MeshingResult:
+        if not runs:
             _check_initial(task, initial)
         check_space(job.output, CELL_BYTES * len(initial.cells))
-        first = first or time.perf_counter()
+        begins.append(time.perf_counter())
         start_stage("kernels", KERNEL_WORDS)
-        nodes = (
-            max(job.nodes or 0, len(initial.points))
-            if task.plan.order == 1
-            else len(initial.points)
-        )
-        if predicted is not None and result is not None:
-            _say_predicted(task, result, predicted, most_bytes(predicted))
+        _say_needed(aim, runs)
+        nodes = max((job.nodes or 0) if aim.order == 1 else 0, len(initial.points))
         note(f"{_start_words(task, initial)}; about {memory_words(most_bytes(nodes))} of memory")
         _prepare(task)
-        start_stage(
-            "optimise",
-            "optimising",
-            options["iterations"],
-            None if ends is None else ends - time.perf_counter(),
-        )
-        kept = run if task.plan.mode == "paper" else partial(run, keep=keep)
-        result = watch_run(
-            kept, initial, options["iterations"], ends, stop, limit, task.source.surface_words
-        )
-        _say_search(task, number, result)
-        if job.target_error is not None or job.order == 2:  # a next run may follow
+        left = None if ends is None else ends - time.perf_counter()
+        start_stage("optimise", "optimising", options["iterations"], left)
+        run = run if aim.mode == "paper" else partial(run, keep=keep)
+        followed = task.source.surface_words
+        result = watch_run(run, initial, options["iterations"], ends, stop, limit, followed)
+        _say_run(task, len(runs) + 1, result)
+        if aim.target_error is not None or aim.order == 2:  # a next run may follow
             start_stage("start", START_WORDS)
-        search.tell(result)
-    result = search.result
+        return result
+
+    start_stage("start", START_WORDS)
+    result = search_mesh(content, _aim(task), attempt, task.source.required, **options)
     if result.curving is not None:
         note(curving_in_words(result.curving))
     elif (
@@ -123,7 +110,7 @@ def mesh_task(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
             "`start`: curved edges become straight, as there are no labels or mask for their "
             "nodes to follow"
         )
-    seconds = {"load": first - begin, "optimize": time.perf_counter() - first}
+    seconds = {"load": begins[0] - begin, "optimize": time.perf_counter() - begins[0]}
     return_freed()  # by the search
     n_nodes = max(result.nodes or 0, len(result.initial.points))
     memory = {"predicted_bytes": most_bytes(n_nodes)}
@@ -188,7 +175,7 @@ def _prepare(task: Task) -> None:
 
 
 def watch_run(
-    run: Run,
+    run: Optimisation,
     initial: Mesh,
     iterations: int,
     ends: float | None,
@@ -241,7 +228,7 @@ def left_words(
     return f", about {time_words(left)} left"
 
 
-def _say_search(task: Task, number: int, result: MeshingResult) -> None:
+def _say_run(task: Task, number: int, result: MeshingResult) -> None:
     """Report one of several runs, repeated until the error, or the number of nodes of order 2,
     is close enough.
     """
@@ -262,20 +249,13 @@ def _say_search(task: Task, number: int, result: MeshingResult) -> None:
         )
 
 
-def _say_predicted(task: Task, last: MeshingResult, corners: int, n_bytes: float) -> None:
-    """Report the nodes, time and memory that the target error takes, by the last of the runs so
-    far.
-    """
-    job, n_corners = task.plan.job, len(last.mesh.points)
-    nodes = round(
-        corners * node_count(last.mesh.points, last.mesh.cells, task.plan.order) / n_corners
-    )
-    seconds = last.history[-1].seconds * (corners / n_corners) ** TIME_RATE
-    words = (
-        f"an error of {job.target_error:g} requires about {nodes} nodes, {time_words(seconds)} and "
-    )
-    words += f"{memory_words(n_bytes)} of memory"
-    if nodes > (most := job.nodes_max or nodes):
+def _say_needed(aim: Aim, runs: list[SearchRun]) -> None:
+    """Report the number of nodes that a target error requires, by the runs so far."""
+    if aim.target_error is None or not runs:
+        return
+    nodes = round(needed_corners(aim, runs) * runs[-1].nodes / runs[-1].reached)
+    words = f"an error of {aim.target_error:g} requires about {nodes} nodes"
+    if nodes > (most := aim.nodes_max or nodes):
         words += f"; more than `nodes_max`, so that the next run has {most} nodes"
     note(words)
 

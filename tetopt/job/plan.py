@@ -10,14 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tetopt.contents.content import Content, check_weights
+from tetopt.engine.aim import Mode, nodes_per_corner
 from tetopt.engine.fast import check_options
 from tetopt.engine.loop import DEFAULT_NODES, MIN_DIHEDRAL, SHAPE_POWER, TARGET_NODES_MAX
 from tetopt.engine.meshing import (
     MODE_DEFAULTS,
-    Mode,
     check_target_error,
     default_nodes,
-    nodes_per_corner,
     sizes_of_order,
     with_label_sizes,
 )

@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.contents.content import Content, content
+from tetopt.engine.aim import Mode
 from tetopt.engine.fast import prepare_kernels
 from tetopt.engine.loop import UNIFORM_ITERATIONS, UNIFORM_K_D
-from tetopt.engine.meshing import MODE_DEFAULTS, Mode, mesh_image
+from tetopt.engine.meshing import MODE_DEFAULTS, mesh_image
 from tetopt.geometry.quadratic import node_count
 from tetopt.image import Image
 from tetopt.measure.segmentation import threshold_image

@@ -12,7 +12,7 @@ from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from tetopt.engine.meshing import QUADRATIC_NODES
+from tetopt.engine.aim import QUADRATIC_NODES
 
 Result = TypeVar("Result")
 
