@@ -196,7 +196,7 @@ def label_interfaces(
     rows = []
     for row in present.tolist():
         is_label = np.pad(voxels[boxes[row]] == row, 1)
-        is_large = np.count_nonzero(is_label) >= NET_VOXELS[mesh.ndim]
+        is_large = bool(np.count_nonzero(is_label) >= NET_VOXELS[mesh.ndim])
         smooth_area = _smooth_area(is_label, labels, is_large)
         rows.append(
             LabelInterface(

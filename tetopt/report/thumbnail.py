@@ -81,8 +81,8 @@ def thumbnail_png(
     """
     colours = None
     if labels is not None and of_cell is not None:
-        values, row = np.unique(of_cell, return_inverse=True)
-        colours = np.where(of_cell[:, None] > 0, label_colours(values, table.colours)[row], np.nan)
+        present, row = np.unique(of_cell, return_inverse=True)
+        colours = np.where(of_cell[:, None] > 0, label_colours(present, table.colours)[row], np.nan)
     views = _views(mesh)
     pixels = [_sample_view(image, view) for view in views]
     limits = _limits(image, mesh, mask, views, pixels)
