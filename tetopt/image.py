@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tetopt.errors import InputError
 from tetopt.interop import notebook
-from tetopt.system.arrays import plain_array
+from tetopt.system.arrays import Floats, plain_array
 
 # determinant of the axes' directions, below which they do not span the space
 SINGULAR_DETERMINANT = 1e-6
@@ -62,7 +62,7 @@ class Image:
     """
 
     data: NDArray[np.floating]
-    affine: NDArray[np.float64]
+    affine: Floats
 
     def __init__(self, data: ArrayLike, affine: ArrayLike | None = None) -> None:
         checked = _check_data(data)
@@ -109,7 +109,7 @@ class Image:
         return len(self.shape)
 
     @property
-    def spacing(self) -> NDArray[np.float64]:
+    def spacing(self) -> Floats:
         """Length of a voxel's edge along each axis, (n,) float64, mm."""
         return np.sqrt((self.affine[:-1, :-1] ** 2).sum(axis=0))
 
@@ -123,7 +123,7 @@ class Image:
         """Volume of the domain, index -0.5 to shape - 0.5, mm^n."""
         return self.voxel_volume * prod(self.shape)
 
-    def to_world(self, index: ArrayLike) -> NDArray[np.float64]:
+    def to_world(self, index: ArrayLike) -> Floats:
         """World coordinates of index coordinates.
 
         Parameters
@@ -145,7 +145,7 @@ class Image:
         """
         return _to_world(self.affine, index)
 
-    def to_index(self, points: ArrayLike) -> NDArray[np.float64]:
+    def to_index(self, points: ArrayLike) -> Floats:
         """Index coordinates of world points, the inverse of `to_world`.
 
         Parameters
@@ -214,9 +214,7 @@ class Image:
         return notebook.card_html("Image", rows, notebook.slice_html(self.data, self.affine))
 
 
-def transform_vectors(
-    vectors: NDArray[np.float64], matrix: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def transform_vectors(vectors: Floats, matrix: Floats) -> Floats:
     """Multiply each of the vectors (..., n) by `matrix` (n, n), term by term in the order of the
     columns.
 
@@ -229,13 +227,13 @@ def transform_vectors(
     return product
 
 
-def _to_world(affine: NDArray[np.float64], index: ArrayLike) -> NDArray[np.float64]:
+def _to_world(affine: Floats, index: ArrayLike) -> Floats:
     return (
         transform_vectors(np.asarray(index, dtype=np.float64), affine[:-1, :-1]) + affine[:-1, -1]
     )
 
 
-def shifted_affine(affine: NDArray[np.float64], start: Sequence[int]) -> NDArray[np.float64]:
+def shifted_affine(affine: Floats, start: Sequence[int]) -> Floats:
     """Return the affine of the voxels from index `start` on."""
     shifted = affine.copy()
     shifted[:-1, -1] = _to_world(affine, start)
@@ -311,7 +309,7 @@ def _as_lossless_float(data: NDArray) -> NDArray[np.floating]:
     return np.array(data, dtype=np.float64, order="C")
 
 
-def check_affine(affine: ArrayLike, n: int) -> NDArray[np.float64]:
+def check_affine(affine: ArrayLike, n: int) -> Floats:
     """Return a read-only copy of the affine; raise InputError unless it is (n+1, n+1), finite,
     homogeneous, regular.
     """
@@ -351,9 +349,7 @@ def check_affine(affine: ArrayLike, n: int) -> NDArray[np.float64]:
     return affine
 
 
-def _check_extents(
-    columns: NDArray[np.float64], lengths: NDArray[np.float64], origin: NDArray[np.float64]
-) -> None:
+def _check_extents(columns: Floats, lengths: Floats, origin: Floats) -> None:
     """Raise InputError unless the size, shape and position of voxels are within the limits."""
     least, most = LENGTH_RANGE
     if lengths.min() < least:

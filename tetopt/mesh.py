@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import curved_volumes, numbered_edges, quadratic, straight_pieces
 from tetopt.geometry.simplex import volumes
 from tetopt.interop import conversions, notebook
 from tetopt.interop.conversions import MESHIO_KINDS, VTK_KINDS, Fields
-from tetopt.system.arrays import plain_array, simplex_arrays
+from tetopt.system.arrays import Floats, Ints, plain_array, simplex_arrays
 
 if TYPE_CHECKING:
     import meshio
@@ -60,9 +60,9 @@ class Mesh:
     (2, 3, 1)
     """
 
-    points: NDArray[np.float64]
-    cells: NDArray[np.int64]
-    midpoints: NDArray[np.float64] | None
+    points: Floats
+    cells: Ints
+    midpoints: Floats | None
 
     def __init__(
         self, points: ArrayLike, cells: ArrayLike, midpoints: ArrayLike | None = None
@@ -99,7 +99,7 @@ class Mesh:
         return self.points.shape[1]
 
     @cached_property
-    def cell_volumes(self) -> NDArray[np.float64]:
+    def cell_volumes(self) -> Floats:
         """Volumes of the cells (areas in 2-D), (M,) float64, mm^n; exact, also with curved
         edges. Read-only.
         """
@@ -424,7 +424,7 @@ class Mesh:
         return conversions.to_trimesh(self.points, boundary_facets(self.cells))
 
 
-def _check_midpoints(midpoints: ArrayLike, cells: NDArray[np.int64], n: int) -> NDArray[np.float64]:
+def _check_midpoints(midpoints: ArrayLike, cells: Ints, n: int) -> Floats:
     try:
         places = np.array(plain_array("mesh midpoints", midpoints), dtype=np.float64, order="C")
     except InputError:

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.markup import escape
 
 from tetopt import InputError
@@ -18,6 +17,7 @@ from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.options import LabelledPart, ModelOptions, Option
 from tetopt.model.mappings import ByLabel, parse_any_mapping
 from tetopt.report.tables import new_table, nodes_in_words, range_words
+from tetopt.system.arrays import Floats
 from tetopt.system.files import check_output
 
 STEPS_BESIDE = 3  # columns of a table
@@ -149,7 +149,7 @@ def _print(name: str, solved: SolvedModel, shown: slice) -> None:
     print_table(table)
 
 
-def _vector(force: NDArray[np.float64]) -> str:
+def _vector(force: Floats) -> str:
     """Format the components of a force; those within rounding of the largest are 0."""
     shown = np.where(np.abs(force) > SHOWN_FRACTION * np.abs(force).max(), force, 0.0)
     return ", ".join(f"{part:.6g}" for part in shown)

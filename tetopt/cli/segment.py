@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.table import Table
 
 import tetopt
@@ -18,6 +17,7 @@ from tetopt.energy.sampling import overlap_of
 from tetopt.job.mesh_file import read_mesh
 from tetopt.job.options import MaskedPart, Option
 from tetopt.report.tables import new_table
+from tetopt.system.arrays import Bools
 from tetopt.system.files import check_output
 
 
@@ -104,7 +104,7 @@ def _overlaps_table(overlap: dict[str, dict[int, float]], names: dict[int, int])
     return table
 
 
-def _voxels_in(mesh: Mesh, what: Content, path: Path, image_path: Path) -> NDArray[np.bool_]:
+def _voxels_in(mesh: Mesh, what: Content, path: Path, image_path: Path) -> Bools:
     """Return which voxels lie in the mesh and its mask; warn of those outside.
 
     Raises InputError if one lies in several cells, or all outside.

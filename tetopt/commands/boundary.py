@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.commands.beside import cell_field
 from tetopt.errors import InputError
@@ -25,6 +24,7 @@ from tetopt.model.file import MeshFile
 from tetopt.model.label_names import LABEL_FIELD, label_words, labels_named
 from tetopt.model.model import SPACES
 from tetopt.model.sets import FACE_NAMES, boundary_rows, face_sets
+from tetopt.system.arrays import Ints
 
 MOST_LISTED = 12  # interfaces in the table; the file of numbers has all
 
@@ -246,9 +246,7 @@ def _two_sides(text: str, names: dict[int, str]) -> tuple[list[int], list[int]]:
     return one, other
 
 
-def _with_label(
-    loaded: MeshFile, path: Path, chosen: list[int], names: dict[int, str]
-) -> NDArray[np.int64]:
+def _with_label(loaded: MeshFile, path: Path, chosen: list[int], names: dict[int, str]) -> Ints:
     """Return the numbers of the cells with these labels."""
     labels = cell_field(loaded, path, LABEL_FIELD)
     cells = np.flatnonzero(np.isin(labels, chosen))
@@ -261,7 +259,7 @@ def _with_label(
     return cells
 
 
-def _structure_cells(loaded: MeshFile, path: Path, part: SurfacePart) -> NDArray[np.int64]:
+def _structure_cells(loaded: MeshFile, path: Path, part: SurfacePart) -> Ints:
     """Return the numbers of the structure's cells."""
     if part.cell_set is not None:
         if part.cell_set not in loaded.sets.cells:

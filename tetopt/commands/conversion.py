@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.commands.beside import check_part, voxels_of
 from tetopt.contents.align import SMALL_COMPONENT_FRACTION
@@ -57,6 +56,7 @@ from tetopt.model.sets import (
     standard_names,
 )
 from tetopt.report.summary import model_summary, versions
+from tetopt.system.arrays import Bools, Ints
 
 
 class Converted(NamedTuple):
@@ -193,9 +193,7 @@ def _of_labels(loaded: MeshFile, choice: LabelChoice) -> MeshFile:
     return part._replace(field_data=part.field_data | {"inputs": np.array([json.dumps(inputs)])})
 
 
-def _without_crumbs(
-    mesh: Mesh, labels: NDArray[np.int64], is_kept: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
+def _without_crumbs(mesh: Mesh, labels: Ints, is_kept: Bools) -> Bools:
     """Return the cells that stay, (M,), without components that have little of any label; report
     these.
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.commands.beside import check_part, voxels_of
 from tetopt.errors import InputError
@@ -29,6 +28,7 @@ from tetopt.model.loads import MOST_COMPRESSION_PERCENT, count_of_steps
 from tetopt.model.model import Model, locking_words
 from tetopt.model.sets import box_of, box_text
 from tetopt.report.summary import model_summary, versions
+from tetopt.system.arrays import Floats
 
 if TYPE_CHECKING:
     from tetopt.fem.conditioning import Conditioning
@@ -207,7 +207,7 @@ def _with_results(model: Model, solutions: list[Solution]) -> Model:
     return model._replace(cell_data=cell_data, point_data=point_data, about=about)
 
 
-def _lists(reactions: dict[str, NDArray[np.float64]]) -> dict[str, list[float]]:
+def _lists(reactions: dict[str, Floats]) -> dict[str, list[float]]:
     return {name: force.tolist() for name, force in reactions.items()}
 
 

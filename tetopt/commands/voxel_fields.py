@@ -22,6 +22,7 @@ from tetopt.model.fields import half_turned_fields
 from tetopt.model.file import MeshFile, words_of_other_box
 from tetopt.model.on_image import At, field_on_image, warped_image
 from tetopt.report.summary import versions
+from tetopt.system.arrays import Bools
 
 
 def is_image_name(path: Path) -> bool:
@@ -201,7 +202,7 @@ def _field_of(
     return name, values, at
 
 
-def _check_any(inside: NDArray[np.bool_], what: str) -> None:
+def _check_any(inside: Bools, what: str) -> None:
     if not inside.any():
         raise InputError(
             f"{what}: no voxel centre is inside the mesh; do both use the same world coordinates?"

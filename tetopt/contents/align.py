@@ -23,6 +23,7 @@ from tetopt.contents.otsu import class_thresholds
 from tetopt.errors import InputError, warn
 from tetopt.geometry.box import box_sides
 from tetopt.image import Image, transform_vectors
+from tetopt.system.arrays import Bools, Floats, Ints
 
 # two grids whose corners differ by no more are the same: headers hold single precision
 SAME_GRID_VOXELS = 1e-4
@@ -213,7 +214,7 @@ def _warn_of_loss(name: str, word: str, labels: Image, moved: Image) -> None:
         )
 
 
-def _n_pieces(is_in: NDArray[np.bool_]) -> int:
+def _n_pieces(is_in: Bools) -> int:
     """Number of face-connected components."""
     boxes = scipy.ndimage.find_objects(is_in.astype(np.int8))
     return int(scipy.ndimage.label(is_in[boxes[0]])[1]) if boxes else 0
@@ -272,8 +273,8 @@ class Foreground(NamedTuple):
     """The foreground of an image, and its small pieces."""
 
     mask: Image  # float32, 0 and 1
-    dropped: NDArray[np.int64]  # voxels of each bright piece that is left out, descending
-    kept: NDArray[np.int64]  # voxels of each dark piece at the box's sides that stays, descending
+    dropped: Ints  # voxels of each bright piece that is left out, descending
+    kept: Ints  # voxels of each dark piece at the box's sides that stays, descending
 
     @property
     def words(self) -> str:
@@ -384,8 +385,8 @@ class FilledHoles(NamedTuple):
     """Labels without holes, and the holes."""
 
     labels: Image
-    sizes: NDArray[np.int64]  # (H,) voxels of each
-    around: NDArray[np.int64]  # (H,) the label that most of its faces touch
+    sizes: Ints  # (H,) voxels of each
+    around: Ints  # (H,) the label that most of its faces touch
 
 
 def fill_holes(labels: Image, label: int) -> FilledHoles:
@@ -545,7 +546,7 @@ def _resample(data: NDArray, other: Image, image: Image, order: int, mode: str) 
     )
 
 
-def _corners(grid: Any) -> NDArray[np.float64]:
+def _corners(grid: Any) -> Floats:
     """The corners of a grid's box, (2^n, n) indices."""
     return np.array(list(product(*box_sides(grid.shape))))
 
@@ -557,7 +558,7 @@ def _both_boxes(other: Image, image: Image) -> str:
     )
 
 
-def _world_corners(grid: Any) -> NDArray[np.float64]:
+def _world_corners(grid: Any) -> Floats:
     return transform_vectors(_corners(grid), grid.affine[:-1, :-1]) + grid.affine[:-1, -1]
 
 
@@ -575,7 +576,7 @@ def _on_faces(data: NDArray) -> NDArray:
     )
 
 
-def _pieces(is_in: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+def _pieces(is_in: Bools) -> tuple[NDArray[np.int32], Ints]:
     """Face-connected components, numbered from 1, and the number of voxels of each; 0 of the
     rest.
     """
@@ -585,6 +586,6 @@ def _pieces(is_in: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.int
     return pieces, sizes
 
 
-def _least_of(sizes: NDArray[np.int64]) -> float:
+def _least_of(sizes: Ints) -> float:
     """The least number of voxels of a component that is not far smaller than the largest."""
     return max(1.0, SMALL_COMPONENT_FRACTION * float(sizes.max()))

@@ -29,6 +29,7 @@ from tetopt.contents.memberships import (
 from tetopt.contents.noise import noise_level
 from tetopt.errors import InputError
 from tetopt.image import Image
+from tetopt.system.arrays import Bools, Floats, Ints
 
 RARITY_POWER = 0.5  # exponent of a label's fraction of the voxels by which its voxels count less
 SAME_PLACE_VOXELS = 1e-2  # voxel centres no farther apart coincide
@@ -46,7 +47,7 @@ class Continuation(NamedTuple):
     """Source of the values beyond a mask's surface; made by `continuation`."""
 
     part: tuple[slice, ...]  # the voxels around the mask
-    inside: NDArray[np.bool_]  # those that lie in it
+    inside: Bools  # those that lie in it
     # (K,) flat index of the nearest voxel inside, for each one outside in C order
     nearest: NDArray[np.integer]
 
@@ -64,7 +65,7 @@ class SmoothLabels(NamedTuple):
     """Labels with smooth interfaces."""
 
     memberships: Memberships
-    own_channel: NDArray[np.int64]  # (K,) channel of each label
+    own_channel: Ints  # (K,) channel of each label
     own_value: NDArray[np.int32]  # (K,) value of its voxels in that channel
     keeps_volumes: bool  # True if labels thinner than cells keep their volume
 
@@ -197,7 +198,7 @@ class Content(NamedTuple):
         return self.codes[number - self.n_contrasts][self.rows[part]]
 
     @property
-    def inside(self) -> NDArray[np.bool_] | None:
+    def inside(self) -> Bools | None:
         """Mask of the voxels to cover; None for all."""
         return None if self.region is None else self.region.inside
 
@@ -425,7 +426,7 @@ def _scale_contrasts(
 
 
 def _whole_numbers(
-    contrasts: list[NDArray[np.float32]], shape: tuple[int, ...], codes: NDArray[np.float64]
+    contrasts: list[NDArray[np.float32]], shape: tuple[int, ...], codes: Floats
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], float]:
     """The contrasts, (I, *shape), and the values of labels, (L, K), as whole numbers, and their
     scale.
@@ -480,7 +481,7 @@ def _variance(values: NDArray, region: Region | None) -> float:
         return float(np.var(values if region is None else values[region.inside], dtype=np.float64))
 
 
-def continuation(mask: Image, spacing: NDArray[np.float64]) -> Continuation:
+def continuation(mask: Image, spacing: Floats) -> Continuation:
     """The voxels around a mask, with a margin, and their nearest voxels inside, for voxel edges
     (n,) in mm.
 
@@ -581,7 +582,7 @@ def _check(
 
 def _one_hot(
     rows: NDArray[np.integer], n_rows: int, region: Region | None
-) -> tuple[NDArray[np.integer], NDArray[np.float64]]:
+) -> tuple[NDArray[np.integer], Floats]:
     """Channels that distinguish K labels: each voxel's label, and the labels' values in C channels,
     (C, K).
 

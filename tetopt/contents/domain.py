@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from tetopt.contents.smoothing import FARTHEST_LEVEL, largest_around, raw_level, smooth_level
 from tetopt.image import Image
+from tetopt.system.arrays import Bools, Floats
 from tetopt.system.budget import check_memory
 
 INSIDE_FRACTION = 0.5  # the least value of a mask, 0 to 1, at which a voxel counts as inside
@@ -30,7 +31,7 @@ ON_SURFACE_VOXELS = 1e-3  # a place whose level is this near to 0 lies on the su
 class Region(NamedTuple):
     """The part of an image's box that a mask covers; made by `region_of`."""
 
-    inside: NDArray[np.bool_]  # voxels whose centres lie in the mask
+    inside: Bools  # voxels whose centres lie in the mask
     # at voxel centres: distance to the surface in voxels, below 0 inside
     level: NDArray[np.float32]
 
@@ -62,7 +63,7 @@ def region_of(mask: Image) -> Region:
     return Region(inside, level)
 
 
-def _smooth_level(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
+def _smooth_level(inside: Bools) -> NDArray[np.float32]:
     """The smooth level of a mask, but the raw one around sheets and gaps of one voxel, which
     smoothing would tear.
     """
@@ -75,7 +76,7 @@ def _smooth_level(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
     return np.where(largest_around(is_single, 1)[part], raw_level(inside), level[part])
 
 
-def _open_mask(inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _open_mask(inside: Bools) -> Bools:
     """Voxels in cubes of two voxels a side that are inside: a tenth of the time of
     `scipy.ndimage.binary_opening`.
     """
@@ -92,7 +93,7 @@ def _open_mask(inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return whole
 
 
-def levels(level: NDArray, index: NDArray[np.float64]) -> NDArray[np.float64]:
+def levels(level: NDArray, index: Floats) -> Floats:
     """The level function at index coordinates (K, n), (K,)."""
     return np.asarray(
         scipy.ndimage.map_coordinates(level, index.T, order=1, mode="nearest", output=np.float64)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from tetopt.contents.smoothing import largest_around
 from tetopt.errors import InputError, warn
 from tetopt.image import Image, transform_vectors
+from tetopt.system.arrays import Bools, Floats, Ints
 from tetopt.system.kernel_cache import njit
 
 # largest signed 32-bit integer, the widest type of labels in most programs
@@ -154,7 +155,7 @@ def _pairs_apart(data: NDArray, ranks: NDArray, step: int) -> tuple[int, int]:
     return n_pairs, n_apart
 
 
-def warn_of_absent(name: str, labels: Image, is_kept: NDArray[np.bool_], where: str) -> None:
+def warn_of_absent(name: str, labels: Image, is_kept: Bools, where: str) -> None:
     """Warn of labels above 0 none of whose voxels is kept, as it lies in the image or mask; the
     largest first.
     """
@@ -195,9 +196,9 @@ class LostComponent(NamedTuple):
 
 
 def voxel_components(
-    inside: NDArray[np.bool_],
-    is_met: NDArray[np.bool_],
-    affine: NDArray[np.float64],
+    inside: Bools,
+    is_met: Bools,
+    affine: Floats,
     box: Sequence[slice] = (),
 ) -> tuple[int, tuple[LostComponent, ...]]:
     """Number of face-connected components of voxels, and those without one that `is_met`, the
@@ -223,9 +224,7 @@ def voxel_components(
     return n_components, tuple(LostComponent(size, tuple(place)) for size, place in rows)
 
 
-def component_runs(
-    inside: NDArray[np.bool_], is_met: NDArray[np.bool_], *, has_corners: bool = False
-) -> tuple[int, NDArray[np.int64]]:
+def component_runs(inside: Bools, is_met: Bools, *, has_corners: bool = False) -> tuple[int, Ints]:
     """Number of components of voxels that faces connect, or corners, too, and the runs of those of
     which none is met.
 
@@ -294,7 +293,7 @@ def _root(root: NDArray, run: int) -> int:
     return run
 
 
-def label_channels(number: NDArray[np.integer], n_labels: int) -> NDArray[np.int64]:
+def label_channels(number: NDArray[np.integer], n_labels: int) -> Ints:
     """A channel for each label: labels within `APART_VOXELS` voxels of one another have
     different ones.
     """
@@ -327,7 +326,7 @@ def hex_colour(text: Any) -> tuple[float, float, float] | None:
     return (parts[0] / 255.0, parts[1] / 255.0, parts[2] / 255.0)
 
 
-def colours_by_number(labels: NDArray[np.int64]) -> NDArray[np.float64]:
+def colours_by_number(labels: Ints) -> Floats:
     """Default colours (K, 3) of labels from 0: red, green and blue, 0 to 1; label 0 is light grey.
 
     They depend only on the number, so that a label has the same colour in every picture and file.

@@ -28,6 +28,7 @@ from tetopt.contents.smoothing import (
     smooth_level,
 )
 from tetopt.image import Image
+from tetopt.system.arrays import Bools, Floats, Ints
 from tetopt.system.budget import check_memory
 from tetopt.system.kernel_cache import njit
 from tetopt.system.slabs import over_slabs
@@ -51,15 +52,15 @@ ABSENT_DISTANCE = 1e4  # voxels to a label that is absent from a slice
 class Memberships(NamedTuple):
     """Levels of labels on a grid of voxel centres; made by `memberships`."""
 
-    labels: NDArray[np.int64]  # (K,) labels present, ascending
+    labels: Ints  # (K,) labels present, ascending
     # (K,) row of `levels` for each label; labels nowhere near one another share one
-    channel: NDArray[np.int64]
+    channel: Ints
     levels: NDArray[np.float32]  # (C, *shape) distance to the surface, voxels, below 0 inside
     partition: NDArray[np.integer]  # (*shape) row of `labels` with the smallest level at each voxel
     parts: int = 1  # voxels of this grid per voxel of the labels
 
 
-def supersampling(spacing: NDArray[np.float64]) -> tuple[int, ...]:
+def supersampling(spacing: Floats) -> tuple[int, ...]:
     """Number of parts along each axis that divide a voxel with edges (n,), mm, nearly into cubes.
 
     Odd numbers, so that a slice's plane goes through voxels' centres: 1, 3, 5, ..., whichever is
@@ -80,14 +81,14 @@ def finer(image: Image, factors: Sequence[int]) -> Image:
     return Image(data.astype(image.data.dtype), finer_affine(image.affine, factors))
 
 
-def finer_index(n: int, factor: int) -> NDArray[np.float64]:
+def finer_index(n: int, factor: int) -> Floats:
     """Centres of `n` voxels divided into `factor` each, in index coordinates of the whole
     voxels, (n * factor,).
     """
     return (np.arange(n * factor) + 0.5) / factor - 0.5
 
 
-def finer_affine(affine: NDArray[np.float64], factors: Sequence[int]) -> NDArray[np.float64]:
+def finer_affine(affine: Floats, factors: Sequence[int]) -> Floats:
     """The affine (n+1, n+1) of voxels divided by `factors` along the axes."""
     step = np.append(1.0 / np.asarray(factors, dtype=np.float64), 1.0)
     moved = affine * step
@@ -120,7 +121,7 @@ def memberships(labels: Image, factors: Sequence[int] | None = None) -> Membersh
     )
 
 
-def number_labels(labels: Image) -> tuple[NDArray[np.int64], NDArray[np.integer]]:
+def number_labels(labels: Image) -> tuple[Ints, NDArray[np.integer]]:
     """Labels present, (K,), ascending, and the number of each voxel's among them; 16 bits if
     (K+1)^2 fits.
     """
@@ -136,7 +137,7 @@ def number_labels(labels: Image) -> tuple[NDArray[np.int64], NDArray[np.integer]
 
 
 def memberships_of(
-    values: NDArray[np.int64], start: NDArray[np.integer], factors: tuple[int, ...]
+    values: Ints, start: NDArray[np.integer], factors: tuple[int, ...]
 ) -> Memberships:
     """`memberships` of numbered labels."""
     assert all(factor % 2 == 1 for factor in factors), (
@@ -200,14 +201,14 @@ def _agree(members: Memberships) -> None:
                 level[is_near] = np.where(is_own, least, most)
 
 
-def _near(inside: NDArray[np.bool_]) -> NDArray[np.uint8]:
+def _near(inside: Bools) -> NDArray[np.uint8]:
     """Voxels so near to a label that no other label of its channel has its level there, as bits:
     boxes overlap.
     """
     return np.packbits(largest_around(inside, AGREEMENT_REACH))
 
 
-def _mask_of(bits: NDArray[np.uint8], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def _mask_of(bits: NDArray[np.uint8], shape: tuple[int, ...]) -> Bools:
     return np.unpackbits(bits, count=prod(shape)).view(np.bool_).reshape(shape)
 
 
@@ -244,7 +245,7 @@ def _missing_depth(
 
 
 def gather_levels(
-    values: NDArray[np.int64],
+    values: Ints,
     start: NDArray[np.integer],
     level_in: Callable[[int, tuple[slice, ...]], NDArray[np.float32]],
     parts: int,
@@ -295,10 +296,10 @@ def gather_levels(
 
 def labels_at(
     members: Memberships,
-    index: NDArray[np.float64],
-    cells: NDArray[np.int64],
-    places: NDArray[np.float64],
-) -> NDArray[np.int64]:
+    index: Floats,
+    cells: Ints,
+    places: Floats,
+) -> Ints:
     """Rows of the labels with the smallest level at barycentric places (S, K) in cells (M, K), (M,
     S).
 
@@ -406,8 +407,8 @@ def _off_planes(number: NDArray[np.integer], axis: int, factor: int) -> NDArray[
 def _merge_crumbs(
     levels: NDArray[np.float32],
     partition: NDArray[np.integer],
-    channel: NDArray[np.int64],
-    is_plane: NDArray[np.bool_],
+    channel: Ints,
+    is_plane: Bools,
 ) -> None:
     """Merge components of a label between slices that reach no slice's plane into the nearest
     label, in place.
@@ -472,7 +473,7 @@ def _between_slices(
 
 
 def _interpolate_level(
-    inside: NDArray[np.bool_], axis: int, factor: int, length: Sequence[float]
+    inside: Bools, axis: int, factor: int, length: Sequence[float]
 ) -> NDArray[np.float32]:
     """A label's level on slices divided along one axis."""
     inside = np.moveaxis(inside, axis, 0)
@@ -503,7 +504,7 @@ def _rest(level: NDArray[np.float32], deepest: NDArray[np.float32], k: int) -> N
 
 
 def _outline_distance(
-    inside: NDArray[np.bool_], length: Sequence[float]
+    inside: Bools, length: Sequence[float]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Signed distance to the outline within each slice, and the largest in each voxel's
     component.

@@ -9,6 +9,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from tetopt.system.arrays import Bools, Ints
+
 SAMPLED_VOXELS = 100_000  # sample whose most frequent value counts as the background's
 # least number of voxels for estimating the noise; a smaller image uses all
 NOISE_VOXELS = 1_000_000
@@ -22,7 +24,7 @@ class NoiseSample(NamedTuple):
     near: NDArray  # (3, P, ...) the planes before P planes, these planes, and those after
 
 
-def noise_level(data: NDArray, inside: NDArray[np.bool_] | None = None) -> float:
+def noise_level(data: NDArray, inside: Bools | None = None) -> float:
     """Standard deviation of the noise in an image's data, estimated from second differences along
     every axis.
 
@@ -42,7 +44,7 @@ def noise_level(data: NDArray, inside: NDArray[np.bool_] | None = None) -> float
     return sampled_noise(noise_sample(data, middles), noise_sample(inside, middles).near)
 
 
-def noise_planes(inside: NDArray[np.bool_]) -> NDArray[np.int64]:
+def noise_planes(inside: Bools) -> Ints:
     """Indices of the planes at which second differences are taken within a mask; none if no
     voxel is surrounded.
     """
@@ -55,7 +57,7 @@ def noise_planes(inside: NDArray[np.bool_]) -> NDArray[np.int64]:
     return 1 + np.sort(most[counts[most] > 0])
 
 
-def noise_places(shape: tuple[int, ...]) -> tuple[int, NDArray[np.int64]]:
+def noise_places(shape: tuple[int, ...]) -> tuple[int, Ints]:
     """Sampling distance of values, voxels, and indices of the planes at which second differences
     are taken.
 
@@ -67,7 +69,7 @@ def noise_places(shape: tuple[int, ...]) -> tuple[int, NDArray[np.int64]]:
     return max(size // SAMPLED_VOXELS, 1), np.arange(first, end, step, dtype=np.int64)
 
 
-def noise_sample(data: NDArray, middles: NDArray[np.int64] | None = None) -> NoiseSample:
+def noise_sample(data: NDArray, middles: Ints | None = None) -> NoiseSample:
     """The sample of voxels in memory; second differences are taken at the planes `middles`, if
     given.
     """
@@ -75,12 +77,12 @@ def noise_sample(data: NDArray, middles: NDArray[np.int64] | None = None) -> Noi
     return NoiseSample(data.ravel()[::stride], _near(data, usual if middles is None else middles))
 
 
-def _near(data: NDArray, middles: NDArray[np.int64]) -> NDArray:
+def _near(data: NDArray, middles: Ints) -> NDArray:
     """Planes with the ones before and after, (3, P, ...)."""
     return np.stack([data[middles + k] for k in (-1, 0, 1)])
 
 
-def _surrounded_voxels(near: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _surrounded_voxels(near: Bools) -> Bools:
     """Voxels of the middle planes, but for those at their borders, with all neighbours inside,
     (P, ...).
     """
@@ -90,7 +92,7 @@ def _surrounded_voxels(near: NDArray[np.bool_]) -> NDArray[np.bool_]:
     )
 
 
-def sampled_noise(sample: NoiseSample, inside: NDArray[np.bool_] | None = None) -> float:
+def sampled_noise(sample: NoiseSample, inside: Bools | None = None) -> float:
     """`noise_level` from a sample; `inside` covers its planes, (3, P, ...)."""
     if sample.near.size == 0:
         return 0.0

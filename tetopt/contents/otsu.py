@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
+from tetopt.system.arrays import Floats
 
 HISTOGRAM_BINS = 256  # bins of the histogram, as many as the values of 8-bit images
 # of the weight at either end, which may be a few voxels far brighter than all others
@@ -14,9 +15,7 @@ TAIL_FRACTION = 0.0005
 FEWEST_BINS = 64
 
 
-def class_thresholds(
-    values: NDArray, classes: int, weights: NDArray | None = None
-) -> NDArray[np.float64]:
+def class_thresholds(values: NDArray, classes: int, weights: NDArray | None = None) -> Floats:
     """Thresholds between classes that minimise the variance within them (Otsu 1979, for any
     number).
 
@@ -73,7 +72,7 @@ def class_thresholds(
     return 0.5 * (centres[first - 1] + centres[first])
 
 
-def _histogram(values: NDArray, weights: NDArray | None) -> tuple[NDArray, NDArray[np.float64]]:
+def _histogram(values: NDArray, weights: NDArray | None) -> tuple[NDArray, Floats]:
     """Counts and edges of the bins, see `class_thresholds`."""
     low, high = values.min(), values.max()
     steps = np.linspace(low, high, HISTOGRAM_BINS + 1, dtype=values.dtype)  # like numpy's bins
@@ -99,9 +98,7 @@ def _histogram(values: NDArray, weights: NDArray | None) -> tuple[NDArray, NDArr
     return narrow if (narrow[0] > 0).sum() > (counts > 0).sum() else (counts, edges)
 
 
-def _within_class_sums(
-    counts: NDArray[np.float64], centres: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _within_class_sums(counts: Floats, centres: Floats) -> Floats:
     """Sum of squares around the mean over bins a .. b-1, entry [a, b]; infinite for empty runs,
     (n, n+1).
     """

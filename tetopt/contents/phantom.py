@@ -47,10 +47,11 @@ from typing import Any
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from tetopt.errors import InputError
 from tetopt.image import SINGULAR_DETERMINANT, Image, transform_vectors
+from tetopt.system.arrays import Floats, Ints
 from tetopt.system.budget import check_memory
 from tetopt.system.incoming import toml_of
 
@@ -112,9 +113,9 @@ class Shape:
     """
 
     kind: str
-    center: NDArray[np.float64]
-    frame: NDArray[np.float64]
-    half: NDArray[np.float64]
+    center: Floats
+    frame: Floats
+    half: Floats
     intensity: float
     label: int
     name: str = ""
@@ -123,7 +124,7 @@ class Shape:
         _lock(self, state)
 
 
-def signed_distance(shape: Shape, points: ArrayLike) -> NDArray[np.float64]:
+def signed_distance(shape: Shape, points: ArrayLike) -> Floats:
     """Lower bound of the distance from the shape's surface, negative inside, with the exact zero
     set.
 
@@ -195,10 +196,10 @@ class Phantom:
 
     name: str
     description: str
-    size_mm: NDArray[np.float64]
-    voxel_mm: NDArray[np.float64]
-    center_mm: NDArray[np.float64]
-    axes: NDArray[np.float64]
+    size_mm: Floats
+    voxel_mm: Floats
+    center_mm: Floats
+    axes: Floats
     background_intensity: float
     background_label: int
     shapes: tuple[Shape, ...]
@@ -214,7 +215,7 @@ class Phantom:
         """Number of axes n, 2 or 3."""
         return len(self.size_mm)
 
-    def intensity(self, points: ArrayLike) -> NDArray[np.float64]:
+    def intensity(self, points: ArrayLike) -> Floats:
         """The exact intensity at points inside and outside the box.
 
         Parameters
@@ -239,7 +240,7 @@ class Phantom:
         """
         return self._intensities()[self._top_shape(self._checked_points(points))]
 
-    def labels(self, points: ArrayLike) -> NDArray[np.int64]:
+    def labels(self, points: ArrayLike) -> Ints:
         """The label at points inside and outside the box.
 
         Parameters
@@ -374,17 +375,17 @@ class Phantom:
             data[part] = self._labels()[self._top_shape(centers)].reshape(data[part].shape)
         return Image(data, affine)
 
-    def _intensities(self) -> NDArray[np.float64]:
+    def _intensities(self) -> Floats:
         """Intensities in painting order, the background's first."""
         return np.array(
             [self.background_intensity, *(s.intensity for s in self.shapes)], dtype=np.float64
         )
 
-    def _labels(self) -> NDArray[np.int64]:
+    def _labels(self) -> Ints:
         """Labels in painting order, the background's first."""
         return np.array([self.background_label, *(s.label for s in self.shapes)], dtype=np.int64)
 
-    def _checked_points(self, points: ArrayLike) -> NDArray[np.float64]:
+    def _checked_points(self, points: ArrayLike) -> Floats:
         """Points as float64; raise InputError unless they are (..., n) finite numbers."""
         try:
             checked = np.asarray(points, dtype=np.float64)
@@ -405,7 +406,7 @@ class Phantom:
             )
         return checked
 
-    def _top_shape(self, points: NDArray[np.float64]) -> NDArray[np.int64]:
+    def _top_shape(self, points: Floats) -> Ints:
         """Position in painting order of the last shape at each point: 1 is the first, 0 the
         background.
         """
@@ -414,7 +415,7 @@ class Phantom:
             top[signed_distance(shape, points) <= 0.0] = k
         return top
 
-    def _grid(self, voxel_mm: ArrayLike | None) -> tuple[tuple[int, ...], NDArray[np.float64]]:
+    def _grid(self, voxel_mm: ArrayLike | None) -> tuple[tuple[int, ...], Floats]:
         """Number of voxels along each axis and the affine, for voxels of about `voxel_mm`; raise
         InputError unless they and their temporaries fit into memory.
         """
@@ -444,9 +445,7 @@ class Phantom:
         check_memory(PHANTOM_VOXEL_BYTES * math.prod(shape), what, "use larger voxels")
         return shape, affine
 
-    def _voxel_means(
-        self, centers: NDArray[np.float64], offsets: NDArray[np.float64], reach: float
-    ) -> NDArray[np.float64]:
+    def _voxel_means(self, centers: Floats, offsets: Floats, reach: float) -> Floats:
         """Mean intensity, (M,), over voxels with these centres (M, n).
 
         `offsets` (S, n) lead from a centre to its sub-voxels' midpoints; no point of a voxel is
@@ -626,7 +625,7 @@ def _shape(table: dict[str, Any], n: int, where: str) -> Shape:
     return Shape(kind, center, frame, half, intensity, label, table.get("name", ""))
 
 
-def _rotation(angles: Any, n: int, what: str) -> NDArray[np.float64]:
+def _rotation(angles: Any, n: int, what: str) -> Floats:
     """Rotation matrix (n, n) of `rotation_deg`."""
     if angles is None:
         return np.eye(n)
@@ -639,7 +638,7 @@ def _rotation(angles: Any, n: int, what: str) -> NDArray[np.float64]:
     ).as_matrix()
 
 
-def _axes(rows: Any, n: int, what: str) -> NDArray[np.float64]:
+def _axes(rows: Any, n: int, what: str) -> Floats:
     """Unit rows (n, n), read-only."""
     if not isinstance(rows, list) or len(rows) != n:
         raise InputError(
@@ -658,13 +657,13 @@ def _axes(rows: Any, n: int, what: str) -> NDArray[np.float64]:
     return axes
 
 
-def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+def _unit(vector: Floats) -> Floats:
     """The vector at length 1, exact for an axis-aligned one."""
     vector = vector / np.abs(vector).max()
     return vector / np.linalg.norm(vector)
 
 
-def _voxel_edges(voxel_mm: Any, size_mm: NDArray[np.float64], where: str) -> NDArray[np.float64]:
+def _voxel_edges(voxel_mm: Any, size_mm: Floats, where: str) -> Floats:
     """Voxel edges (n,); raise InputError unless they are positive and no larger than the box."""
     what = f"{where}: voxel_mm"
     voxel = _positive(_numbers(voxel_mm, len(size_mm), what, is_one_enough=True), what)
@@ -677,7 +676,7 @@ def _voxel_edges(voxel_mm: Any, size_mm: NDArray[np.float64], where: str) -> NDA
     return voxel
 
 
-def _index_block(shape: Sequence[int]) -> NDArray[np.float64]:
+def _index_block(shape: Sequence[int]) -> Floats:
     """Index coordinates, (product of shape, n), of all voxels in C order."""
     return np.stack(np.unravel_index(np.arange(math.prod(shape)), shape), axis=-1).astype(
         np.float64
@@ -685,8 +684,8 @@ def _index_block(shape: Sequence[int]) -> NDArray[np.float64]:
 
 
 def _voxel_centers(
-    shape: Sequence[int], affine: NDArray[np.float64]
-) -> Iterator[tuple[tuple[slice, ...], NDArray[np.float64]]]:
+    shape: Sequence[int], affine: Floats
+) -> Iterator[tuple[tuple[slice, ...], Floats]]:
     """Iterate over parts of a grid of voxels, with the world centres (M, n) of these in C order.
 
     Centres are summed term by term, not by BLAS, whose rounding depends on the number of rows.
@@ -740,7 +739,7 @@ def _integer(value: Any, what: str, low: int = 0, high: int = 2**31 - 1) -> int:
     return value
 
 
-def _numbers(value: Any, n: int, what: str, is_one_enough: bool = False) -> NDArray[np.float64]:
+def _numbers(value: Any, n: int, what: str, is_one_enough: bool = False) -> Floats:
     """(n,) finite float64, read-only; a single number stands for n of them if `is_one_enough`."""
     value = _plain(value)
     row = [value] * n if is_one_enough and _is_number(value) else value
@@ -752,7 +751,7 @@ def _numbers(value: Any, n: int, what: str, is_one_enough: bool = False) -> NDAr
     return numbers
 
 
-def _positive(values: NDArray[np.float64], what: str) -> NDArray[np.float64]:
+def _positive(values: Floats, what: str) -> Floats:
     """Return the values; raise InputError unless all are above 0."""
     if not (values > 0.0).all():
         raise InputError(f"{what}: expected lengths above 0 mm, got {values.tolist()}")

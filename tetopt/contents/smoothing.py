@@ -14,6 +14,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from tetopt.system.arrays import Bools
 from tetopt.system.kernel_cache import njit
 from tetopt.system.slabs import over_slabs
 
@@ -45,8 +46,8 @@ BROAD_FRACTIONS = np.clip((DISTANCES - THIN_REACH[0]) / (THIN_REACH[1] - THIN_RE
 
 
 def smooth_level(
-    inside: NDArray[np.bool_],
-    raw: NDArray[np.bool_],
+    inside: Bools,
+    raw: Bools,
     off: NDArray[np.float32] | None,
     factors: Sequence[int],
 ) -> NDArray[np.float32]:
@@ -90,7 +91,7 @@ def smooth_level(
     return np.clip(level, -FARTHEST_LEVEL, FARTHEST_LEVEL, out=level).reshape(inside.shape)
 
 
-def raw_level(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
+def raw_level(inside: Bools) -> NDArray[np.float32]:
     """Distance to the nearest voxel centre on the other side less 0.5, voxels; negative inside,
     clipped where far.
     """
@@ -108,7 +109,7 @@ def _levels_of(square: NDArray[np.int8]) -> NDArray[np.float32]:
     return level
 
 
-def _near_squares(inside: NDArray[np.bool_]) -> NDArray[np.uint8]:
+def _near_squares(inside: Bools) -> NDArray[np.uint8]:
     """Squares of distances to the nearest voxel centre outside; 0 outside, clipped where it is far.
 
     The least sum of squared steps, axis by axis (Felzenszwalb and Huttenlocher 2012). As only short
@@ -259,7 +260,7 @@ def _blend_planes(smooth: NDArray, broad: NDArray, reach: NDArray) -> None:
 
 def _keep_volume(
     level: NDArray[np.float32],
-    raw: NDArray[np.bool_],
+    raw: Bools,
     sigma: float,
     square: NDArray[np.int8],
     off: NDArray[np.float32],

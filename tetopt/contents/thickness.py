@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from tetopt.contents.memberships import Memberships
 from tetopt.geometry.vectors import cross, dot, minus, row, scale_vector
+from tetopt.system.arrays import Bools, Floats, Ints
 from tetopt.system.budget import check_memory
 from tetopt.system.kernel_cache import njit
 from tetopt.system.slabs import over_slabs
@@ -49,7 +50,7 @@ class _Labels(NamedTuple):
     # (s_0, s_1, s_2) row of the label; -1 beyond the region; small, to fit into caches
     partition: NDArray[np.int16]
     levels: NDArray[np.float32]  # (C, s_0, s_1, s_2)
-    channel: NDArray[np.int64]  # (K,)
+    channel: Ints  # (K,)
     # (D, s_0, s_1, s_2) place where facets cross each step up, 0 to 254, times 256, plus the cosine
     # of the angle, 0 to 255;
     crossing: NDArray[np.uint16]  # empty if there are levels
@@ -57,9 +58,9 @@ class _Labels(NamedTuple):
 
 def local_thickness(
     members: Memberships,
-    spacing: NDArray[np.float64],
+    spacing: Floats,
     most: float,
-    inside: NDArray[np.bool_] | None = None,
+    inside: Bools | None = None,
 ) -> NDArray[np.float32]:
     """The local thickness of each voxel's label.
 
@@ -94,9 +95,9 @@ def local_thickness(
 
 
 def thickness_between(
-    corners: NDArray[np.float64],
+    corners: Floats,
     partition: NDArray[np.integer],
-    spacing: NDArray[np.float64],
+    spacing: Floats,
     most: float,
 ) -> NDArray[np.float32]:
     """Local thickness of labels whose surfaces are facets, such as those of a mesh.
@@ -136,9 +137,7 @@ def thickness_between(
     return _thickness(partition, no_levels, np.zeros(1, dtype=np.int64), corners, spacing, most)
 
 
-def _check_room(
-    shape: tuple[int, ...], n_bytes: float, spacing: NDArray[np.float64], beyond: float
-) -> None:
+def _check_room(shape: tuple[int, ...], n_bytes: float, spacing: Floats, beyond: float) -> None:
     """Check the memory for a grid, with `n_bytes` per direction in the slabs in work and
     `beyond` them, mm.
     """
@@ -151,9 +150,9 @@ def _check_room(
 def _thickness(
     partition: NDArray[np.integer],
     levels: NDArray[np.float32],
-    channel: NDArray[np.int64],
-    corners: NDArray[np.float64] | None,
-    spacing: NDArray[np.float64],
+    channel: Ints,
+    corners: Floats | None,
+    spacing: Floats,
     most: float,
 ) -> NDArray[np.float32]:
     """`local_thickness` of labels by row (-1 beyond the region), between levels or facets'
@@ -217,8 +216,8 @@ def _over_slabs(
 
 
 def _rays(
-    spacing: NDArray[np.float64],
-) -> tuple[tuple[NDArray[np.int64], NDArray[np.float64]], NDArray[np.float64]]:
+    spacing: Floats,
+) -> tuple[tuple[Ints, Floats], Floats]:
     """Steps (D, 3) along axes and diagonals, one of each opposite pair, their lengths, and a
     voxel's edges.
     """

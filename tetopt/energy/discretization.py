@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.contents.content import Content
 from tetopt.energy.sampling import (
@@ -15,9 +14,10 @@ from tetopt.energy.sampling import (
 )
 from tetopt.image import Image
 from tetopt.mesh import Mesh
+from tetopt.system.arrays import Floats
 
 
-def cell_E_D(image: Image, mesh: Mesh) -> NDArray[np.float64]:
+def cell_E_D(image: Image, mesh: Mesh) -> Floats:
     """Each cell's contribution to E_D, (M,) float64, intensity^2 mm^n.
 
     E_D = sum_j integral over cell j of (h - hbar_j)^2, with h constant on a voxel, each voxel
@@ -104,7 +104,7 @@ def _columns(content: Content) -> list[int]:
     return [1, *range(3, 2 + content.n_channels)]
 
 
-def _channel_sums(content: Content, mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _channel_sums(content: Content, mesh: Mesh) -> tuple[Floats, Floats]:
     """Return the sums over each cell (M, D), see `moment_sums`, and its sum of squares about its
     means (M,).
     """

@@ -12,16 +12,15 @@ which needs no origin and cannot cancel. E_G scales as s^(n+2) with the mesh's s
 
 from __future__ import annotations
 
-import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.geometry.simplex import Cells, Points, squared_edges, volumes
 from tetopt.geometry.vectors import cross, difference, dot
-from tetopt.system.arrays import simplex_arrays
+from tetopt.system.arrays import Floats, simplex_arrays
 from tetopt.system.kernel_cache import njit
 
 
-def cell_E_G(points: Points, cells: Cells) -> NDArray[np.float64]:
+def cell_E_G(points: Points, cells: Cells) -> Floats:
     """Each cell's contribution to E_G, (M,) float64, mm^(n+2), for points (N, n) in mm and cells
     (M, n+1).
     """

@@ -39,6 +39,7 @@ from tetopt.geometry.topology import Facets, facets
 from tetopt.geometry.vectors import cross, difference, dot, row
 from tetopt.image import Image
 from tetopt.mesh import Mesh
+from tetopt.system.arrays import Floats, Ints
 from tetopt.system.budget import check_memory
 from tetopt.system.kernel_cache import njit
 from tetopt.system.kernels import (
@@ -89,9 +90,9 @@ class CellMoments(NamedTuple):
     True
     """
 
-    n_voxels: NDArray[np.int64]
-    mean: NDArray[np.float64]
-    variance: NDArray[np.float64]
+    n_voxels: Ints
+    mean: Floats
+    variance: Floats
 
 
 def cell_moments(image: Image, mesh: Mesh) -> CellMoments:
@@ -132,9 +133,7 @@ def cell_moments(image: Image, mesh: Mesh) -> CellMoments:
     return _moments(image, mesh, _sample_cells(image, mesh))
 
 
-def cell_moments_and_ranges(
-    image: Image, mesh: Mesh
-) -> tuple[CellMoments, tuple[NDArray[np.float64], NDArray[np.float64]]]:
+def cell_moments_and_ranges(image: Image, mesh: Mesh) -> tuple[CellMoments, tuple[Floats, Floats]]:
     """`cell_moments`, and the least and greatest intensity in each cell, (M,) each; in a cell
     without voxel centre the nearest voxel's.
     """
@@ -146,7 +145,7 @@ class _Sampled(NamedTuple):
     """A mesh on the grid of an image."""
 
     grid: SamplingGrid
-    ticks: NDArray[np.int64]  # (N, 3)
+    ticks: Ints  # (N, 3)
     sides: Facets
 
 
@@ -184,7 +183,7 @@ def _moments(image: Image, mesh: Mesh, sampled: _Sampled) -> CellMoments:
     return CellMoments(n_voxels, mean, variance)
 
 
-def cell_of_voxel(image: Image, mesh: Mesh) -> NDArray[np.int64]:
+def cell_of_voxel(image: Image, mesh: Mesh) -> Ints:
     """Number of the cell that contains each voxel centre.
 
     Parameters
@@ -250,11 +249,11 @@ class _Visited(NamedTuple):
     """Results of visiting each cell's voxels."""
 
     # (s_0, s_1, s_2) the cell of each voxel, the first of several; -1 for none
-    owner: NDArray[np.int64]
-    low: NDArray[np.float64]  # (M,) least intensity of each cell's voxels, inf without any
-    high: NDArray[np.float64]  # (M,) greatest intensity, -inf without any
+    owner: Ints
+    low: Floats  # (M,) least intensity of each cell's voxels, inf without any
+    high: Floats  # (M,) greatest intensity, -inf without any
     # (6,) number of voxels in several cells, the index of one, and two of its cells
-    shared: NDArray[np.int64]
+    shared: Ints
 
 
 def _visit_voxels(mesh: Mesh, sampled: _Sampled, h: NDArray[np.floating] | None = None) -> _Visited:
@@ -280,7 +279,7 @@ def _visit_voxels(mesh: Mesh, sampled: _Sampled, h: NDArray[np.floating] | None 
     bottom, top = along.min(axis=1), along.max(axis=1)
     owner = np.empty(grid.shape, dtype=np.int64)
 
-    def fill(first: int, stop: int) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
+    def fill(first: int, stop: int) -> tuple[Floats, Floats, int]:
         """Find the owners in some planes, as in a volume of these alone."""
         is_near = (top >= first << grid.bits) & (bottom <= stop << grid.bits)
         steps, volume = _volume_of(
@@ -312,9 +311,7 @@ def _visit_voxels(mesh: Mesh, sampled: _Sampled, h: NDArray[np.floating] | None 
     return _Visited(owner, low, high, shared)
 
 
-def _volume_of(
-    owner: NDArray[np.int64], h: NDArray[np.floating] | None
-) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+def _volume_of(owner: Ints, h: NDArray[np.floating] | None) -> tuple[Ints, NDArray[np.float32]]:
     """Steps of 0 along the rows of a volume, whose shape alone matters as prefix sums, and its
     intensities or 0.
     """
@@ -322,9 +319,7 @@ def _volume_of(
     return steps, np.zeros(owner.shape, dtype=np.float32) if h is None else h
 
 
-def _ranges(
-    image: Image, mesh: Mesh, sampled: _Sampled
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _ranges(image: Image, mesh: Mesh, sampled: _Sampled) -> tuple[Floats, Floats]:
     _, low, high, _ = _visit_voxels(mesh, sampled, image.data)
     is_empty = low > high
     low[is_empty] = high[is_empty] = nearest_values(
@@ -333,9 +328,7 @@ def _ranges(
     return low, high
 
 
-def ranges_of(
-    owner: NDArray[np.int64], h: NDArray[np.floating], n_cells: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def ranges_of(owner: Ints, h: NDArray[np.floating], n_cells: int) -> tuple[Floats, Floats]:
     """Least and greatest of the values (K,) that each cell owns, (M,) float64; inf and -inf if
     it owns none.
     """
@@ -350,14 +343,14 @@ def ranges_of(
     return low, high
 
 
-def nearest_values(image: Image, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def nearest_values(image: Image, points: Floats) -> Floats:
     """Value of the voxel nearest to each world point, (K,) float64; points outside get the
     border's value.
     """
     return image.data[tuple(nearest_voxels(image, points).T)].astype(np.float64)
 
 
-def nearest_voxels(image: Image, points: NDArray[np.float64]) -> NDArray[np.int64]:
+def nearest_voxels(image: Image, points: Floats) -> Ints:
     """Index of the voxel nearest to each world point, (K, n) int64; points outside get the
     border's voxel.
     """
@@ -380,7 +373,7 @@ class SamplingGrid(NamedTuple):
         return self.prefix.shape[0], self.prefix.shape[1], self.prefix.shape[2] - 1
 
 
-def sampling_grid(image: Image, points: NDArray[np.float64]) -> SamplingGrid:
+def sampling_grid(image: Image, points: Floats) -> SamplingGrid:
     """The image and the fixed-point grid for nodes near `points`, (N, n) world mm.
 
     Differences of coordinates stay below 2**29 units, so that their products, areas and
@@ -418,7 +411,7 @@ def sampling_grid(image: Image, points: NDArray[np.float64]) -> SamplingGrid:
     return SamplingGrid(prefix, bits, float(shift))
 
 
-def grid_bits(image: Image, points: NDArray[np.float64]) -> int:
+def grid_bits(image: Image, points: Floats) -> int:
     """The bits of the fixed-point grid for nodes near points, (N, n) world mm; InputError as for
     `sampling_grid`.
     """
@@ -437,7 +430,7 @@ def grid_bits(image: Image, points: NDArray[np.float64]) -> int:
     return bits
 
 
-def channel_grid(content: Content, points: NDArray[np.float64]) -> SamplingGrid:
+def channel_grid(content: Content, points: Floats) -> SamplingGrid:
     """`sampling_grid` of all channels of a content: sums of the first, of all channels' squares,
     and of the others.
 
@@ -494,7 +487,7 @@ def channel_grid(content: Content, points: NDArray[np.float64]) -> SamplingGrid:
     return SamplingGrid(prefix, bits, shift, n_channels)
 
 
-def _squares(values: Sequence[NDArray[np.int32]]) -> NDArray[np.float64]:
+def _squares(values: Sequence[NDArray[np.int32]]) -> Floats:
     """Squares of channels, summed over the channels."""
     return np.asarray(sum(part.astype(np.float64) ** 2 for part in values))
 
@@ -510,14 +503,14 @@ def _check_grid(shape: Sequence[int], n_sums: int) -> None:
     )
 
 
-def to_ticks(index: NDArray[np.float64], grid: SamplingGrid) -> NDArray[np.int64]:
+def to_ticks(index: Floats, grid: SamplingGrid) -> Ints:
     """Fixed-point coordinates, (N, 3) int64, of index coordinates (N, n); 2-D gets a leading 0."""
     ticks = np.zeros((len(index), 3), dtype=np.int64)
     ticks[:, 3 - index.shape[1] :] = np.rint(index * 2.0**grid.bits).astype(np.int64)
     return ticks
 
 
-def from_ticks(ticks: NDArray[np.int64], grid: SamplingGrid, n: int) -> NDArray[np.float64]:
+def from_ticks(ticks: Ints, grid: SamplingGrid, n: int) -> Floats:
     """Index coordinates, (N, n) float64, of fixed-point ones (N, 3); exact."""
     return ticks[:, 3 - n :].astype(np.float64) * 2.0**-grid.bits
 
@@ -537,7 +530,7 @@ def few_threads(tasks: int) -> Iterator[None]:
         numba.set_num_threads(threads)
 
 
-def check_orientations(image: Image, ticks: NDArray[np.int64], cells: NDArray[np.int64]) -> None:
+def check_orientations(image: Image, ticks: Ints, cells: Ints) -> None:
     """Raise InputError unless every cell, positive in the world, is positive on the fixed-point
     grid, too.
     """
@@ -551,17 +544,17 @@ def check_orientations(image: Image, ticks: NDArray[np.int64], cells: NDArray[np
         )
 
 
-def orientations(ticks: NDArray[np.int64], cells: NDArray[np.int64]) -> NDArray[np.int64]:
+def orientations(ticks: Ints, cells: Ints) -> Ints:
     """Sign of each cell's volume in index space, (M,) int64 in {-1, 0, 1}; exact."""
     return _orientations(ticks, np.ascontiguousarray(cells, dtype=np.int64))
 
 
 def moment_sums(
     grid: SamplingGrid,
-    ticks: NDArray[np.int64],
-    cells: NDArray[np.int64],
+    ticks: Ints,
+    cells: Ints,
     sides: Facets | None = None,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Voxel count, sum of (h - shift) and of its square over each cell, (M, 3) float64; with more
     channels, (M, D).
 
@@ -580,7 +573,7 @@ def moment_sums(
     return sums
 
 
-def _hand(ticks: NDArray[np.int64], cells: NDArray[np.int64]) -> int:
+def _hand(ticks: Ints, cells: Ints) -> int:
     """Sign of the first cell's volume in index space, which all cells of a valid mesh share."""
     return int(_orientations(ticks, np.ascontiguousarray(cells[:1], dtype=np.int64))[0])
 

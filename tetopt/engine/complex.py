@@ -29,6 +29,7 @@ from tetopt.geometry.vectors import (
     scale_vector,
     times,
 )
+from tetopt.system.arrays import Bools, Floats, Ints
 from tetopt.system.kernels import (
     Bools2,
     Floats1,
@@ -126,9 +127,9 @@ class State(NamedTuple):
 
 
 def build(
-    cells: NDArray[np.int64],
-    ticks: NDArray[np.int64],
-    is_frozen: NDArray[np.bool_],
+    cells: Ints,
+    ticks: Ints,
+    is_frozen: Bools,
     objective: Objective,
     sides: Sides,
 ) -> State:
@@ -189,7 +190,7 @@ def grow_state(state: State, least: int = 64) -> State:
     return state._replace(complex=mesh._replace(**wide))
 
 
-def without_cells(state: State, is_gone: NDArray[np.bool_]) -> State:
+def without_cells(state: State, is_gone: Bools) -> State:
     """The state without some cells, (M,); nodes stay, and those on the new boundary count as on
     the mask's surface.
     """
@@ -614,7 +615,7 @@ def cell_energy(state: State, cell: int) -> float:
     return objective.geometry * state.complex.E_shape[cell] + objective.image * squares
 
 
-def cell_squares(state: State, n_means: int | None = None) -> NDArray[np.float64]:
+def cell_squares(state: State, n_means: int | None = None) -> Floats:
     """Each cell's sum of squares around its values, (n_cells,), or around means if `n_means` is
     all channels.
     """

@@ -27,6 +27,7 @@ from tetopt.geometry.simplex import facet_nodes
 from tetopt.geometry.topology import facets
 from tetopt.image import Image
 from tetopt.mesh import Mesh
+from tetopt.system.arrays import Bools, Floats, Ints
 
 LEAST_JACOBIAN = 0.2  # least ratio of a curved cell's Jacobian determinant to the straight cell's
 # of an edge's length: a level farther from its middle belongs to another part of the surface
@@ -77,13 +78,11 @@ class _Surfaces(NamedTuple):
 
     fields: list[NDArray[np.float32]]  # levels
     # (K, Q, 2) pairs of levels to be equal; a second -1 stands for 0; -1, -1 for no pair
-    pairs: NDArray[np.int64]
-    edges: NDArray[np.int64]  # (K,) whose
+    pairs: Ints
+    edges: Ints  # (K,) whose
 
 
-def curve_mesh(
-    mesh: Mesh, content: Content, labels: NDArray[np.int64] | None
-) -> tuple[Mesh, Curving | None]:
+def curve_mesh(mesh: Mesh, content: Content, labels: Ints | None) -> tuple[Mesh, Curving | None]:
     """Add midpoints to the mesh; those of edges on interfaces and on the mask's surface lie on the
     smooth levels.
 
@@ -138,11 +137,11 @@ def curve_mesh(
 
 
 def _surfaces(
-    cells: NDArray[np.int64],
-    number: NDArray[np.int64],
-    index: NDArray[np.float64],
+    cells: Ints,
+    number: Ints,
+    index: Floats,
     content: Content,
-    labels: NDArray[np.int64] | None,
+    labels: Ints | None,
 ) -> _Surfaces:
     """Levels on which the edges of cells, numbered (M, 3 or 6), lie, for labels (M,) and nodes
     at `index`.
@@ -175,7 +174,7 @@ def _surfaces(
     return _Surfaces(fields, pairs[chosen], chosen)
 
 
-def _ways(image: Image) -> NDArray[np.float64]:
+def _ways(image: Image) -> Floats:
     """Maps (2^n, n, n) from the slope of a level, by index, to the shortest way up, for each set
     of fixed axes.
     """
@@ -188,7 +187,7 @@ def _ways(image: Image) -> NDArray[np.float64]:
     return ways
 
 
-def _values(surfaces: _Surfaces, at: NDArray[np.float64]) -> NDArray[np.float64]:
+def _values(surfaces: _Surfaces, at: Floats) -> Floats:
     """Difference of the levels of each pair at places (K, n), (K, Q), voxels; 0 for no pair."""
     values = np.zeros(surfaces.pairs.shape[:2])
     for number, field in enumerate(surfaces.fields):
@@ -198,9 +197,7 @@ def _values(surfaces: _Surfaces, at: NDArray[np.float64]) -> NDArray[np.float64]
     return values
 
 
-def _bring_places(
-    surfaces: _Surfaces, start: NDArray[np.float64], ways: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _bring_places(surfaces: _Surfaces, start: Floats, ways: Floats) -> tuple[Floats, Bools]:
     """Places (K, n) moved from `start` to where their pairs of levels are equal, and a mask of
     those that arrive.
     """
@@ -235,11 +232,11 @@ def _bring_places(
 
 def _unfold_midpoints(
     mesh: Mesh,
-    edges: NDArray[np.int64],
-    number: NDArray[np.int64],
-    ways: NDArray[np.float64],
-    part: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], float]:
+    edges: Ints,
+    number: Ints,
+    ways: Floats,
+    part: Floats,
+) -> tuple[Floats, float]:
     """Midpoints (E, n) moved a fraction of each way, and the least bound of a cell's Jacobian
     determinant.
 

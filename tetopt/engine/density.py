@@ -73,6 +73,7 @@ from tetopt.engine.smooth import (
 from tetopt.geometry.topology import compact
 from tetopt.geometry.vectors import dot, minus, put_row, row
 from tetopt.start.sizes import LONG_EDGE
+from tetopt.system.arrays import Bools, Floats, Ints
 from tetopt.system.kernels import (
     Bools1,
     Floats1,
@@ -110,8 +111,8 @@ class Exchanged(NamedTuple):
     """Result of `exchange` and `mend`."""
 
     state: State
-    source: NDArray[np.int64]  # (N',) number of each node before; -1 for new ones
-    is_touched: NDArray[np.bool_]  # (N',) nodes with a cell that has changed
+    source: Ints  # (N',) number of each node before; -1 for new ones
+    is_touched: Bools  # (N',) nodes with a cell that has changed
     n_split: int
     n_collapsed: int
 
@@ -179,7 +180,7 @@ def exchange(state: State, n_nodes: int, most: int, limits: Limits) -> Exchanged
     return compact_state(state, is_dirty, n_before, n_split, n_collapsed)
 
 
-def too_long(state: State, target: NDArray[np.float64]) -> NDArray[np.bool_]:
+def too_long(state: State, target: Floats) -> Bools:
     """Nodes with an edge longer than sqrt 2 times its target, (N,)."""
     is_one = np.zeros(len(target), dtype=np.bool_)
     if np.isfinite(target).any():
@@ -206,13 +207,13 @@ def squared_ratio(state: State, a: int, b: int, target: NDArray) -> float:
     return squared_length(state, a, b) / (0.25 * (target[a] + target[b]) ** 2)
 
 
-def _best_first(moves: EdgeMoves) -> NDArray[np.int64]:
+def _best_first(moves: EdgeMoves) -> Ints:
     """The nodes that have a move, the largest gain first."""
     order = np.lexsort((np.arange(len(moves.gain)), -moves.gain))
     return order[moves.gain[order] > -np.inf]
 
 
-def _star_errors(state: State, n_nodes: int) -> NDArray[np.float64]:
+def _star_errors(state: State, n_nodes: int) -> Floats:
     """Sum of squares around the cells' means over the cells around each node, (N,)."""
     cells = state.complex.cells[: state.complex.n_cells[0]]
     squares = np.repeat(cell_squares(state), cells.shape[1])
@@ -240,7 +241,7 @@ def roomy(state: State, n_nodes: int, n_cells: int) -> State:
 
 def compact_state(
     state: State,
-    is_dirty: NDArray[np.bool_] | None = None,
+    is_dirty: Bools | None = None,
     n_before: int | None = None,
     n_split: int = 0,
     n_collapsed: int = 0,
@@ -452,7 +453,7 @@ def labels_of_edge(meeting: Ints1, state: State, stars: NodeStars, a: int, b: in
     return count
 
 
-def mend(state: State, bad: NDArray[np.int64], target: float) -> Exchanged:
+def mend(state: State, bad: Ints, target: float) -> Exchanged:
     """For each bad cell make the collapse or split of an edge that leaves the best worst angle, if
     it improves.
 
@@ -546,9 +547,7 @@ def _lift_by_split(
 # Splits.
 
 
-def best_splits(
-    state: State, stars: NodeStars, may_split: NDArray[np.bool_], limits: Limits
-) -> EdgeMoves:
+def best_splits(state: State, stars: NodeStars, may_split: Bools, limits: Limits) -> EdgeMoves:
     """The best allowed split of an edge of each node, above the angle limit and without too short
     edges.
 
@@ -799,7 +798,7 @@ def split_edge(state: State, stars: NodeStars, a: int, b: int, p: int, is_dirty:
 
 
 def best_collapses(
-    state: State, stars: NodeStars, groups: Blocks, may_collapse: NDArray[np.bool_], limits: Limits
+    state: State, stars: NodeStars, groups: Blocks, may_collapse: Bools, limits: Limits
 ) -> EdgeMoves:
     """The neighbour to which each allowed node is best joined, so that no flat cell remains."""
     n_nodes = len(may_collapse)

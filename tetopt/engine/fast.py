@@ -18,7 +18,6 @@ from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.contents.content import Content, plain
 from tetopt.contents.content import content as make_content
@@ -62,6 +61,7 @@ from tetopt.mesh import Mesh
 from tetopt.start.carve import carve_mesh
 from tetopt.start.lattice import lattice_mesh
 from tetopt.start.sizes import Sizes
+from tetopt.system.arrays import Bools, Floats, Ints
 from tetopt.system.kernels import link, roots
 
 # of the edge: distance that a node may be off its place at the surface between two labels
@@ -103,7 +103,7 @@ def optimize(
     max_seconds: float | None = None,
     callback: Callable[[IterationRecord], None] | None = None,
     stop: Callable[[], bool] | None = None,
-    keep: Callable[[Mesh, NDArray[np.int64] | None], None] | None = None,
+    keep: Callable[[Mesh, Ints | None], None] | None = None,
 ) -> MeshingResult:
     """Move and reconnect the nodes of a mesh to lower E.
 
@@ -242,7 +242,7 @@ def follow_course(
     is_over: Callable[[], bool],
     begin: float,
     callback: Callable[[IterationRecord], None] | None,
-    keep: Callable[[Mesh, NDArray[np.int64] | None], None] | None = None,
+    keep: Callable[[Mesh, Ints | None], None] | None = None,
 ) -> tuple[list[IterationRecord], str]:
     """Do the iterations of a course; return the records and "iterations", "converged", "risen"
     or "over".
@@ -407,7 +407,7 @@ class Run:
         self.dropped: Counter[int] = Counter()  # their volume by label, mm^n
 
     @property
-    def is_still(self) -> NDArray[np.bool_]:
+    def is_still(self) -> Bools:
         """Nodes that may not move along any axis, (N,)."""
         return np.asarray(self.state.complex.is_frozen[:, 3 - self.n : 3].all(axis=1))
 
@@ -457,13 +457,13 @@ class Run:
         self.hope[is_touched] = np.inf
         return n_flips
 
-    def _moved(self, since: NDArray[np.int64], fraction: float) -> NDArray[np.bool_]:
+    def _moved(self, since: Ints, fraction: float) -> Bools:
         """Nodes more than a fraction of an edge away from `since`, which is updated for them."""
         matrix = self.state.objective.matrix
         way = transform_vectors(
             (self.state.complex.ticks - since).astype(np.float64), matrix * 2.0**-self.grid.bits
         )
-        moved: NDArray[np.bool_] = (way**2).sum(axis=1) > (fraction * self.edge) ** 2
+        moved: Bools = (way**2).sum(axis=1) > (fraction * self.edge) ** 2
         since[moved] = self.state.complex.ticks[moved]
         return moved
 
@@ -641,13 +641,13 @@ class Run:
         """Largest number of flat cells that may be removed."""
         return max(FLAT_CELLS_FRACTION * self.n_cells, FLAT_CELLS)
 
-    def _take_out(self, is_gone: NDArray[np.bool_]) -> int:
+    def _take_out(self, is_gone: Bools) -> int:
         if is_gone.any():
             made = compact_state(without_cells(self.state, is_gone))
             self._renumber(made.state, made.source)
         return int(is_gone.sum())
 
-    def _overlapping(self, state: State) -> NDArray[np.bool_]:
+    def _overlapping(self, state: State) -> Bools:
         """Mask of the cells, (M,), with a voxel centre that a previous cell contains, too."""
         points = self.image.to_world(from_ticks(state.complex.ticks, self.grid, self.n))
         mesh = Mesh(points, state.complex.cells[: int(state.complex.n_cells[0])].copy())
@@ -657,7 +657,7 @@ class Run:
             remeasure(state)
         return np.asarray(state.complex.sums[: len(n_owned), 0] > n_owned)
 
-    def _renumber(self, state: State, source: NDArray[np.int64]) -> None:
+    def _renumber(self, state: State, source: Ints) -> None:
         """Adopt a state with other nodes; `source` is each node's previous number, -1 for new
         ones.
         """
@@ -667,7 +667,7 @@ class Run:
         self.hope = np.where(is_new[:, 0], np.inf, self.hope[source])
         self.groups, self.edge = blocks(state.complex.ticks), _edges(self.points(), self.cells)
 
-    def movement(self, before: NDArray[np.int64]) -> float:
+    def movement(self, before: Ints) -> float:
         """Relative movement of the nodes since `before` (N, 3), in ticks; see
         `relative_movement`.
         """
@@ -689,7 +689,7 @@ class Run:
             iteration, E, E_G, E_D, movement, is_changed, self.n_cells, n_voxels, seconds
         )
 
-    def labels(self) -> NDArray[np.int64] | None:
+    def labels(self) -> Ints | None:
         """The label of each cell, (M,); None without labels."""
         members = self.content.memberships
         if members is None or not self.has_labels:
@@ -697,11 +697,11 @@ class Run:
         return members.labels[self.state.complex.labels[: self.n_cells]]
 
     @property
-    def cells(self) -> NDArray[np.int64]:
+    def cells(self) -> Ints:
         """The current cells, (M, n+1); a view."""
         return self.state.complex.cells[: self.n_cells]
 
-    def points(self) -> NDArray[np.float64]:
+    def points(self) -> Floats:
         """The current nodes, (N, n) mm."""
         points = self.image.to_world(from_ticks(self.state.complex.ticks, self.grid, self.n))
         if self.kept:  # fixed nodes keep their exact positions, not rounded to ticks
@@ -714,7 +714,7 @@ class Run:
         return Mesh(self.points(), self.cells)
 
 
-def _edges(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.float64]:
+def _edges(points: Floats, cells: Ints) -> Floats:
     """Edge of the regular cell with the mean volume of the cells around each node, (N,) mm."""
     n, around = points.shape[1], cells.ravel()
     total = np.bincount(around, np.repeat(volumes(points, cells), n + 1), len(points))

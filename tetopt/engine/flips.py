@@ -42,6 +42,7 @@ from tetopt.engine.complex import (
     worst_cosine,
 )
 from tetopt.geometry.vectors import cross, difference, dot, row
+from tetopt.system.arrays import Bools
 from tetopt.system.kernels import (
     Bools1,
     Bools2,
@@ -118,9 +119,9 @@ def cavity(n_free: int, D: int) -> Cavity:
 
 def flip(
     state: State,
-    is_dirty: NDArray[np.bool_] | None = None,
+    is_dirty: Bools | None = None,
     passes: int = 50,
-    is_touched: NDArray[np.bool_] | None = None,
+    is_touched: Bools | None = None,
 ) -> tuple[State, int]:
     """Make every move that lowers E until none remains, or for some passes; return the state and
     the number of moves.

@@ -29,6 +29,7 @@ from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import facets
 from tetopt.image import Image
 from tetopt.mesh import Mesh
+from tetopt.system.arrays import Floats, Ints
 from tetopt.system.kernels import entry, unit
 from tetopt.system.slabs import count_pairs, over_slabs
 
@@ -101,7 +102,7 @@ def cell_contents(image: Image, members: Memberships, mesh: Mesh, voxels: LabelV
     n_owned, is_sampled = centres.sum(axis=1), centres.sum(axis=1) < FEWEST_CENTRES
     sampled, index = np.flatnonzero(is_sampled), image.to_index(mesh.points)
 
-    def sample(first: int, stop: int) -> NDArray[np.int64]:
+    def sample(first: int, stop: int) -> Ints:
         return labels_at(members, index, mesh.cells[sampled[first:stop]], inner)
 
     most = 1 + len(sampled) // SAMPLED_AT_ONCE
@@ -135,7 +136,7 @@ def _diagonal(values: NDArray) -> scipy.sparse.csr_array:
     return scipy.sparse.diags_array(values.astype(np.float64), format="csr")
 
 
-def _samples(n: int, parts: int) -> NDArray[np.float64]:
+def _samples(n: int, parts: int) -> Floats:
     """Barycentric places (S, n+1): the points that divide a simplex's edges into parts, moved
     inside.
     """
@@ -149,7 +150,7 @@ def _samples(n: int, parts: int) -> NDArray[np.float64]:
 PART_CENTRES = {2: _samples(2, 4), 3: _samples(3, 3)}
 
 
-def crowded_nodes(cells: NDArray[np.int64], of_cell: NDArray[np.int64]) -> int:
+def crowded_nodes(cells: Ints, of_cell: Ints) -> int:
     """Nodes with more labels than they can be moved onto (`MOST_MEETING`); cells (M, n+1), their
     labels (M,).
     """

@@ -34,6 +34,7 @@ from tetopt.contents.labels import COMPONENT_VOXELS
 from tetopt.engine.complex import has_node
 from tetopt.geometry.simplex import facet_areas, regular_edge, volumes
 from tetopt.geometry.topology import connected_sets, stars
+from tetopt.system.arrays import Bools, Floats, Ints
 from tetopt.system.kernels import (
     Bools1,
     Bools2,
@@ -129,11 +130,11 @@ class Contacts(NamedTuple):
 class LabelVoxels(NamedTuple):
     """Information on the voxels of labels for any mesh; made by `label_voxels`."""
 
-    components: list[NDArray[np.int64]]  # voxels in each component of each label, descending
+    components: list[Ints]  # voxels in each component of each label, descending
     pieces: Pieces
-    is_apart: NDArray[np.bool_]  # (K, K) as in `Contacts`
+    is_apart: Bools  # (K, K) as in `Contacts`
     # flat indices of voxels next to one of a label that is apart from theirs
-    places: NDArray[np.int64]
+    places: Ints
 
 
 class Contents(NamedTuple):
@@ -143,7 +144,7 @@ class Contents(NamedTuple):
     counts: scipy.sparse.csr_array
     contacts: Contacts | None = None
     pieces: scipy.sparse.csr_array | None = None  # (P, M) voxels of each of `Pieces`
-    label_of_piece: NDArray[np.int64] = np.empty(0, dtype=np.int64)  # (P,)
+    label_of_piece: Ints = np.empty(0, dtype=np.int64)  # (P,)
 
 
 class Dual(NamedTuple):
@@ -171,20 +172,20 @@ class Targets(NamedTuple):
     near: Floats1  # of those near their surfaces
     fit: Floats1  # below which cells are next to nothing of a label, and of a mean cell
 
-    def bounds(self, limits: Pass) -> NDArray[np.float64]:
+    def bounds(self, limits: Pass) -> Floats:
         """The least and largest volumes that a pass allows, (2, K)."""
         least = np.maximum(self.volume - limits.loss * self.near, self.fit)
         return np.stack([least, self.volume + limits.gain * self.near])
 
 
 def label_cells(
-    points: NDArray[np.float64],
-    cells: NDArray[np.int64],
-    across: NDArray[np.int64],
+    points: Floats,
+    cells: Ints,
+    across: Ints,
     contents: Contents,
     components: list[NDArray],
     keeps_volumes: bool = True,
-) -> NDArray[np.int64]:
+) -> Ints:
     """Label each cell of a mesh close to its voxels, with short, manifold interfaces and without
     fragments.
 
@@ -233,13 +234,13 @@ def label_cells(
 
 
 def mend_labels(
-    points: NDArray[np.float64],
-    cells: NDArray[np.int64],
-    across: NDArray[np.int64],
+    points: Floats,
+    cells: Ints,
+    across: Ints,
     contents: Contents,
-    labels: NDArray[np.int64],
-    aim: NDArray[np.float64],
-) -> NDArray[np.int64]:
+    labels: Ints,
+    aim: Floats,
+) -> Ints:
     """Labels of cells, (M,), with the fewest changes that make interfaces of two labels manifold,
     at any cost.
 
@@ -256,8 +257,8 @@ def mend_labels(
 
 def mend(
     dual: Dual,
-    labels: NDArray[np.int64],
-    is_kept: NDArray[np.bool_],
+    labels: Ints,
+    is_kept: Bools,
     targets: Targets,
     limits: Pass,
     marks: _Marks | None = None,
@@ -298,14 +299,14 @@ def _targets(dual: Dual, aim: NDArray) -> Targets:
     return Targets(np.asarray(aim, dtype=np.float64), aim - inner, fit)
 
 
-def _label_volumes(dual: Dual, labels: NDArray[np.int64]) -> NDArray:
+def _label_volumes(dual: Dual, labels: Ints) -> NDArray:
     """Volume of each label's cells, (K,) mm^n."""
     return np.bincount(labels, dual.size, len(dual.bias))
 
 
 def _settle_majority(
     dual: Dual, targets: Targets, voxels: scipy.sparse.csr_array, keeps_volumes: bool
-) -> NDArray[np.int64]:
+) -> Ints:
     """Labels of most of each cell's voxels, (M,), settled; `voxels` (M, K) in mm^n.
 
     If volumes are kept, labels get the bias that gives them nearly their volumes: in proportion to
@@ -337,7 +338,7 @@ def _settle_majority(
 
 def _mend_cheaply(
     dual: Dual,
-    labels: NDArray[np.int64],
+    labels: Ints,
     targets: Targets,
     voxel: float,
     components: list[NDArray],
@@ -361,9 +362,7 @@ def _mend_cheaply(
             break
 
 
-def unfit_labels(
-    labels: NDArray[np.int64], size: NDArray[np.float64], aim: NDArray[np.float64]
-) -> NDArray[np.bool_]:
+def unfit_labels(labels: Ints, size: Floats, aim: Floats) -> Bools:
     """Mask of labels, (K,), whose cells are next to nothing of their volume `aim`, (K,) mm^n,
     and of a mean cell.
     """
@@ -371,20 +370,20 @@ def unfit_labels(
     return (volume > 0.0) & (volume < _least_fit(size, aim))
 
 
-def _least_fit(size: NDArray[np.float64], aim: NDArray[np.float64]) -> NDArray[np.float64]:
+def _least_fit(size: Floats, aim: Floats) -> Floats:
     return UNFIT_FRACTION * np.minimum(aim, size.mean())
 
 
-def _give_away_unfit(dual: Dual, labels: NDArray[np.int64], aim: NDArray[np.float64]) -> None:
+def _give_away_unfit(dual: Dual, labels: Ints, aim: Floats) -> None:
     _give_away(dual, labels, unfit_labels(labels, dual.size, aim)[labels])
 
 
 def _give_cells(
     dual: Dual,
-    labels: NDArray[np.int64],
-    is_kept: NDArray[np.bool_],
+    labels: Ints,
+    is_kept: Bools,
     rows: scipy.sparse.csr_array,
-    label_of_row: NDArray[np.int64],
+    label_of_row: Ints,
     least_share: float,
 ) -> None:
     """Give each of some parts of labels without a cell of its label the cell that it fits best, if
@@ -413,7 +412,7 @@ def _give_cells(
         labels[best], is_kept[best] = label, True
 
 
-def _is_manifold(dual: Dual, labels: NDArray[np.int64], cell: int, label: int) -> bool:
+def _is_manifold(dual: Dual, labels: Ints, cell: int, label: int) -> bool:
     """True if interfaces of two labels are manifold at a cell's nodes and edges once it has this
     label.
     """
@@ -424,7 +423,7 @@ def _is_manifold(dual: Dual, labels: NDArray[np.int64], cell: int, label: int) -
 
 def _components(
     partition: NDArray[np.integer], n_labels: int, least: int
-) -> tuple[list[NDArray[np.int64]], Pieces]:
+) -> tuple[list[Ints], Pieces]:
     """Number of voxels in each face-connected component of each label, descending; and pieces of
     `least` or more.
     """
@@ -453,7 +452,7 @@ def _components(
 
 
 def label_voxels(
-    partition: NDArray[np.integer], spacing: NDArray[np.float64], n_labels: int, parts: int = 1
+    partition: NDArray[np.integer], spacing: Floats, n_labels: int, parts: int = 1
 ) -> LabelVoxels:
     """Components of labels in the voxels of a grid, pairs that share hardly any area, and places
     where these touch.
@@ -463,7 +462,7 @@ def label_voxels(
     """
     n_rows, n_voxels = n_labels + 1, partition.size  # the last row: outside
 
-    def count(first: int, stop: int) -> NDArray[np.int64]:
+    def count(first: int, stop: int) -> Ints:
         counts = np.empty((partition.ndim, n_rows * n_rows), dtype=np.int64)
         for d in range(partition.ndim):
             rows = np.moveaxis(partition[first : stop + (d == 0)], d, 0)
@@ -499,9 +498,7 @@ def label_voxels(
     return LabelVoxels(sizes, pieces, is_apart[:-1, :-1].copy(), np.flatnonzero(is_place))
 
 
-def components_of(
-    across: NDArray[np.int64], labels: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def components_of(across: Ints, labels: Ints) -> tuple[Ints, Ints]:
     """The component of each cell, (M,), linked by facets between cells of one label; and each
     component's label.
     """
@@ -515,9 +512,9 @@ def components_of(
 
 
 def _dual(
-    points: NDArray[np.float64],
-    cells: NDArray[np.int64],
-    across: NDArray[np.int64],
+    points: Floats,
+    cells: Ints,
+    across: Ints,
     contents: Contents,
 ) -> Dual:
     counts = contents.counts
@@ -554,7 +551,7 @@ def _no_contacts(n_cells: int, n_labels: int) -> Contacts:
     return Contacts(np.zeros((n_labels, n_labels), dtype=bool), np.zeros(n_cells, dtype=bool))
 
 
-def _majority(dual: Dual) -> NDArray[np.int64]:
+def _majority(dual: Dual) -> Ints:
     """The most frequent label in each cell, the first of equally frequent ones."""
     labels = np.empty(len(dual.cells), dtype=np.int64)
     _fill_majority(labels, dual)
@@ -571,9 +568,7 @@ def _fill_majority(labels: Ints1, dual: Dual) -> None:
                 labels[cell], most = dual.row[p], worth
 
 
-def _settle(
-    dual: Dual, labels: NDArray[np.int64], least: NDArray[np.float64], is_careful: bool
-) -> int:
+def _settle(dual: Dual, labels: Ints, least: Floats, is_careful: bool) -> int:
     """Let cells take a neighbour's label while the energy falls, the best moves first; return their
     number.
 
@@ -775,9 +770,9 @@ def _is_opposite(cells: NDArray, other: int, k: int, cell: int, is_one: NDArray)
 
 def _without_fragments(
     dual: Dual,
-    labels: NDArray[np.int64],
-    is_bridge: NDArray[np.bool_],
-    aim: NDArray[np.float64],
+    labels: Ints,
+    is_bridge: Bools,
+    aim: Floats,
     voxel: float,
     components: list[NDArray],
 ) -> int:
@@ -960,9 +955,7 @@ def _work(dual: Dual) -> _Work:
     )
 
 
-def _nonmanifold(
-    dual: Dual, labels: NDArray[np.int64], is_near: NDArray[np.bool_] | None = None
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def _nonmanifold(dual: Dual, labels: Ints, is_near: Bools | None = None) -> tuple[Ints, Bools]:
     """Edges (a, b) and nodes (a, -1) where a label's interface is not manifold, (F, 2), and a mask
     of two-label ones.
 
@@ -971,7 +964,7 @@ def _nonmanifold(
     is_near = np.ones(len(dual.scale), dtype=bool) if is_near is None else is_near
     is_around = _around(dual, is_near)
 
-    def find(first: int, stop: int) -> NDArray[np.int64]:
+    def find(first: int, stop: int) -> Ints:
         # The largest possible number; unwritten pages take no memory.
         most = stop - first + dual.cells.shape[1] * (dual.star_start[stop] - dual.star_start[first])
         faces = np.empty((most, 3), dtype=np.int64)

@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from tetopt.contents.content import Content
 from tetopt.contents.labels import colours_by_number
@@ -21,6 +21,7 @@ from tetopt.geometry.box import facets_on_sides
 from tetopt.image import Image, transform_vectors
 from tetopt.interop import notebook
 from tetopt.mesh import Mesh
+from tetopt.system.arrays import Bools, Floats, Ints
 
 # The defaults of all entry points, with their evidence (docs/measured/sizes.md,
 # docs/understand/k_d.md).
@@ -159,7 +160,7 @@ class MeshingResult(NamedTuple):
     nodes: int | None = None
     seconds_start: float = 0.0
     seconds_run: float = 0.0
-    labels: NDArray[np.int64] | None = None
+    labels: Ints | None = None
     violated: Mapping[str, str] = MappingProxyType({})
     fraction: float | None = None
     n_dropped: int = 0
@@ -256,12 +257,12 @@ def grace(begin: float, is_over: Callable[[], bool]) -> Callable[[], bool]:
 
 
 def frozen_axes(
-    ticks: NDArray[np.int64],
-    facets_out: NDArray[np.int64],
-    sides: NDArray[np.int64],
+    ticks: Ints,
+    facets_out: Ints,
+    sides: Ints,
     boundary: Boundary,
     has_surface: bool,
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Index axes along which each node must stay, (N, 4) bool; the leading axis of a 2-D image
     counts as free.
 
@@ -292,7 +293,7 @@ def check_common_options(k_D: float, iterations: int, boundary: str) -> None:
         raise InputError(f"boundary: expected slide or fixed, got {boundary!r}")
 
 
-def side_ticks(grid: SamplingGrid) -> NDArray[np.int64]:
+def side_ticks(grid: SamplingGrid) -> Ints:
     """`tetopt.geometry.box.box_sides` in ticks, (3, 2), which are whole numbers; a slice is one
     voxel thick.
     """
@@ -301,11 +302,11 @@ def side_ticks(grid: SamplingGrid) -> NDArray[np.int64]:
 
 
 def relative_movement(
-    before: NDArray[np.int64],
-    after: NDArray[np.int64],
+    before: Ints,
+    after: Ints,
     image: Image,
     grid: SamplingGrid,
-    matrix: NDArray[np.float64],
+    matrix: Floats,
 ) -> float:
     """|x^t - x^(t-1)| / |x^(t-1)| over all nodes, in mm, with x from the box's centre; Fig.
     1(c).

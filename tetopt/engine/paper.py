@@ -7,7 +7,6 @@ from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.contents.content import plain
 from tetopt.energy.discretization import combine_energies
@@ -41,6 +40,7 @@ from tetopt.image import Image
 from tetopt.interop.notebook import with_bar
 from tetopt.mesh import Mesh
 from tetopt.start.delaunay import delaunay
+from tetopt.system.arrays import Ints
 from tetopt.system.kernels import pack_record
 
 Retessellate = Literal["first", "accept", "never"]
@@ -185,7 +185,7 @@ def optimize_paper(
     return MeshingResult(Mesh(points, _cells(state)), history, ended, mesh)
 
 
-def _cells(state: State) -> NDArray[np.int64]:
+def _cells(state: State) -> Ints:
     """The cells of a state, (M, n+1)."""
     return state.complex.cells[: int(state.complex.n_cells[0])]
 

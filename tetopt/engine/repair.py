@@ -45,6 +45,7 @@ from tetopt.engine.flips import (
 from tetopt.engine.sliding import projection_at, slides
 from tetopt.engine.smooth import slide_node, star_energy, store, trial_of
 from tetopt.geometry.vectors import difference, dot, put_row, row, scale_vector, times
+from tetopt.system.arrays import Bools, Floats, Ints
 from tetopt.system.kernels import Bools1, Floats1, Floats2, Ints1, entry, helper, unit
 
 REPAIR_ROUNDS = 40  # at most; a round without changes ends them earlier
@@ -59,12 +60,12 @@ class Repaired(NamedTuple):
     """Result of `repair`."""
 
     state: State
-    source: NDArray[np.int64]  # (N',) number of each node before; -1 for new ones
+    source: Ints  # (N',) number of each node before; -1 for new ones
     n_below: int  # cells still below the minimum
     n_moves: int
 
 
-def cell_cosines(state: State) -> NDArray[np.float64]:
+def cell_cosines(state: State) -> Floats:
     """Minus the cosine of each cell's smallest dihedral angle."""
     cosines = np.empty(int(state.complex.n_cells[0]))
     _fill_cosines(cosines, state)
@@ -121,9 +122,7 @@ def repair(
     return Repaired(state, source, len(_worst_first(state, target)), n_moves)
 
 
-def _free_changed(
-    is_stuck: NDArray[np.bool_], before: NDArray[np.int64], after: NDArray[np.int64]
-) -> None:
+def _free_changed(is_stuck: Bools, before: Ints, after: Ints) -> None:
     """Clear the marks of the nodes of cells that differ."""
     both = min(len(before), len(after))
     is_other = (before[:both] != after[:both]).any(axis=1)
@@ -133,10 +132,10 @@ def _free_changed(
 
 def _displace_until(
     state: State,
-    bad: NDArray[np.int64],
+    bad: Ints,
     target: float,
     is_over: Callable[[], bool],
-    is_stuck: NDArray[np.bool_],
+    is_stuck: Bools,
 ) -> int:
     """`_displace` until `is_over` returns True, as tens of thousands of cells far smaller than
     voxels took minutes.
@@ -163,7 +162,7 @@ def n_cells_below(state: State, min_dihedral: float) -> int:
     return int((cell_cosines(state) < -np.cos(np.radians(min_dihedral))).sum())
 
 
-def _worst_first(state: State, target: float) -> NDArray[np.int64]:
+def _worst_first(state: State, target: float) -> Ints:
     cosines = cell_cosines(state)
     bad = np.flatnonzero(cosines < target)
     return bad[np.lexsort((bad, cosines[bad]))]

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from tetopt.contents.domain import ON_SURFACE_VOXELS
 from tetopt.engine.complex import NodeStars, State, facet_area, has_node, outward, place
 from tetopt.geometry.vectors import cross, dot, row, scale_vector
+from tetopt.system.arrays import Floats
 from tetopt.system.kernels import Floats1, Floats2, Singles3, entry, helper, unit
 
 # where several surfaces meet, a place whose levels are this close to 0 lies on all of them
@@ -340,7 +341,7 @@ def _put_in_box(state: State, node: int) -> None:
 # surface make up for it.
 
 
-def _facet_places(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _facet_places(n: int) -> tuple[Floats, Floats]:
     """Barycentric places (S, n) on a facet of n corners; weights (S, 2) of a mean over the facet
     and at its corners.
 
@@ -358,7 +359,7 @@ def _facet_places(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return places, np.repeat([[1.0 / 12.0, 0.0], [0.0, 1.0 / 3.0]], [12, 3], axis=0)
 
 
-def fill_offsets(state: State, most: NDArray[np.float64]) -> None:
+def fill_offsets(state: State, most: Floats) -> None:
     """Set the values of nodes' first constraints at which facets cut off as much of a round surface
     as they add.
 

@@ -54,6 +54,7 @@ from tetopt.engine.sliding import (
 )
 from tetopt.geometry.topology import greedy_colours
 from tetopt.geometry.vectors import cross, difference, dot, minus, put_row, row, scale_vector, times
+from tetopt.system.arrays import Bools, Floats, Ints
 from tetopt.system.kernels import (
     Bools1,
     Floats1,
@@ -98,7 +99,7 @@ class Blocks(NamedTuple):
     of_node: Ints1  # (N,) the group of each node
 
 
-def blocks(ticks: NDArray[np.int64]) -> Blocks:
+def blocks(ticks: Ints) -> Blocks:
     """Group nodes along a Z-order curve (Morton 1966), which gives equal groups on a graded
     mesh, too.
     """
@@ -120,9 +121,9 @@ def sweep(
     state: State,
     stars: NodeStars,
     groups: Blocks,
-    may_move: NDArray[np.bool_],
+    may_move: Bools,
     is_over: Callable[[], bool] = lambda: False,
-    gains: NDArray[np.float64] | None = None,
+    gains: Floats | None = None,
 ) -> bool:
     """Move the nodes in `may_move` (N,), each along the axes and on the surfaces that `is_frozen`
     allows.
@@ -142,7 +143,7 @@ def sweep(
     return True
 
 
-def colours_of(state: State, stars: NodeStars, groups: Blocks) -> list[NDArray[np.int64]]:
+def colours_of(state: State, stars: NodeStars, groups: Blocks) -> list[Ints]:
     """The groups of each colour; groups of one colour share no cell."""
     start, cells = _block_stars(groups.nodes, groups.start, stars.start, stars.cells)
     colours = greedy_colours(
@@ -575,14 +576,14 @@ class Search(NamedTuple):
     one the next.
     """
 
-    x: NDArray[np.float64]  # (4, 3) room for a cell's corners
-    normal: NDArray[np.float64]  # (7, 3) see `tetopt.engine.sliding.normals_at`
+    x: Floats  # (4, 3) room for a cell's corners
+    normal: Floats  # (7, 3) see `tetopt.engine.sliding.normals_at`
     is_sliding: bool  # True if the node stays on its surfaces
-    best: NDArray[np.float64]  # (1,) the least energy of the star
-    place: NDArray[np.int64]  # (1, 3) its place, ticks
-    slot: NDArray[np.int64]  # (1,)
-    shapes: NDArray[np.float64]  # (2, R) as in `Trial`
-    fluxes: NDArray[np.float64]  # (2, R, n+1, D)
+    best: Floats  # (1,) the least energy of the star
+    place: Ints  # (1, 3) its place, ticks
+    slot: Ints  # (1,)
+    shapes: Floats  # (2, R) as in `Trial`
+    fluxes: Floats  # (2, R, n+1, D)
 
 
 # Its steps and those of `star_energy` are inlined: compared with one long function, a sweep took 12

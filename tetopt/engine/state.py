@@ -14,6 +14,7 @@ from tetopt.geometry.check import check_unfolded
 from tetopt.geometry.topology import boundary_facets, facets
 from tetopt.image import Image
 from tetopt.mesh import Mesh
+from tetopt.system.arrays import Floats, Ints
 
 
 def state_of(
@@ -110,7 +111,7 @@ def content_energies(
     return E_G, squares if squares > state.objective.rounding else 0.0
 
 
-def matrix_of(image: Image) -> NDArray[np.float64]:
+def matrix_of(image: Image) -> Floats:
     """The map from index vectors to mm, (3, 3); a 2-D image gets a leading axis."""
     matrix = np.eye(3)
     matrix[3 - image.ndim :, 3 - image.ndim :] = image.affine[:-1, :-1]
@@ -119,8 +120,8 @@ def matrix_of(image: Image) -> NDArray[np.float64]:
 
 def sides_of(
     grid: SamplingGrid,
-    matrix: NDArray[np.float64],
-    own_sides: NDArray[np.int64],
+    matrix: Floats,
+    own_sides: Ints,
     is_fixed: bool,
     level: NDArray[np.float32] | None,
 ) -> Sides:
@@ -137,7 +138,7 @@ def sides_of(
     )
 
 
-def free_projections(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+def free_projections(matrix: Floats) -> Floats:
     """For each set of frozen axes (bit d: axis d), the (3, 3) map from a vector in mm to the index
     vector along the free axes that comes nearest to it: least squares in mm, so it is correct for
     oblique and sheared axes.
@@ -150,7 +151,7 @@ def free_projections(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def objective_of(
-    grid: SamplingGrid, matrix: NDArray[np.float64], power: float, is_graded: bool = False
+    grid: SamplingGrid, matrix: Floats, power: float, is_graded: bool = False
 ) -> Objective:
     """An objective of plain numbers, as the kernels require, with weights 1 and without an angle
     limit.

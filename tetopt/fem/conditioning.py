@@ -27,6 +27,7 @@ from tetopt.fem.elasticity import (
     multigrid,
     on_one_blas_thread,
 )
+from tetopt.system.arrays import Floats
 
 # up to which a full matrix is used, as the Lanczos solver needs more dofs than eigenvalues
 DENSE_DOFS = 32
@@ -154,7 +155,7 @@ def _by_lobpcg(K_ff: csr_array, preconditioner: LinearOperator) -> float:
         if residual <= 1e-4 * estimate:
             return estimate
 
-    def solve(load: NDArray[np.float64]) -> NDArray[np.float64]:
+    def solve(load: Floats) -> Floats:
         solution, failure = cg(K_ff, load.ravel(), rtol=1e-10, maxiter=3000, M=preconditioner)
         if failure:
             raise RuntimeError(
@@ -165,9 +166,7 @@ def _by_lobpcg(K_ff: csr_array, preconditioner: LinearOperator) -> float:
     return _by_inverse(K_ff, solve, tol=1e-8)  # slower, but converges if moduli differ widely
 
 
-def cg_iterations(
-    K_ff: csr_array, load: NDArray[np.float64], rtol: float = RESIDUAL_FRACTION
-) -> int:
+def cg_iterations(K_ff: csr_array, load: Floats, rtol: float = RESIDUAL_FRACTION) -> int:
     """Number of steps of diagonally preconditioned conjugate gradients that solve K_ff x = load
     from x = 0.
 
@@ -188,7 +187,7 @@ def cg_iterations(
     """
     steps = 0
 
-    def count(_: NDArray[np.float64]) -> None:
+    def count(_: Floats) -> None:
         nonlocal steps
         steps += 1
 
@@ -201,6 +200,6 @@ def cg_iterations(
     return steps
 
 
-def _start(K_ff: csr_array, n_vectors: int = 1) -> NDArray[np.float64]:
+def _start(K_ff: csr_array, n_vectors: int = 1) -> Floats:
     """Fixed start vectors, (F, n_vectors), with a part of every eigenvector."""
     return np.random.default_rng(0).standard_normal((K_ff.shape[0], n_vectors))

@@ -27,7 +27,7 @@ from functools import wraps
 from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.sparse import bsr_array, bsr_matrix, csr_array, diags_array, eye_array, kron
 from scipy.sparse.linalg import LinearOperator, cg, splu
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
@@ -51,6 +51,7 @@ from tetopt.geometry.simplex import determinants, volume_gradients, volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.model.mappings import check_young
+from tetopt.system.arrays import Bools, Floats, Ints
 from tetopt.system.budget import check_memory
 
 Method = Literal["auto", "direct", "amg"]
@@ -87,9 +88,9 @@ def on_one_blas_thread(function: Callable[Arguments, Result]) -> Callable[Argume
 class Outside(NamedTuple):
     """External forces and springs on the nodes."""
 
-    forces: NDArray[np.float64]  # (N, n) mN, world
+    forces: Floats  # (N, n) mN, world
     # (N,) mN/mm, from the node to the ground, the same in all directions
-    springs: NDArray[np.float64]
+    springs: Floats
 
 
 class System(NamedTuple):
@@ -99,14 +100,14 @@ class System(NamedTuple):
 
     # (N*n, N*n) of all dofs, including springs; dofs are components along the columns of `frame`
     K: csr_array
-    free: NDArray[np.int64]  # (F,) dofs that are not prescribed, ascending
+    free: Ints  # (F,) dofs that are not prescribed, ascending
     K_ff: csr_array  # (F, F) block of the free dofs: symmetric, positive definite
     # (F,) mN, f - K_fc u_c: the forces, plus those of the prescribed dofs on the free ones
-    load: NDArray[np.float64]
-    prescribed: NDArray[np.float64]  # (N*n,) mm, 0 at the free dofs
-    modes: NDArray[np.float64]  # (N*n, 3 or 6) rigid motions
+    load: Floats
+    prescribed: Floats  # (N*n,) mm, 0 at the free dofs
+    modes: Floats  # (N*n, 3 or 6) rigid motions
     # (n, n) a rotation; the identity if dofs are components along the world's axes
-    frame: NDArray[np.float64]
+    frame: Floats
     # (N, corners) for order 2: linear displacements at its nodes from the corners'
     of_corners: csr_array | None = None
 
@@ -114,9 +115,9 @@ class System(NamedTuple):
 class Compression(NamedTuple):
     """Result of `compression`."""
 
-    u: NDArray[np.float64]  # (N, n) displacement, mm, world
+    u: Floats  # (N, n) displacement, mm, world
     strain_energy: float  # E_strain = 1/2 u^T K u, uJ (per mm of thickness in 2-D)
-    reaction: NDArray[np.float64]  # (n,) force that holds the pushed nodes, mN, world
+    reaction: Floats  # (n,) force that holds the pushed nodes, mN, world
     system: System  # the solved system, for `tetopt.fem.conditioning`
 
 
@@ -163,18 +164,16 @@ def stiffness(mesh: Mesh, young: ArrayLike, nu: ArrayLike, order: int = 1) -> cs
 class Elements(NamedTuple):
     """The cells of a mesh as elements of one order; made by `elements_of`."""
 
-    points: NDArray[np.float64]  # (N, n) nodes of the order, mm
-    cells: NDArray[np.int64]  # (M, A) their nodes
-    volumes: NDArray[np.float64]  # (M,) mm^n
-    gradients: NDArray[np.float64]  # (M, n+1, n) gradients of the barycentric coordinates, 1/mm
+    points: Floats  # (N, n) nodes of the order, mm
+    cells: Ints  # (M, A) their nodes
+    volumes: Floats  # (M,) mm^n
+    gradients: Floats  # (M, n+1, n) gradients of the barycentric coordinates, 1/mm
     # (Q, A, n+1) of the shape functions by these coordinates, at the Gauss points
-    slopes: NDArray[np.float64]
-    weights: NDArray[np.float64]  # (Q,) weights of the Gauss points
+    slopes: Floats
+    weights: Floats  # (Q,) weights of the Gauss points
     is_curved: bool = False  # volumes and gradients are always those of straight cells
 
-    def at_points(
-        self, frame: NDArray[np.float64] | None = None
-    ) -> Iterator[tuple[NDArray[np.float64], ...]]:
+    def at_points(self, frame: Floats | None = None) -> Iterator[tuple[Floats, ...]]:
         """For each Gauss point, the shape functions' gradients (M, A, n) in a frame (n, n) and
         its volume (M,).
         """
@@ -212,9 +211,9 @@ def elements_of(mesh: Mesh, order: int) -> Elements:
 
 def _stiffness(
     elements: Elements,
-    young: NDArray[np.float64],
-    nu: NDArray[np.float64],
-    frame: NDArray[np.float64],
+    young: Floats,
+    nu: Floats,
+    frame: Floats,
 ) -> csr_array:
     """`stiffness` with dofs along the columns of `frame`: for an isotropic law it suffices to
     rotate the gradients.
@@ -258,7 +257,7 @@ def _stiffness(
     return bsr_array((blocks, pairs % n_nodes, start), shape=(n_nodes * n, n_nodes * n)).tocsr()
 
 
-def _sum(arrays: Iterable[NDArray[np.float64]]) -> NDArray[np.float64]:
+def _sum(arrays: Iterable[Floats]) -> Floats:
     """Sum arrays made one by one, from first to last, in the memory of the first."""
     iterator = iter(arrays)
     total = next(iterator)
@@ -267,7 +266,7 @@ def _sum(arrays: Iterable[NDArray[np.float64]]) -> NDArray[np.float64]:
     return total
 
 
-def _gradients(mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _gradients(mesh: Mesh) -> tuple[Floats, Floats]:
     """Volumes v (M,) and gradients of barycentric coordinates (M, n+1, n), 1/mm: derivatives of
     v by nodes, over v.
     """
@@ -275,15 +274,13 @@ def _gradients(mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return v, volume_gradients(mesh.points, mesh.cells) / v[:, None, None]
 
 
-def lame_constants(
-    young: NDArray[np.float64], nu: float | NDArray[np.float64], n: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def lame_constants(young: Floats, nu: float | Floats, n: int) -> tuple[Floats, Floats]:
     """Lame's lambda (in 2-D that of plane stress) and mu, kPa."""
     narrowing = 1.0 - nu**2 if n == 2 else (1.0 + nu) * (1.0 - 2.0 * nu)
     return young * (nu / narrowing), young / (2.0 * (1.0 + nu))
 
 
-def gauss_strains(mesh: Mesh, u: NDArray[np.float64]) -> NDArray[np.float64]:
+def gauss_strains(mesh: Mesh, u: Floats) -> Floats:
     """Strain at the Gauss points of each cell, (M, Q, n, n) float64, symmetric, from displacements
     `u`, (N, n) mm.
 
@@ -303,14 +300,14 @@ def gauss_strains(mesh: Mesh, u: NDArray[np.float64]) -> NDArray[np.float64]:
     return 0.5 * (slope + slope.swapaxes(2, 3))
 
 
-def strains(mesh: Mesh, u: NDArray[np.float64]) -> NDArray[np.float64]:
+def strains(mesh: Mesh, u: Floats) -> Floats:
     """Mean strain in each cell, (M, n, n) float64, symmetric, from displacements `u` as in
     `gauss_strains`.
     """
     return cell_means(gauss_strains(mesh, u))
 
 
-def cell_means(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def cell_means(values: Floats) -> Floats:
     """Mean over each cell, (M, ...), of values at its Gauss points (M, Q, ...); curved cells
     count as straight.
     """
@@ -319,12 +316,12 @@ def cell_means(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.tensordot(values, curved_rule(CURVED_POINTS[n_points])[1], axes=(1, 0))
 
 
-def gauss_volumes(mesh: Mesh, order: int) -> NDArray[np.float64]:
+def gauss_volumes(mesh: Mesh, order: int) -> Floats:
     """The volume of each Gauss point of a cell, (M, Q), mm^n."""
     return np.stack([volume for _, volume in elements_of(mesh, order).at_points()], axis=1)
 
 
-def order_of(mesh: Mesh, u: NDArray[np.float64]) -> int:
+def order_of(mesh: Mesh, u: Floats) -> int:
     """Order of the displacements `u`: 1 with a row for each node of the mesh, else 2."""
     return 1 if len(u) == len(mesh.points) else 2
 
@@ -332,7 +329,7 @@ def order_of(mesh: Mesh, u: NDArray[np.float64]) -> int:
 # Boundary conditions
 
 
-def box_faces(image: Image, mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def box_faces(image: Image, mesh: Mesh) -> tuple[Ints, Ints]:
     """Nodes on the bottom and the top of the image's box, int64, ascending.
 
     These are the faces across the index axis nearest to the last world axis: z in 3-D, inferior to
@@ -380,7 +377,7 @@ def box_faces(image: Image, mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.i
     return low, high
 
 
-def push_of(image: Image, percent: float) -> NDArray[np.float64]:
+def push_of(image: Image, percent: float) -> Floats:
     """Displacement of the bottom in a compression by `percent`, (n,) mm, along the faces' normal
     towards the top.
 
@@ -423,11 +420,11 @@ def constrain_nodes(
     mesh: Mesh,
     young: ArrayLike,
     nu: ArrayLike,
-    is_prescribed: NDArray[np.bool_],
-    prescribed: NDArray[np.float64],
+    is_prescribed: Bools,
+    prescribed: Floats,
     *,
     order: int = 1,
-    frame: NDArray[np.float64] | None = None,
+    frame: Floats | None = None,
     outside: Outside | None = None,
 ) -> System:
     """Set up the equations of the mesh with some prescribed displacements.
@@ -600,9 +597,7 @@ def compression(
     return Compression(u, 0.5 * float(dofs @ force), reaction, system)
 
 
-def _with_midpoints(
-    mesh: Mesh, cells: NDArray[np.int64], nodes: NDArray[np.int64]
-) -> NDArray[np.int64]:
+def _with_midpoints(mesh: Mesh, cells: Ints, nodes: Ints) -> Ints:
     """Nodes of order 2, with cells `cells`: the given nodes of the mesh, and the mid-edge nodes
     between them.
     """
@@ -612,9 +607,7 @@ def _with_midpoints(
     return np.union1d(nodes, cells[:, mesh.ndim + 1 :][is_between])
 
 
-def _sliding_frame(
-    fixed: NDArray[np.float64], push: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], int]:
+def _sliding_frame(fixed: Floats, push: Floats) -> tuple[Floats, int]:
     """A rotation with the push as first column; the second points from the first fixed point to the
     farthest across.
 
@@ -640,7 +633,7 @@ def _sliding_frame(
 # Solution
 
 
-def solve_system(system: System, method: Method = "auto") -> NDArray[np.float64]:
+def solve_system(system: System, method: Method = "auto") -> Floats:
     """Solve for the displacement of every node, (N, n) float64, mm, in world components.
 
     Parameters
@@ -662,13 +655,13 @@ def solve_system(system: System, method: Method = "auto") -> NDArray[np.float64]
 
 
 @on_one_blas_thread
-def solve_in_steps(system: System, method: Method = "auto") -> tuple[NDArray[np.float64], int]:
+def solve_in_steps(system: System, method: Method = "auto") -> tuple[Floats, int]:
     """The result of `solve_system`, and the number of conjugate gradient steps: 0 if the matrix was
     factorised.
     """
     n, n_steps = len(system.frame), 0
 
-    def count(_: NDArray[np.float64]) -> None:
+    def count(_: Floats) -> None:
         nonlocal n_steps
         n_steps += 1
 
@@ -766,7 +759,7 @@ def multigrid(system: System) -> LinearOperator:
     change_smoothers(whole, before + for_all, after + for_all)
     cycle = whole.aspreconditioner(cycle="V")
 
-    def apply(residual: NDArray[np.float64]) -> NDArray[np.float64]:
+    def apply(residual: Floats) -> Floats:
         padded = np.zeros(n_dofs)
         padded[system.free] = residual.ravel()
         return (cycle @ padded)[system.free]
@@ -774,7 +767,7 @@ def multigrid(system: System) -> LinearOperator:
     return LinearOperator((len(system.free),) * 2, matvec=apply, dtype=np.float64)
 
 
-def _with_held(K: csr_array, is_free: NDArray[np.float64], alone: float) -> csr_array:
+def _with_held(K: csr_array, is_free: Floats, alone: float) -> csr_array:
     """K with the prescribed dofs uncoupled, and `alone` on their diagonal."""
     keep = diags_array(is_free)
     return (keep @ K @ keep + diags_array((1.0 - is_free) * alone)).tocsr()
@@ -783,7 +776,7 @@ def _with_held(K: csr_array, is_free: NDArray[np.float64], alone: float) -> csr_
 # Checks of the arguments
 
 
-def _check_young(young: ArrayLike, elements: Elements) -> NDArray[np.float64]:
+def _check_young(young: ArrayLike, elements: Elements) -> Floats:
     """Moduli at the Gauss points, (M, Q)."""
     try:
         young = np.asarray(young, dtype=np.float64)
@@ -805,7 +798,7 @@ def _check_young(young: ArrayLike, elements: Elements) -> NDArray[np.float64]:
     return young
 
 
-def _check_nu(nu: ArrayLike, mesh: Mesh) -> NDArray[np.float64]:
+def _check_nu(nu: ArrayLike, mesh: Mesh) -> Floats:
     """Poisson's ratios of the cells, (M,)."""
     ratios = np.asarray(nu, dtype=np.float64)
     if ratios.shape not in ((), (len(mesh.cells),)):
@@ -821,7 +814,7 @@ def _check_nu(nu: ArrayLike, mesh: Mesh) -> NDArray[np.float64]:
     return np.broadcast_to(ratios, (len(mesh.cells),))
 
 
-def _check_nodes(name: str, nodes: ArrayLike, mesh: Mesh) -> NDArray[np.int64]:
+def _check_nodes(name: str, nodes: ArrayLike, mesh: Mesh) -> Ints:
     """Distinct node numbers, ascending."""
     nodes = np.asarray(nodes)
     if nodes.size == 0:
@@ -838,7 +831,7 @@ def _check_nodes(name: str, nodes: ArrayLike, mesh: Mesh) -> NDArray[np.int64]:
     return np.unique(nodes).astype(np.int64)
 
 
-def _check_displacement(displacement: ArrayLike, n: int) -> NDArray[np.float64]:
+def _check_displacement(displacement: ArrayLike, n: int) -> Floats:
     vector = np.asarray(displacement, dtype=np.float64)
     if vector.shape != (n,) or not np.isfinite(vector).all() or not vector.any():
         raise InputError(

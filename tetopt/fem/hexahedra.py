@@ -12,19 +12,19 @@ from __future__ import annotations
 from itertools import product as combinations_of
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import bsr_array, csr_array
 
 from tetopt.fem.elasticity import System, lame_constants, on_one_blas_thread, solve_in_steps
 from tetopt.fem.rigidity import rigid_modes
 from tetopt.geometry.box import upright_axis
 from tetopt.image import Image
+from tetopt.system.arrays import Floats, Ints
 from tetopt.system.budget import at_most, check_memory
 
 DOF_BYTES = 4800.0  # of memory per dof; 4,750 were measured at 12,000, 4,400 at 300,000
 
 
-def element_stiffness(jacobian: NDArray[np.float64], nu: float) -> NDArray[np.float64]:
+def element_stiffness(jacobian: Floats, nu: float) -> Floats:
     """Stiffness of one element of modulus 1 between its corners, (2^n, 2^n, n, n); corners as
     `product((0, 1), ...)`.
 
@@ -49,7 +49,7 @@ def element_stiffness(jacobian: NDArray[np.float64], nu: float) -> NDArray[np.fl
     return K
 
 
-def shape_gradients(at: NDArray[np.float64], corners: NDArray[np.int64]) -> NDArray[np.float64]:
+def shape_gradients(at: Floats, corners: Ints) -> Floats:
     """Gradients of the n-linear hat functions at a point of the unit cube, (2^n, n), per unit of
     index.
     """
@@ -62,7 +62,7 @@ def shape_gradients(at: NDArray[np.float64], corners: NDArray[np.int64]) -> NDAr
     return g
 
 
-def stiffness_product(modulus: Image, nu: float, u: NDArray[np.float64]) -> NDArray[np.float64]:
+def stiffness_product(modulus: Image, nu: float, u: Floats) -> Floats:
     """The stiffness of the grid times displacements of its nodes, (*shape + 1, n), mN."""
     n, out = modulus.ndim, np.zeros_like(u)
     of_corners = [_of_voxels(corner, modulus.shape) for corner in _corners(n)]
@@ -76,7 +76,7 @@ def stiffness_product(modulus: Image, nu: float, u: NDArray[np.float64]) -> NDAr
 
 
 @on_one_blas_thread
-def solve_between_plates(modulus: Image, nu: float, u: NDArray[np.float64]) -> int:
+def solve_between_plates(modulus: Image, nu: float, u: Floats) -> int:
     """Solve for the displacements between plates on the two faces across the upright axis, without
     forces.
 

@@ -24,6 +24,7 @@ from tetopt.geometry.quadratic import shape_slopes, shape_values
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.model.on_image import places_in_cells
+from tetopt.system.arrays import Bools, Floats, Ints
 
 # ratio of successive voxel sizes tried for the grid, which misses the limit by less than 6 %
 STEP_GROWTH = 1.02
@@ -50,8 +51,8 @@ class Reference(NamedTuple):
     modulus: Image  # kPa, of the grid's elements
     nu: float
     strain_energy: float  # uJ (per mm of thickness in 2-D)
-    u: NDArray[np.float64]  # (*shape + 1, n) mm, at the voxels' corners
-    u_homogeneous: NDArray[np.float64]  # the same for the block with one modulus everywhere
+    u: Floats  # (*shape + 1, n) mm, at the voxels' corners
+    u_homogeneous: Floats  # the same for the block with one modulus everywhere
     own_error: OwnError
     n_iterations: int
 
@@ -115,9 +116,7 @@ def reference(modulus: Image, nu: float, percent: float = 1.0) -> Reference:
     return Reference(modulus, nu, energy, u, even, own, n_iterations)
 
 
-def _compress_grid(
-    modulus: Image, nu: float, push: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], int]:
+def _compress_grid(modulus: Image, nu: float, push: Floats) -> tuple[Floats, int]:
     """Displacements of the nodes with the bottom pushed in and the top fixed, and the number of
     iterations.
     """
@@ -128,11 +127,11 @@ def _compress_grid(
     return u, solve_between_plates(modulus, nu, u)
 
 
-def _strain_energy(modulus: Image, nu: float, u: NDArray[np.float64]) -> float:
+def _strain_energy(modulus: Image, nu: float, u: Floats) -> float:
     return 0.5 * float((u * stiffness_product(modulus, nu, u)).sum())
 
 
-def interpolate_nodes(u: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.float64]:
+def interpolate_nodes(u: Floats, shape: tuple[int, ...]) -> Floats:
     """Displacements of a grid's nodes at the nodes of another grid of this shape over the same
     box.
     """
@@ -141,7 +140,7 @@ def interpolate_nodes(u: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray
 
 
 def compare(
-    exact: Reference, mesh: Mesh, u: NDArray[np.float64], strain_energy: float, labels: ArrayLike
+    exact: Reference, mesh: Mesh, u: Floats, strain_energy: float, labels: ArrayLike
 ) -> Errors:
     """Compare a mesh's displacements and energy with the reference, over voxel centres in the mesh.
 
@@ -194,9 +193,7 @@ def compare(
     )
 
 
-def at_centres(
-    image: Image, u: NDArray[np.float64], voxels: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def at_centres(image: Image, u: Floats, voxels: Ints) -> tuple[Floats, Floats]:
     """Displacement (K, n) and strain (K, n, n) at the centres of voxels with these flat indices,
     from nodes' `u`.
     """
@@ -212,7 +209,7 @@ def at_centres(
     return value, 0.5 * (slope + slope.transpose(0, 2, 1))
 
 
-def near_interface(labels: NDArray) -> NDArray[np.bool_]:
+def near_interface(labels: NDArray) -> Bools:
     """Mask of voxels whose centre is within `INTERFACE_BAND_VOXELS` voxels of a facet between
     two labels.
     """
@@ -251,9 +248,7 @@ def _fractions(new: int, old: int) -> csr_array:
     return csr_array((length * new / old, (row, middle.astype(np.int64))), shape=(new, old))
 
 
-def reference_shape(
-    shape: Sequence[int], spacing: NDArray[np.float64], dofs: int
-) -> tuple[int, ...]:
+def reference_shape(shape: Sequence[int], spacing: Floats, dofs: int) -> tuple[int, ...]:
     """The finest grid of nearly cubic voxels over the image's box with at most `dofs`, no finer
     than the image.
     """
@@ -294,24 +289,24 @@ def nearest(image: Image, grid: Image) -> Image:
 def _displacements(
     elements: Elements,
     order: int,
-    u: NDArray[np.float64],
-    cell: NDArray[np.int64],
-    places: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    u: Floats,
+    cell: Ints,
+    places: Floats,
+) -> Floats:
     return np.einsum("ka,kai->ki", shape_values(places, order), u[elements.cells[cell]])
 
 
 def _strains(
     elements: Elements,
     order: int,
-    u: NDArray[np.float64],
-    cell: NDArray[np.int64],
-    places: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    u: Floats,
+    cell: Ints,
+    places: Floats,
+) -> Floats:
     by_place = np.einsum("kai,kab->kib", u[elements.cells[cell]], shape_slopes(places, order))
     slope = by_place @ elements.gradients[cell]
     return 0.5 * (slope + slope.transpose(0, 2, 1))
 
 
-def _squares(values: NDArray[np.float64]) -> float:
+def _squares(values: Floats) -> float:
     return float((values**2).sum())

@@ -12,19 +12,19 @@ from __future__ import annotations
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import block_array, coo_array, csr_array
 from scipy.sparse.linalg import eigsh
 
 from tetopt.errors import InputError
 from tetopt.geometry.topology import components, connected_sets
+from tetopt.system.arrays import Bools, Floats, Ints
 
 # Least squared violation of all constraints by a rigid motion of size 1; less is rounding, and the
 # motion is free.
 LOOSE_VIOLATION = 1e-11
 
 
-def rigid_modes(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def rigid_modes(points: Floats) -> Floats:
     """Rigid motions of points (N, n) as dofs, (N*n, 3) in 2-D and (N*n, 6) in 3-D: translations,
     then rotations.
 
@@ -36,7 +36,7 @@ def rigid_modes(points: NDArray[np.float64]) -> NDArray[np.float64]:
     return _rigid_rows(arms / (size if size > 0.0 else 1.0)).reshape(len(points) * n, -1)
 
 
-def _rigid_rows(arms: NDArray[np.float64]) -> NDArray[np.float64]:
+def _rigid_rows(arms: Floats) -> Floats:
     """Displacements (K, n, n(n+1)/2) of points with given arms (K, n) by translations and
     infinitesimal rotations.
     """
@@ -49,9 +49,7 @@ def _rigid_rows(arms: NDArray[np.float64]) -> NDArray[np.float64]:
     return rows
 
 
-def check_held(
-    points: NDArray[np.float64], cells: NDArray[np.int64], is_prescribed: NDArray[np.bool_]
-) -> None:
+def check_held(points: Floats, cells: Ints, is_prescribed: Bools) -> None:
     """Raise InputError if any part of the mesh can move without strain, as K_ff is singular then.
 
     Cells (M, A) may have either order, with their corners first; `is_prescribed` (N, n) is also
@@ -88,9 +86,7 @@ def check_held(
         )
 
 
-def _check_pieces(
-    cells: NDArray[np.int64], body: NDArray[np.int64], is_prescribed: NDArray[np.bool_]
-) -> None:
+def _check_pieces(cells: Ints, body: Ints, is_prescribed: Bools) -> None:
     """Raise InputError if a component of cells connected by nodes has no prescribed dof."""
     n_bodies = int(body.max()) + 1
     bodies = np.repeat(body, cells.shape[1]) + len(is_prescribed)
@@ -111,10 +107,10 @@ def _check_pieces(
 
 
 def _weakest_hold(
-    points: NDArray[np.float64],
-    cells: NDArray[np.int64],
-    body: NDArray[np.int64],
-    is_prescribed: NDArray[np.bool_],
+    points: Floats,
+    cells: Ints,
+    body: Ints,
+    is_prescribed: Bools,
 ) -> tuple[float, int]:
     """Smallest sum of squared violations by a rigid motion of size 1 of the bodies, and the body
     that it moves most.
@@ -131,7 +127,7 @@ def _weakest_hold(
     r = rows.shape[2]
     is_first = np.concatenate([[True], node[1:] != node[:-1]])
 
-    def spread(which: NDArray[np.int64]) -> csr_array:
+    def spread(which: Ints) -> csr_array:
         """Displacements of the given incidences by the bodies' motions, one row per component."""
         column = of_body[which, None, None] * r + np.arange(r)
         at = (np.arange(len(which))[:, None] * n + np.arange(n))[:, :, None]

@@ -14,7 +14,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.fem.elasticity import (
@@ -37,6 +36,7 @@ from tetopt.model.averages import gauss_young
 from tetopt.model.loads import Load, count_of_steps, facet_forces, in_step, spring_constants
 from tetopt.model.materials import density_of
 from tetopt.model.model import Model, element_facets, elements, in_units
+from tetopt.system.arrays import Bools, Floats
 
 KG_PER_MM3 = 1e-9  # in a kg/m3
 # of a matrix's row times its displacements: rounding error in a sum of forces
@@ -83,15 +83,15 @@ class Solution(NamedTuple):
     [...0.0, ...0.0, ...0.0]
     """
 
-    u: NDArray[np.float64]
-    young: NDArray[np.float64]
-    strain: NDArray[np.float64]
-    stress: NDArray[np.float64]
+    u: Floats
+    young: Floats
+    strain: Floats
+    stress: Floats
     strain_energy: float
     spring_energy: float
     work: float
-    reactions: dict[str, NDArray[np.float64]]
-    applied: NDArray[np.float64]
+    reactions: dict[str, Floats]
+    applied: Floats
     n_iterations: int
     system: System
 
@@ -99,11 +99,11 @@ class Solution(NamedTuple):
 class _Task(NamedTuple):
     """The loads of one step on the nodes of the model's order."""
 
-    is_prescribed: NDArray[np.bool_]  # (N, n)
-    prescribed: NDArray[np.float64]  # (N, n) mm
-    of_set: dict[str, NDArray[np.bool_]]  # (N, n) mask of the dofs that a set prescribes
+    is_prescribed: Bools  # (N, n)
+    prescribed: Floats  # (N, n) mm
+    of_set: dict[str, Bools]  # (N, n) mask of the dofs that a set prescribes
     outside: Outside
-    springs: dict[str, NDArray[np.float64]]  # (N,) mN/mm, by set
+    springs: dict[str, Floats]  # (N,) mN/mm, by set
 
 
 @on_one_blas_thread
@@ -209,7 +209,7 @@ def solve(model: Model, step: int = 1, method: Method = "auto") -> Solution:
     )
 
 
-def gauss_moduli(model: Model) -> NDArray[np.float64]:
+def gauss_moduli(model: Model) -> Floats:
     """Modulus at the Gauss points of the model's order, (M, Q), in its unit of stress.
 
     From each cell's material, from linear interpolation of moduli at the nodes, or from the model's
@@ -227,9 +227,7 @@ def gauss_moduli(model: Model) -> NDArray[np.float64]:
     )
 
 
-def _stress(
-    strain: NDArray[np.float64], young: NDArray[np.float64], nu: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _stress(strain: Floats, young: Floats, nu: Floats) -> Floats:
     """Stress (M, Q, n, n), kPa, from strains, moduli (M, Q) and ratios (M,); in 2-D plane
     stress.
     """
@@ -244,8 +242,8 @@ def _stress(
 
 def _task(model: Model, loads: tuple[Load, ...]) -> _Task:
     points, cells = elements(model)
-    of_set: dict[str, NDArray[np.bool_]] = {}
-    springs: dict[str, NDArray[np.float64]] = {}
+    of_set: dict[str, Bools] = {}
+    springs: dict[str, Floats] = {}
     task = _Task(
         np.zeros(points.shape, dtype=bool),
         np.zeros(points.shape),
@@ -282,9 +280,7 @@ def _task(model: Model, loads: tuple[Load, ...]) -> _Task:
     return task
 
 
-def weight_forces(
-    mesh: Mesh, density: NDArray[np.float64], acceleration: NDArray[np.float64], order: int
-) -> NDArray[np.float64]:
+def weight_forces(mesh: Mesh, density: Floats, acceleration: Floats, order: int) -> Floats:
     """Forces on nodes, (N, n) mN, from a uniform acceleration (n,), mm/s2, of cells with a density
     (M,), kg/m3.
 
@@ -314,9 +310,9 @@ def weight_forces(
 def _check_balance(
     system: System,
     task: _Task,
-    reaction: NDArray[np.float64],
-    pull: NDArray[np.float64],
-    u: NDArray[np.float64],
+    reaction: Floats,
+    pull: Floats,
+    u: Floats,
 ) -> None:
     """Raise RuntimeError unless reactions, forces and springs cancel in their sum and moments about
     any axis.
@@ -341,13 +337,13 @@ def _check_balance(
 # Fields on the mesh
 
 
-def von_mises(stress: NDArray[np.float64]) -> NDArray[np.float64]:
+def von_mises(stress: Floats) -> Floats:
     """Von Mises stress of stresses (..., n, n); in 2-D plane stress."""
     spread = np.einsum("...ii->...", stress)
     return np.sqrt(np.maximum(1.5 * ((stress**2).sum(axis=(-2, -1)) - spread**2 / 3.0), 0.0))
 
 
-def node_means(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
+def node_means(mesh: Mesh, values: Floats) -> Floats:
     """Extrapolate values at Gauss points (M, Q, ...) to the nodes of the order with Q points, (N,
     ...).
 
@@ -400,8 +396,8 @@ class SolutionFields(NamedTuple):
     (280, 3)
     """
 
-    cell_data: dict[str, NDArray[np.float64]]
-    point_data: dict[str, NDArray[np.float64]]
+    cell_data: dict[str, Floats]
+    point_data: dict[str, Floats]
 
 
 @on_one_blas_thread

@@ -13,20 +13,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.system.arrays import Bools, Floats, Ints
+
 # A place this near to a side lies on it. Reading a file and converting its points to index
 # coordinates moves them by some 1e-12 voxel (1e-7 of the coordinate in mm where a file holds
 # float32), and no mesh has cells as thin as this.
 ON_SIDE_VOXELS = 1e-6
 
 
-def box_sides(shape: tuple[int, ...]) -> NDArray[np.float64]:
+def box_sides(shape: tuple[int, ...]) -> Floats:
     """Index coordinates of the two sides across each axis, (n, 2)."""
     return np.column_stack([np.full(len(shape), -0.5), np.array(shape) - 0.5])
 
 
 def is_on_sides(
     places: NDArray[Any], sides: NDArray[Any], tolerance: float = ON_SIDE_VOXELS
-) -> NDArray[np.bool_]:
+) -> Bools:
     """True where places (..., n) lie on the sides (n, 2) of a box, (..., n, 2); exactly if
     `tolerance` is 0.
 
@@ -40,23 +42,23 @@ def is_on_sides(
 
 def facets_on_sides(
     places: NDArray[Any],
-    nodes: NDArray[np.int64],
+    nodes: Ints,
     sides: NDArray[Any],
     tolerance: float = ON_SIDE_VOXELS,
-) -> NDArray[np.bool_]:
+) -> Bools:
     """True where all nodes of facets `nodes` (F, n), at places (N, n), lie on a side, (F, n, 2)."""
-    is_on: NDArray[np.bool_] = np.all(is_on_sides(places, sides, tolerance)[nodes], axis=1)
+    is_on: Bools = np.all(is_on_sides(places, sides, tolerance)[nodes], axis=1)
     return is_on
 
 
-def upright_axis(affine: NDArray[np.float64]) -> int:
+def upright_axis(affine: Floats) -> int:
     """The index axis that corresponds to the last world axis: z in 3-D, from inferior to
     superior, and y in 2-D.
     """
     return world_axes(affine).index(len(affine) - 2)
 
 
-def world_axes(affine: NDArray[np.float64]) -> tuple[int, ...]:
+def world_axes(affine: Floats) -> tuple[int, ...]:
     """The world axis that corresponds to each index axis, by the largest sum of cosines; each
     occurs once.
     """
@@ -71,7 +73,7 @@ def world_axes(affine: NDArray[np.float64]) -> tuple[int, ...]:
     return max(permutations(range(len(cosines))), key=alignment)
 
 
-def _cosines(affine: NDArray[np.float64]) -> NDArray[np.float64]:
+def _cosines(affine: Floats) -> Floats:
     """Absolute cosines between world axes (rows) and index axes (columns), (n, n)."""
     columns = affine[:-1, :-1]
     return np.abs(columns / np.sqrt((columns**2).sum(axis=0)))

@@ -19,6 +19,7 @@ from tetopt.geometry.quadratic import (
 )
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import Facets, boundary_facets, components, facets, folded_groups
+from tetopt.system.arrays import Bools, Floats, Ints
 
 if TYPE_CHECKING:
     from tetopt.image import Image
@@ -131,7 +132,7 @@ def _problems_of_cells(mesh: Mesh) -> list[str]:
     return problems
 
 
-def scaled_jacobians(mesh: Mesh) -> NDArray[np.float64]:
+def scaled_jacobians(mesh: Mesh) -> Floats:
     """Least ratio of each quadratic cell's Jacobian determinant to the straight cell's, (M,); 0 or
     less if folded.
 
@@ -228,7 +229,7 @@ def manifold_problems(mesh: Mesh, of_cell: ArrayLike | None = None) -> list[str]
     return problems
 
 
-def _most_frequent(pairs: NDArray[np.int64]) -> str:
+def _most_frequent(pairs: Ints) -> str:
     """The most frequent pairs of labels, with their counts, for a message."""
     kinds, counts = np.unique(pairs, axis=0, return_counts=True)
     most = np.argsort(-counts, kind="stable")[:3]
@@ -256,9 +257,7 @@ def check_unfolded(mesh: Mesh, shared: Facets | None = None, source: str = "mesh
         )
 
 
-def facets_on_box(
-    mesh: Mesh, image: Image, shared: Facets | None = None
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def facets_on_box(mesh: Mesh, image: Image, shared: Facets | None = None) -> tuple[Ints, Bools]:
     """Boundary facets, (B, n) nodes, and True for those on a face of the image's box, (B,).
 
     `shared` are the mesh's facets, if already known.
@@ -273,7 +272,7 @@ def filled_fraction(mesh: Mesh, image: Image) -> float:
     return float(mesh.cell_volumes.sum()) / image.volume
 
 
-def beyond_box(mesh: Mesh, image: Image) -> NDArray[np.float64]:
+def beyond_box(mesh: Mesh, image: Image) -> Floats:
     """Distance of each node beyond the image's box, voxels along an index axis, (N,); negative
     inside.
     """

@@ -5,16 +5,16 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.geometry.simplex import Cells, Points
+from tetopt.system.arrays import Floats, Ints
 
 
 class Cut(NamedTuple):
     """Polygons of three or four corners; a triangle repeats its last corner."""
 
-    corners: NDArray[np.float64]  # (K, 4, w), in the coordinates given to `plane_cut`
-    cells: NDArray[np.int64]  # (K,) the cell each one comes from
+    corners: Floats  # (K, 4, w), in the coordinates given to `plane_cut`
+    cells: Ints  # (K,) the cell each one comes from
 
 
 # Corners of the section as pairs of local nodes, in order around it, by which nodes lie above the
@@ -29,7 +29,7 @@ for _a, _b in ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)):
     CUT_SECTIONS[(1 << _a) + (1 << _b)] = [(_a, _c), (_a, _d), (_b, _d), (_b, _c)]
 
 
-def plane_cut(points: Points, cells: Cells, height: NDArray[np.float64]) -> Cut:
+def plane_cut(points: Points, cells: Cells, height: Floats) -> Cut:
     """Cut the cells by the plane height = 0.
 
     Parameters
@@ -56,9 +56,7 @@ def plane_cut(points: Points, cells: Cells, height: NDArray[np.float64]) -> Cut:
     return Cut(points[ends[..., 0]] * (1.0 - fraction) + points[ends[..., 1]] * fraction, cut)
 
 
-def triangle_cut(
-    points: NDArray[np.float64], triangles: NDArray[np.int64], height: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def triangle_cut(points: Floats, triangles: Ints, height: Floats) -> tuple[Floats, Ints]:
     """Segments (K, 2, 3) in which the plane height = 0 cuts triangles, and the numbers (K,) of
     these.
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from tetopt.geometry.simplex import facet_nodes
 from tetopt.geometry.topology import Facets, connected_sets, facets, stars
+from tetopt.system.arrays import Bools, Floats, Ints
 
 _Key = TypeVar("_Key", bound=Hashable)
 
@@ -27,29 +28,29 @@ OUTSIDE_LABEL = -1  # stands for the space beyond the boundary; labels are 0 and
 class LabelSurfaces(NamedTuple):
     """The surface of each label, facet by facet."""
 
-    label: NDArray[np.int64]  # (S,), `OUTSIDE_LABEL` for the boundary seen from without
-    beyond: NDArray[np.int64]  # (S,), the label on the other side
-    nodes: NDArray[np.int64]  # (S, n), turned to face out of the label
+    label: Ints  # (S,), `OUTSIDE_LABEL` for the boundary seen from without
+    beyond: Ints  # (S,), the label on the other side
+    nodes: Ints  # (S, n), turned to face out of the label
 
 
 class Ridges(NamedTuple):
     """Ridges at which facets of one label's surface meet, listed separately for each label."""
 
-    label: NDArray[np.int64]  # (R,)
-    nodes: NDArray[np.int64]  # (R, n-1), ascending
-    n_facets: NDArray[np.int64]  # (R,), facets of that label that meet there
-    n_labels: NDArray[np.int64]  # (R,), labels that meet there, including `OUTSIDE_LABEL`
-    of_facet: NDArray[np.int64]  # (S, n), ridge opposite each of a facet's nodes
+    label: Ints  # (R,)
+    nodes: Ints  # (R, n-1), ascending
+    n_facets: Ints  # (R,), facets of that label that meet there
+    n_labels: Ints  # (R,), labels that meet there, including `OUTSIDE_LABEL`
+    of_facet: Ints  # (S, n), ridge opposite each of a facet's nodes
 
 
 class Fans(NamedTuple):
     """The nodes of each label's surface."""
 
-    label: NDArray[np.int64]  # (P,)
-    node: NDArray[np.int64]  # (P,)
+    label: Ints  # (P,)
+    node: Ints  # (P,)
     # (P,), connected sets of the label's facets around it, over the ridges that end there
-    n_fans: NDArray[np.int64]
-    n_labels: NDArray[np.int64]  # (P,), labels that meet there, including `OUTSIDE_LABEL`
+    n_fans: Ints
+    n_labels: Ints  # (P,), labels that meet there, including `OUTSIDE_LABEL`
 
 
 def label_surfaces(shared: Facets, of_cell: NDArray[np.integer]) -> LabelSurfaces:
@@ -122,8 +123,8 @@ def surface_fans(surfaces: LabelSurfaces, ridges: Ridges) -> Fans:
 class Pinches(NamedTuple):
     """Ridges, or nodes, at which a surface between exactly two labels is not a manifold."""
 
-    labels: NDArray[np.int64]  # (K, 2), ascending, may include `OUTSIDE_LABEL`
-    nodes: NDArray[np.int64]  # (K, n-1) of ridges, (K, 1) of nodes
+    labels: Ints  # (K, 2), ascending, may include `OUTSIDE_LABEL`
+    nodes: Ints  # (K, n-1) of ridges, (K, 1) of nodes
 
 
 def pinches(shared: Facets, of_cell: NDArray[np.integer]) -> tuple[Pinches, Pinches]:
@@ -149,7 +150,7 @@ def pinches(shared: Facets, of_cell: NDArray[np.integer]) -> tuple[Pinches, Pinc
     return both[0], both[1]
 
 
-def manifold_part(cells: NDArray[np.int64], size: NDArray[np.float64]) -> NDArray[np.bool_]:
+def manifold_part(cells: Ints, size: Floats) -> Bools:
     """Select the cells to keep, (M,), so that the boundary of a conforming mesh is a manifold; few
     are dropped.
 
@@ -199,7 +200,7 @@ class Corners(NamedTuple):
 
 
 def _cells_at_pinch(
-    place: tuple[int, ...], star: dict[int, Corners], size: NDArray[np.float64]
+    place: tuple[int, ...], star: dict[int, Corners], size: Floats
 ) -> Iterable[int]:
     """Cells of an edge's or a node's star to drop so that the boundary is a manifold there; none
     if it is.
@@ -272,7 +273,7 @@ def _way(links: dict[int, list[int]], begin: set[int], end: set[int]) -> list[in
     return []
 
 
-def _times(values: NDArray[np.int64]) -> NDArray[np.int64]:
+def _times(values: Ints) -> Ints:
     """The number of occurrences of each value, at each position."""
     _, which, count = np.unique(values, return_inverse=True, return_counts=True)
     return count[which]

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.geometry.vectors import cross, dot, minus, over, row, scale_vector
+from tetopt.system.arrays import Floats, Ints
 from tetopt.system.kernels import Floats1, Floats2, Ints1, Ints2, entry, helper, run, unit
 
 # exponent of the number of triangles for bins along the longest side, with a few triangles in each
@@ -31,9 +31,7 @@ class _Search(NamedTuple):
     size: float  # a bin's edge
 
 
-def triangle_distances(
-    points: NDArray[np.float64], nodes: NDArray[np.float64], facets: NDArray[np.int64]
-) -> NDArray[np.float64]:
+def triangle_distances(points: Floats, nodes: Floats, facets: Ints) -> Floats:
     """Distance of points (K, 3) from the nearest of one or more triangles (T, 3) of nodes (P, 3):
     (K,), in their unit.
 

@@ -14,10 +14,10 @@ from itertools import permutations, product
 from math import factorial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import determinants, outward_facet_nodes, volume_gradients, volumes
+from tetopt.system.arrays import Floats, Ints
 
 # Local corners of the edges whose midpoints are a tetrahedron's nodes 4 to 9, as in VTK, Abaqus and
 # FEBio; the first three are a triangle's, nodes 3 to 5.
@@ -64,19 +64,19 @@ CURVED_ORBITS: dict[int, list[tuple[tuple[float, ...], float]]] = {
 }
 
 
-def cell_edges(n: int) -> NDArray[np.int64]:
+def cell_edges(n: int) -> Ints:
     """Local corners (E, 2) of the edges of a triangle (n = 2) or a tetrahedron, in the order of
     their nodes.
     """
     return QUADRATIC_EDGES[: n * (n + 1) // 2]
 
 
-def edge_ends(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+def edge_ends(cells: Ints) -> Ints:
     """The edges of cells (M, n+1), (M, 3 or 6, 2), each with the lower node first."""
     return np.sort(cells[:, cell_edges(cells.shape[1] - 1)], axis=2)
 
 
-def numbered_edges(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def numbered_edges(cells: Ints) -> tuple[Ints, Ints]:
     """The edges (E, 2) of cells (M, n+1), sorted by their ends, and the numbers (M, 3 or 6) of
     each cell's edges.
     """
@@ -88,10 +88,10 @@ def numbered_edges(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray
 
 
 def quadratic(
-    points: NDArray[np.float64],
-    cells: NDArray[np.int64],
-    midpoints: NDArray[np.float64] | None = None,
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    points: Floats,
+    cells: Ints,
+    midpoints: Floats | None = None,
+) -> tuple[Floats, Ints]:
     """Nodes (N + E, n) and cells (M, 6 or 10) of order 2 from points (N, n) and cells (M, n+1).
 
     The points come first, then the midpoints (E, n) of the edges sorted by their ends (by default
@@ -104,11 +104,11 @@ def quadratic(
 
 
 def of_order(
-    points: NDArray[np.float64],
-    cells: NDArray[np.int64],
+    points: Floats,
+    cells: Ints,
     order: int,
-    midpoints: NDArray[np.float64] | None = None,
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    midpoints: Floats | None = None,
+) -> tuple[Floats, Ints]:
     """Nodes and cells of order 1 (the points and cells themselves) or 2; raise InputError for
     another order.
     """
@@ -117,12 +117,12 @@ def of_order(
     return (points, cells) if order == 1 else quadratic(points, cells, midpoints)
 
 
-def node_count(points: NDArray[np.float64], cells: NDArray[np.int64], order: int) -> int:
+def node_count(points: Floats, cells: Ints, order: int) -> int:
     """Number of nodes of an order; order 2 includes the mid-edge nodes."""
     return len(of_order(points, cells, order)[0])
 
 
-def quadratic_facet_nodes(cells: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
+def quadratic_facet_nodes(cells: Ints, rows: Ints) -> Ints:
     """Nodes (K, 3 or 6) of facets (K, 2), rows of (cell, local corner opposite), of cells of order
     2.
 
@@ -143,7 +143,7 @@ def quadratic_facet_nodes(cells: NDArray[np.int64], rows: NDArray[np.int64]) -> 
     return cells[rows[:, :1], local[rows[:, 1]]]
 
 
-def shape_values(places: NDArray[np.float64], order: int) -> NDArray[np.float64]:
+def shape_values(places: Floats, order: int) -> Floats:
     """Shape functions at places (K, n+1) within a cell, (K, A), in the order of the cell's nodes.
 
     At a corner lambda (2 lambda - 1), in the middle of an edge 4 lambda_a lambda_b; for order 1
@@ -155,7 +155,7 @@ def shape_values(places: NDArray[np.float64], order: int) -> NDArray[np.float64]
     return np.column_stack([places * (2.0 * places - 1.0), 4.0 * places[:, a] * places[:, b]])
 
 
-def shape_slopes(places: NDArray[np.float64], order: int) -> NDArray[np.float64]:
+def shape_slopes(places: Floats, order: int) -> Floats:
     """Derivatives of the shape functions by the barycentric coordinates, (K, A, n+1).
 
     Multiplied by the gradients of the coordinates, (n+1, n), they give the shape functions'
@@ -174,9 +174,7 @@ def shape_slopes(places: NDArray[np.float64], order: int) -> NDArray[np.float64]
     return slopes
 
 
-def gauss_rule(
-    n: int, order: int, is_curved: bool = False
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def gauss_rule(n: int, order: int, is_curved: bool = False) -> tuple[Floats, Floats]:
     """Places (Q, n+1) and weights (Q,), which sum to 1, of the rule that integrates a cell's
     stiffness.
 
@@ -193,7 +191,7 @@ def gauss_rule(
     return places, np.full(n + 1, 1.0 / (n + 1))
 
 
-def curved_rule(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def curved_rule(n: int) -> tuple[Floats, Floats]:
     """Places (Q, n+1) and weights (Q,), which sum to 1, of a rule of degree 5 with 3, 7 or 14
     points.
 
@@ -210,7 +208,7 @@ def curved_rule(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return np.array([place for place, _ in places]), np.array([weight for _, weight in places])
 
 
-def on_curved_rule(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def on_curved_rule(values: Floats) -> Floats:
     """Transfer values (M, n+1) of the parts of cells nearest to each corner to the points of
     `curved_rule`, (M, Q).
 
@@ -221,9 +219,7 @@ def on_curved_rule(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.einsum("qa,ca->cq", is_nearest / is_nearest.sum(axis=1, keepdims=True), values)
 
 
-def jacobian_ratios(
-    nodes: NDArray[np.float64], cells: NDArray[np.int64], places: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def jacobian_ratios(nodes: Floats, cells: Ints, places: Floats) -> Floats:
     """Jacobian determinants of quadratic cells (M, 6 or 10) at places (K, n+1), relative to
     straight cells, (M, K).
 
@@ -237,7 +233,7 @@ def jacobian_ratios(
     return np.stack([determinants(each) for each in maps], axis=1)
 
 
-def curved_volumes(nodes: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.float64]:
+def curved_volumes(nodes: Floats, cells: Ints) -> Floats:
     """Volumes (areas in 2-D) of quadratic cells (M, 6 or 10), (M,), mm^n: exact, as the
     determinant is of degree n.
     """
@@ -246,9 +242,7 @@ def curved_volumes(nodes: NDArray[np.float64], cells: NDArray[np.int64]) -> NDAr
     return volumes(nodes, cells[:, : nodes.shape[1] + 1]) * mean
 
 
-def straight_pieces(
-    points: NDArray[np.float64], cells: NDArray[np.int64], midpoints: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def straight_pieces(points: Floats, cells: Ints, midpoints: Floats) -> tuple[Floats, Ints]:
     """Split cells (M, n+1) with curved edges at their midpoints: nodes of order 2, and 4 M or 8 M
     straight cells.
 
@@ -269,16 +263,14 @@ def straight_pieces(
         nodes[bent] = straight[bent]
 
 
-def mapped_slopes(
-    nodes: NDArray[np.float64], gradients: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def mapped_slopes(nodes: Floats, gradients: Floats) -> Floats:
     """Derivatives (M, n, n) of the map from straight to curved cells, from nodes and gradients
     (M, A, n).
     """
     return np.einsum("cai,caj->cij", nodes, gradients)
 
 
-def jacobian_bounds(nodes: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.float64]:
+def jacobian_bounds(nodes: Floats, cells: Ints) -> Floats:
     """A lower bound (M,) of `jacobian_ratios` anywhere in quadratic cells (M, 6 or 10).
 
     The determinant is a polynomial of degree n, never below the least of its Bernstein
@@ -296,7 +288,7 @@ def jacobian_bounds(nodes: NDArray[np.float64], cells: NDArray[np.int64]) -> NDA
     controls[:, edges[:, 0], edges[:, 1]] = controls[:, edges[:, 1], edges[:, 0]] = middles
     # (M, n, n+1, n): slopes from corner 0, linear in the cell
     arms = 2.0 * (controls[:, 1:] - controls[:, :1])
-    sums: dict[tuple[int, ...], list[NDArray[np.float64]]] = {}
+    sums: dict[tuple[int, ...], list[Floats]] = {}
     for of_arm in product(range(n + 1), repeat=n):
         frames = np.stack([arms[:, axis, k] for axis, k in enumerate(of_arm)], axis=1)
         sums.setdefault(tuple(sorted(of_arm)), []).append(determinants(frames))

@@ -11,7 +11,9 @@ from math import factorial
 import numpy as np
 from numpy.typing import NDArray
 
-Points = NDArray[np.float64]
+from tetopt.system.arrays import Floats, Ints
+
+Points = Floats
 Cells = NDArray[np.integer]
 CELLS_AT_A_TIME = 2**13  # their corners fit into a processor's cache
 
@@ -26,7 +28,7 @@ def facet_nodes(n: int) -> list[tuple[int, ...]]:
     return [tuple(k for k in range(n + 1) if k != i) for i in range(n + 1)]
 
 
-def outward_facet_nodes(n: int) -> NDArray[np.int64]:
+def outward_facet_nodes(n: int) -> Ints:
     """Local nodes of each facet, facing out; for even k, `facet_nodes` of a positively oriented
     simplex do already.
     """
@@ -38,7 +40,7 @@ def outward_facet_nodes(n: int) -> NDArray[np.int64]:
     )
 
 
-def volumes(points: Points, cells: Cells) -> NDArray[np.float64]:
+def volumes(points: Points, cells: Cells) -> Floats:
     """Signed volumes (areas in 2-D), (M,) float64, mm^n; positive for a positively oriented
     cell.
     """
@@ -53,7 +55,7 @@ def volumes(points: Points, cells: Cells) -> NDArray[np.float64]:
     return result
 
 
-def determinants(frames: NDArray[np.float64]) -> NDArray[np.float64]:
+def determinants(frames: Floats) -> Floats:
     """Determinants of (M, n, n) matrices, written out: exactly 0 where two rows are equal,
     unlike an LU's.
     """
@@ -63,7 +65,7 @@ def determinants(frames: NDArray[np.float64]) -> NDArray[np.float64]:
     return (a * (e * i - f * h) + c * (d * h - e * g)) + b * (f * g - d * i) + 0.0  # no -0
 
 
-def orient_cells(points: Points, cells: Cells) -> NDArray[np.int64]:
+def orient_cells(points: Points, cells: Cells) -> Ints:
     """Copy of `cells`, (M, n+1) int64, with the last two nodes swapped where the signed volume
     is negative.
     """
@@ -73,19 +75,19 @@ def orient_cells(points: Points, cells: Cells) -> NDArray[np.int64]:
     return turned
 
 
-def centroids(points: Points, cells: Cells) -> NDArray[np.float64]:
+def centroids(points: Points, cells: Cells) -> Floats:
     """Mean of each cell's nodes, (M, n) float64, mm."""
     return points[cells].mean(axis=1)
 
 
-def squared_edges(points: Points, cells: Cells) -> NDArray[np.float64]:
+def squared_edges(points: Points, cells: Cells) -> Floats:
     """Squared edge lengths, (M, n(n+1)/2) float64, mm^2, in the order of `edge_pairs`."""
     corners = points[cells]
     first, second = np.array(edge_pairs(points.shape[1])).T
     return ((corners[:, second] - corners[:, first]) ** 2).sum(axis=2)
 
 
-def facet_areas(points: Points, cells: Cells) -> NDArray[np.float64]:
+def facet_areas(points: Points, cells: Cells) -> Floats:
     """Areas (edge lengths in 2-D) of each cell's facets, (M, n+1) float64, mm^(n-1); column i is
     opposite node i.
     """
@@ -94,7 +96,7 @@ def facet_areas(points: Points, cells: Cells) -> NDArray[np.float64]:
     )
 
 
-def area_normals(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+def area_normals(corners: Floats) -> Floats:
     """Normals (K, n) of facets with corners (K, n, n), as long as their areas, mm^2 (in 2-D mm).
 
     They point to the side from which three corners turn anticlockwise; in 2-D to the right of first
@@ -106,12 +108,12 @@ def area_normals(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     return edges[:, 0, ::-1] * np.array([1.0, -1.0])
 
 
-def regular_edge(size: NDArray[np.float64], n: int) -> NDArray[np.float64]:
+def regular_edge(size: Floats, n: int) -> Floats:
     """Edge, mm, of the regular n-simplex of a given volume, mm^n."""
     return (6.0 * 2.0**0.5 * size) ** (1 / 3) if n == 3 else (4.0 / 3.0**0.5 * size) ** 0.5
 
 
-Vectors = list[NDArray[np.float64]]  # n components, (M,) each: three times as fast as rows
+Vectors = list[Floats]  # n components, (M,) each: three times as fast as rows
 
 
 def _corners(points: Points, cells: Cells) -> list[Vectors]:
@@ -124,7 +126,7 @@ def _minus(a: Vectors, b: Vectors) -> Vectors:
     return [x - y for x, y in zip(a, b, strict=True)]
 
 
-def _dot(a: Vectors, b: Vectors) -> NDArray[np.float64]:
+def _dot(a: Vectors, b: Vectors) -> Floats:
     total = a[0] * b[0] + 0.0  # + 0.0 avoids -0, whose sign would change angles of flat cells
     for x, y in zip(a[1:], b[1:], strict=True):
         total += x * y
@@ -151,7 +153,7 @@ def _facet_normals(points: Points, cells: Cells) -> list[Vectors]:
     return normals
 
 
-def volume_gradients(points: Points, cells: Cells) -> NDArray[np.float64]:
+def volume_gradients(points: Points, cells: Cells) -> Floats:
     """Gradient of each cell's volume by each of its nodes, (M, n+1, n) float64, mm^(n-1).
 
     Moving node i along a vector d changes the volume by (area of the opposite facet) x (height
@@ -163,7 +165,7 @@ def volume_gradients(points: Points, cells: Cells) -> NDArray[np.float64]:
     return -normals / points.shape[1]
 
 
-def rho(points: Points, cells: Cells) -> NDArray[np.float64]:
+def rho(points: Points, cells: Cells) -> Floats:
     """Inradius over circumradius, (M,) float64 in [0, 1/n]: 1/n for the regular simplex, 0 for a
     flat one.
 
@@ -188,7 +190,7 @@ def rho(points: Points, cells: Cells) -> NDArray[np.float64]:
     return np.divide(above, below, out=np.zeros_like(v), where=below > 0.0)
 
 
-def dihedral_angles(points: Points, cells: Cells) -> NDArray[np.float64]:
+def dihedral_angles(points: Points, cells: Cells) -> Floats:
     """Angles between facets, degrees: (M, 6) float64 in 3-D, by `edge_pairs`; (M, 3) in 2-D, by
     node.
 

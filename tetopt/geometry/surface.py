@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import edge_pairs, facet_areas, volumes
 from tetopt.geometry.topology import Facets, connected_sets, facets
-from tetopt.system.arrays import plain_array, simplex_arrays
+from tetopt.system.arrays import Floats, Ints, plain_array, simplex_arrays
 
 # The facet opposite each local node, its nodes turned to face out of a positively oriented cell.
 OUTWARD_FACETS = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
@@ -64,8 +64,8 @@ class Surface(NamedTuple):
     ((260, 3), 0)
     """
 
-    points: NDArray[np.float64]
-    triangles: NDArray[np.int64]
+    points: Floats
+    triangles: Ints
     n_parted: int
     largest_shift: float
 
@@ -73,32 +73,30 @@ class Surface(NamedTuple):
 class _Skin(NamedTuple):
     """The boundary as it is in the mesh, with the pairs of half-edges."""
 
-    points: NDArray[np.float64]  # (N, 3), all nodes of the mesh
-    triangles: NDArray[np.int64]  # (K, 3)
-    normals: NDArray[np.float64]  # (K, 3), unit vectors, outwards
+    points: Floats  # (N, 3), all nodes of the mesh
+    triangles: Ints  # (K, 3)
+    normals: Floats  # (K, 3), unit vectors, outwards
     # (3K,), the half-edge on the other side, met by walking through the solid
-    partner: NDArray[np.int64]
+    partner: Ints
     # (3K,), radians, 0 to 2 pi, between the two triangles through the solid
-    angle: NDArray[np.float64]
+    angle: Floats
     # (N,), mm, the smallest height of the chosen cells around each node
-    height: NDArray[np.float64]
+    height: Floats
 
 
 class _Sheets(NamedTuple):
     """Coincident fans or edges that must be moved apart."""
 
-    points: NDArray[np.float64]  # (S, 3), equal where `place` is
-    place: NDArray[np.int64]  # (S,)
+    points: Floats  # (S, 3), equal where `place` is
+    place: Ints  # (S,)
     # (S,), the fraction of all directions that go into the solid, 0 to 1
-    inside: NDArray[np.float64]
-    height: NDArray[np.float64]  # (S,), mm, of the cells around
-    normals: NDArray[np.float64]  # (C, 3), unit vectors, of the triangles of all sheets
-    sheet: NDArray[np.int64]  # (C,), the sheet of each normal, ascending
+    inside: Floats
+    height: Floats  # (S,), mm, of the cells around
+    normals: Floats  # (C, 3), unit vectors, of the triangles of all sheets
+    sheet: Ints  # (C,), the sheet of each normal, ascending
 
 
-def extract_surface(
-    points: NDArray[np.float64], cells: NDArray[np.integer], chosen: ArrayLike
-) -> Surface:
+def extract_surface(points: Floats, cells: NDArray[np.integer], chosen: ArrayLike) -> Surface:
     """Boundary of tetrahedra: closed, two triangles at each edge, one fan at each node.
 
     Where chosen cells touch only in a node or an edge, the sheets of the surface are separated. The
@@ -155,7 +153,7 @@ def extract_surface(
     return Surface(at, triangles, n_parted, float(np.append(shift, edge_shift).max(initial=0.0)))
 
 
-def _chosen_cells(points: NDArray, cells: NDArray, chosen: ArrayLike) -> NDArray[np.int64]:
+def _chosen_cells(points: NDArray, cells: NDArray, chosen: ArrayLike) -> Ints:
     if points.shape[1] != 3 or cells.shape[1] != 4:
         raise InputError(
             f"surface: expected tetrahedra in space, got cells of {cells.shape[1]} nodes; mesh a "
@@ -184,7 +182,7 @@ def _chosen_cells(points: NDArray, cells: NDArray, chosen: ArrayLike) -> NDArray
     return cells[is_chosen].astype(np.int64)
 
 
-def _skin(points: NDArray[np.float64], cells: NDArray[np.int64]) -> _Skin:
+def _skin(points: Floats, cells: Ints) -> _Skin:
     shared = facets(cells)
     if (shared.n_cells > 2).any():
         raise InputError(FOLDED_MESSAGE)
@@ -198,9 +196,7 @@ def _skin(points: NDArray[np.float64], cells: NDArray[np.int64]) -> _Skin:
     return _Skin(points, triangles, normals, partner, angle, _smallest_heights(points, cells))
 
 
-def _partners(
-    cells: NDArray[np.int64], shared: Facets, triangles: NDArray[np.int64], facet: NDArray[np.int64]
-) -> NDArray[np.int64]:
+def _partners(cells: Ints, shared: Facets, triangles: Ints, facet: Ints) -> Ints:
     """The half-edge paired with each one, (3K,); `facet` is each triangle's number among the
     facets.
     """
@@ -226,13 +222,13 @@ def _partners(
 
 
 def _walks(
-    cells: NDArray[np.int64],
+    cells: Ints,
     shared: Facets,
-    crowded: NDArray[np.int64],
+    crowded: Ints,
     n_nodes: int,
-    facet: NDArray[np.int64],
-    edge: NDArray[np.int64],
-) -> NDArray[np.int64]:
+    facet: Ints,
+    edge: Ints,
+) -> Ints:
     """Number of the walk around an edge, from cell to cell through facets, that ends in each
     requested facet.
 
@@ -258,11 +254,11 @@ def _walks(
 
 
 def _inner_angles(
-    points: NDArray[np.float64],
-    triangles: NDArray[np.int64],
-    normals: NDArray[np.float64],
-    partner: NDArray[np.int64],
-) -> NDArray[np.float64]:
+    points: Floats,
+    triangles: Ints,
+    normals: Floats,
+    partner: Ints,
+) -> Floats:
     """`_Skin.angle`: pi where flat, less where the edge is convex."""
     along = (points[np.roll(triangles, -1, axis=1)] - points[triangles]).reshape(-1, 3)
     one, other = np.repeat(normals, 3, axis=0), normals[partner // 3]
@@ -270,7 +266,7 @@ def _inner_angles(
     return np.pi - np.arctan2(sine, (one * other).sum(axis=1))
 
 
-def _smallest_heights(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.float64]:
+def _smallest_heights(points: Floats, cells: Ints) -> Floats:
     """`_Skin.height`; infinite at nodes of no cell."""
     smallest = np.full(len(points), np.inf)
     of_cell = 3.0 * volumes(points, cells) / facet_areas(points, cells).max(axis=1)
@@ -278,7 +274,7 @@ def _smallest_heights(points: NDArray[np.float64], cells: NDArray[np.int64]) -> 
     return smallest
 
 
-def _fans(partner: NDArray[np.int64]) -> NDArray[np.int64]:
+def _fans(partner: Ints) -> Ints:
     """The fan of each corner, (3K,), numbered from 0: the corners met while turning around a
     node.
     """
@@ -287,7 +283,7 @@ def _fans(partner: NDArray[np.int64]) -> NDArray[np.int64]:
     return connected_sets(corner, partner[before], len(corner))[1]
 
 
-def _split_nodes(skin: _Skin, fan: NDArray[np.int64]) -> tuple[NDArray[np.int64], _Sheets]:
+def _split_nodes(skin: _Skin, fan: Ints) -> tuple[Ints, _Sheets]:
     """The fans at nodes with several fans, (S,), ascending, and these fans as sheets."""
     node = np.empty(fan.max() + 1, dtype=np.int64)
     node[fan] = skin.triangles.ravel()
@@ -312,7 +308,7 @@ def _split_nodes(skin: _Skin, fan: NDArray[np.int64]) -> tuple[NDArray[np.int64]
     )
 
 
-def _split_edges(skin: _Skin, fan: NDArray[np.int64]) -> tuple[NDArray[np.int64], _Sheets]:
+def _split_edges(skin: _Skin, fan: Ints) -> tuple[Ints, _Sheets]:
     """Half-edges, one per pair, whose two ends another pair joins as well, (S,), and these as
     sheets.
 
@@ -337,7 +333,7 @@ def _split_edges(skin: _Skin, fan: NDArray[np.int64]) -> tuple[NDArray[np.int64]
     )
 
 
-def _move_apart(sheets: _Sheets) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _move_apart(sheets: _Sheets) -> tuple[Floats, Floats]:
     """New positions of the sheets, (S, 3), and their displacements, (S,), mm.
 
     The narrower sides of two sheets that do not cross are disjoint or nested. So each sheet may
@@ -359,7 +355,7 @@ def _move_apart(sheets: _Sheets) -> tuple[NDArray[np.float64], NDArray[np.float6
     return sheets.points + (sign * shift)[:, None] * _outwards(sheets.normals, sheets.sheet), shift
 
 
-def _outwards(normals: NDArray[np.float64], sheet: NDArray[np.int64]) -> NDArray[np.float64]:
+def _outwards(normals: Floats, sheet: Ints) -> Floats:
     """For each sheet, the unit vector that maximises the smallest dot product with its normals, (S,
     3).
 
@@ -386,12 +382,12 @@ def _outwards(normals: NDArray[np.float64], sheet: NDArray[np.int64]) -> NDArray
 
 
 def _with_middles(
-    points: NDArray[np.float64],
-    triangles: NDArray[np.int64],
-    half: NDArray[np.int64],
-    partner: NDArray[np.int64],
-    middles: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    points: Floats,
+    triangles: Ints,
+    half: Ints,
+    partner: Ints,
+    middles: Floats,
+) -> tuple[Floats, Ints]:
     """Insert middles of half-edges and their partners into points and triangles.
 
     Their triangles are split from the centroid to every corner and middle, whether they have one,
@@ -412,6 +408,6 @@ def _with_middles(
     return np.vstack([points, middles, centres]), np.vstack([triangles[~is_cut], parts, more])
 
 
-def _pair_key(one: NDArray[np.int64], other: NDArray[np.int64], base: int) -> NDArray[np.int64]:
+def _pair_key(one: Ints, other: Ints, base: int) -> Ints:
     """One number for two numbers below `base`, whatever their order."""
     return np.minimum(one, other) * base + np.maximum(one, other)

@@ -9,6 +9,7 @@ import scipy
 from numpy.typing import NDArray
 
 from tetopt.geometry.simplex import facet_nodes
+from tetopt.system.arrays import Bools, Ints
 from tetopt.system.kernel_cache import njit
 
 MOST_BY_INSERTION = 100  # facets with the same lowest node; more are sorted
@@ -21,19 +22,19 @@ class Stars(NamedTuple):
     The cells of node i are ``cells[start[i]:start[i + 1]]``, ascending.
     """
 
-    start: NDArray[np.int64]  # (N+1,)
-    cells: NDArray[np.int64]  # (M * (n+1),)
+    start: Ints  # (N+1,)
+    cells: Ints  # (M * (n+1),)
 
 
 class Facets(NamedTuple):
     """The distinct facets of a mesh and the cells that they belong to."""
 
-    nodes: NDArray[np.int64]  # (F, n), each row ascending; rows in lexicographic order
-    cells: NDArray[np.int64]  # (F, 2), the second is -1 on the boundary
-    n_cells: NDArray[np.int64]  # (F,), number of cells that share it: 1 or 2 in a conforming mesh
-    of_cell: NDArray[np.int64]  # (M, n+1), the facet opposite each local node
+    nodes: Ints  # (F, n), each row ascending; rows in lexicographic order
+    cells: Ints  # (F, 2), the second is -1 on the boundary
+    n_cells: Ints  # (F,), number of cells that share it: 1 or 2 in a conforming mesh
+    of_cell: Ints  # (M, n+1), the facet opposite each local node
     # (M, n+1), +1 where the facet's nodes as listed face out of the cell, else -1
-    sign: NDArray[np.int64]
+    sign: Ints
 
 
 def stars(cells: NDArray[np.integer], n_nodes: int) -> Stars:
@@ -57,7 +58,7 @@ def _by_number(numbers: NDArray, n: int) -> tuple[NDArray, NDArray]:
     return order, start[: n + 1]
 
 
-def compact(cells: NDArray[np.int64], n_nodes: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def compact(cells: Ints, n_nodes: int) -> tuple[Ints, Ints]:
     """The nodes, out of `n_nodes`, that cells use, ascending, and the cells with nodes numbered
     among these.
     """
@@ -103,7 +104,7 @@ def _facet_rows(cells: NDArray, local: NDArray) -> tuple[NDArray, NDArray]:
     return rows, sign
 
 
-def lexicographic_order(rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def lexicographic_order(rows: Ints) -> tuple[Ints, Bools]:
     """Stable order of rows (K, n) of numbers from 0, and True for the first of equal rows in it."""
     if rows.max(initial=0) > LARGEST_RATIO * rows.size:
         rows = np.unique(rows, return_inverse=True)[1].reshape(rows.shape)
@@ -164,7 +165,7 @@ def _listed_facets(
     return nodes, sides, of_cell
 
 
-def folded_groups(cells: NDArray[np.integer], shared: Facets | None = None) -> NDArray[np.int64]:
+def folded_groups(cells: NDArray[np.integer], shared: Facets | None = None) -> Ints:
     """Groups of cells that do not lie on opposite sides of the facet they share, (K, 2) int64, by
     facet.
 
@@ -178,7 +179,7 @@ def folded_groups(cells: NDArray[np.integer], shared: Facets | None = None) -> N
     return shared.cells[(shared.n_cells > 2) | ((shared.n_cells == 2) & (sides != 0.0))]
 
 
-def boundary_facets(cells: NDArray[np.integer], shared: Facets | None = None) -> NDArray[np.int64]:
+def boundary_facets(cells: NDArray[np.integer], shared: Facets | None = None) -> Ints:
     """Nodes of the facets that belong to one cell only, (B, n) int64, turned to face outwards.
 
     For positively oriented cells the normals of the returned triangles (edges in 2-D) point
@@ -219,9 +220,7 @@ def greedy_colours(cells: NDArray, start: NDArray, star_cells: NDArray) -> NDArr
     return colours
 
 
-def connected_sets(
-    one: NDArray[np.int64], other: NDArray[np.int64], n: int
-) -> tuple[int, NDArray[np.int64]]:
+def connected_sets(one: Ints, other: Ints, n: int) -> tuple[int, Ints]:
     """Number of connected sets of n items linked in pairs one[i], other[i], and the set of each
     item, (n,).
     """
@@ -230,7 +229,7 @@ def connected_sets(
     return int(count), number.astype(np.int64)
 
 
-def components(cells: NDArray[np.integer], shared: Facets | None = None) -> NDArray[np.int64]:
+def components(cells: NDArray[np.integer], shared: Facets | None = None) -> Ints:
     """The connected set of each cell, (M,) int64; cells that share a facet are connected.
 
     Sets are numbered from 0 in the order of their first cell. `shared` are the cells' facets, if
@@ -245,9 +244,7 @@ def components(cells: NDArray[np.integer], shared: Facets | None = None) -> NDAr
     return rank[inverse]
 
 
-def largest_component(
-    cells: NDArray[np.integer], is_chosen: NDArray[np.bool_]
-) -> NDArray[np.int64]:
+def largest_component(cells: NDArray[np.integer], is_chosen: Bools) -> Ints:
     """Indices of the largest facet-connected set among the chosen cells, ascending; the first of
     equal sets.
 

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import orient_cells
 from tetopt.interop.notebook import in_kernel
-from tetopt.system.arrays import plain_array
+from tetopt.system.arrays import Floats, Ints, plain_array
 from tetopt.system.extras import install_hint
 
 if TYPE_CHECKING:
@@ -79,9 +79,9 @@ Fields = Mapping[str, ArrayLike]  # by name, one row per cell or per node
 class Simplices(NamedTuple):
     """The cells of the highest dimension in a mesh, and their corners."""
 
-    points: NDArray[np.float64]  # (N, n), the points that the cells use, in their original order
-    cells: NDArray[np.int64]  # (M, n+1), reoriented where they were inverted
-    used: NDArray[np.int64]  # (N,) indices of these points among all points
+    points: Floats  # (N, n), the points that the cells use, in their original order
+    cells: Ints  # (M, n+1), reoriented where they were inverted
+    used: Ints  # (N,) indices of these points among all points
     n_turned: int
 
 
@@ -131,9 +131,7 @@ def kind_of_cells(kinds: Collection[str]) -> str:
     return kind
 
 
-def simplices_of(
-    points: NDArray[np.float64], cells: NDArray[np.int64], middles: NDArray[np.int64] | None = None
-) -> Simplices:
+def simplices_of(points: Floats, cells: Ints, middles: Ints | None = None) -> Simplices:
     """Convert cells over points in space to the arrays of a mesh.
 
     Parameters
@@ -168,9 +166,7 @@ def simplices_of(
     return Simplices(corners, turned, used, int((turned != compact).any(axis=1).sum()))
 
 
-def rows_by_kind(
-    sizes: NDArray[np.int64], cell_types: NDArray[np.uint8]
-) -> dict[str, NDArray[np.int64]]:
+def rows_by_kind(sizes: Ints, cell_types: NDArray[np.uint8]) -> dict[str, Ints]:
     """Group cells, given their numbers of nodes and VTK types, by pyvista's names of the types.
 
     Cells of arbitrary order are grouped with the fixed-size type that they are equivalent to.
@@ -179,7 +175,7 @@ def rows_by_kind(
 
     stride = int(sizes.max()) + 1
     sorts, which = np.unique(cell_types.astype(np.int64) * stride + sizes, return_inverse=True)
-    parts: dict[str, list[NDArray[np.int64]]] = {}
+    parts: dict[str, list[Ints]] = {}
     for number, sort in enumerate(sorts.tolist()):
         vtk_type, size = divmod(sort, stride)
         try:
@@ -192,10 +188,10 @@ def rows_by_kind(
 
 
 def cells_of_rows(
-    connectivity: NDArray[np.int64],
-    offsets: NDArray[np.int64],
-    rows_of_kind: Mapping[str, NDArray[np.int64]],
-) -> dict[str, NDArray[np.int64]]:
+    connectivity: Ints,
+    offsets: Ints,
+    rows_of_kind: Mapping[str, Ints],
+) -> dict[str, Ints]:
     """Return the nodes of VTK's cells, (M, w) for each type; polylines of varying length keep
     their first nodes.
     """
@@ -211,9 +207,7 @@ def cells_of_rows(
     return cells
 
 
-def _pick_cells(
-    caller: str, points: ArrayLike, cells: Mapping[str, NDArray[np.int64]]
-) -> Simplices:
+def _pick_cells(caller: str, points: ArrayLike, cells: Mapping[str, Ints]) -> Simplices:
     """Select the tetrahedra, or else the triangles, from cells by type; cells of order 2 by
     their corners.
     """
@@ -282,7 +276,7 @@ def from_meshio(mesh: Any) -> Simplices:
             f"from_meshio: expected a meshio.Mesh, got {type(mesh).__name__}; meshio.read(path) "
             "reads one"
         )
-    cells: dict[str, NDArray[np.int64]] = {}
+    cells: dict[str, Ints] = {}
     for block in mesh.cells:
         if len(block.data):
             earlier = [cells[block.type]] if block.type in cells else []
@@ -334,8 +328,8 @@ def check_fields(what: str, fields: Fields | None, n_rows: int | None = None) ->
 
 
 def vtk_grid(
-    points: NDArray[np.float64],
-    cells: NDArray[np.int64],
+    points: Floats,
+    cells: Ints,
     kind: int,
     cell_data: Mapping[str, NDArray],
     point_data: Mapping[str, NDArray],
@@ -385,8 +379,8 @@ def add_array(fields: vtkFieldData, name: str, values: NDArray) -> None:
 
 
 def to_pyvista(
-    points: NDArray[np.float64],
-    cells: NDArray[np.int64],
+    points: Floats,
+    cells: Ints,
     kind: int,
     cell_data: Fields | None,
     point_data: Fields | None,
@@ -399,8 +393,8 @@ def to_pyvista(
 
 
 def to_meshio(
-    points: NDArray[np.float64],
-    cells: NDArray[np.int64],
+    points: Floats,
+    cells: Ints,
     kind: str,
     cell_data: Fields | None,
     point_data: Fields | None,
@@ -417,7 +411,7 @@ def to_meshio(
     )
 
 
-def to_skfem(points: NDArray[np.float64], cells: NDArray[np.int64]) -> Any:
+def to_skfem(points: Floats, cells: Ints) -> Any:
     """Convert a mesh to a `skfem.MeshTri` or `skfem.MeshTet`."""
     skfem = library("skfem", "to_skfem")
     kind = skfem.MeshTet if points.shape[1] == 3 else skfem.MeshTri
@@ -425,7 +419,7 @@ def to_skfem(points: NDArray[np.float64], cells: NDArray[np.int64]) -> Any:
     return kind(np.ascontiguousarray(points.T), np.ascontiguousarray(cells.T))
 
 
-def to_trimesh(points: NDArray[np.float64], triangles: NDArray[np.int64]) -> Any:
+def to_trimesh(points: Floats, triangles: Ints) -> Any:
     """Convert triangles in space, and the points that they use, to a `trimesh.Trimesh`."""
     trimesh = library("trimesh", "to_trimesh")
     used, faces = np.unique(triangles, return_inverse=True)

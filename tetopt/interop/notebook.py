@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from tetopt.geometry.cut import plane_cut
 from tetopt.geometry.simplex import dihedral_angles, rho
+from tetopt.system.arrays import Floats, Ints
 
 if TYPE_CHECKING:
     import PIL.Image
@@ -68,7 +69,7 @@ def _escape_html(text: str) -> str:
     return html.escape("".join(sign if sign.isprintable() else " " for sign in text))
 
 
-def mesh_rows(points: NDArray[np.float64], cells: NDArray[np.int64]) -> list[tuple[str, str]]:
+def mesh_rows(points: Floats, cells: Ints) -> list[tuple[str, str]]:
     """Return rows that describe a mesh: its size, its extent and the shape of its cells."""
     n = points.shape[1]
     shape = rho(points, cells)
@@ -85,7 +86,7 @@ def mesh_rows(points: NDArray[np.float64], cells: NDArray[np.int64]) -> list[tup
     ]
 
 
-def extent_words(points: NDArray[np.float64]) -> str:
+def extent_words(points: Floats) -> str:
     """Format the sides of the bounding box of points, mm."""
     return f"{' x '.join(f'{side:.4g}' for side in np.ptp(points, axis=0))} mm"
 
@@ -93,9 +94,7 @@ def extent_words(points: NDArray[np.float64]) -> str:
 # --- pictures
 
 
-def section_html(
-    points: NDArray[np.float64], cells: NDArray[np.int64], values: NDArray | None = None
-) -> str:
+def section_html(points: Floats, cells: Ints, values: NDArray | None = None) -> str:
     """Return a picture of a mesh as HTML: in 3-D its section at half height in z, x to the right
     and y upwards.
 
@@ -119,7 +118,7 @@ def section_html(
     )
 
 
-def _draw_polygons(corners: NDArray[np.float64], values: NDArray | None) -> PIL.Image.Image:
+def _draw_polygons(corners: Floats, values: NDArray | None) -> PIL.Image.Image:
     """Draw polygons (K, 3 or 4, 2), shaded by their values (K,)."""
     import PIL.Image
     import PIL.ImageDraw
@@ -145,7 +144,7 @@ def _draw_polygons(corners: NDArray[np.float64], values: NDArray | None) -> PIL.
     )
 
 
-def greys(values: NDArray) -> NDArray[np.int64]:
+def greys(values: NDArray) -> Ints:
     """Map numbers to greys between the darkest and the brightest; NaN becomes the darkest."""
     finite = values[np.isfinite(values)]
     low, high = np.quantile(finite, GREY_QUANTILES) if finite.size else (0.0, 0.0)
@@ -158,7 +157,7 @@ def greys(values: NDArray) -> NDArray[np.int64]:
     return np.rint(DARKEST_GREY + fraction * (BRIGHTEST_GREY - DARKEST_GREY)).astype(np.int64)
 
 
-def slice_html(data: NDArray, affine: NDArray[np.float64]) -> str:
+def slice_html(data: NDArray, affine: Floats) -> str:
     """Return a picture of an image's voxels as HTML: in 3-D the middle slice along the last
     axis.
     """

@@ -31,6 +31,7 @@ from tetopt.model.model import (
     traction_forces,
 )
 from tetopt.model.sets import Sets
+from tetopt.system.arrays import Floats, Ints
 from tetopt.system.incoming import regular_file
 
 ALL_ELEMENTS = "all_cells"  # the set for which results are requested
@@ -205,7 +206,7 @@ def _law(model: Model, materials: Materials, k: int) -> str:
     )
 
 
-def _temperatures(model: Model, young: NDArray[np.float64]) -> NDArray[np.float64]:
+def _temperatures(model: Model, young: Floats) -> Floats:
     """Return the temperatures that represent moduli."""
     assert model.node_young is not None
     return young * (HOTTEST_DEGREES / model.node_young.max())
@@ -284,7 +285,7 @@ def _pressures(model: Model, loads: tuple[Load, ...]) -> str:
     values = np.repeat(
         [float(load.numbers[0]) for load in pressed], [len(each) for each in members]
     )
-    total: NDArray[np.float64] = np.bincount(which.ravel(), weights=values).astype(np.float64)
+    total: Floats = np.bincount(which.ravel(), weights=values).astype(np.float64)
     lines = zip(_faces(faces, "P").splitlines(), _fitting(total).tolist(), strict=True)
     return "".join(f"{face}, {value!r}\n" for face, value in lines)
 
@@ -301,7 +302,7 @@ def _weight(loads: tuple[Load, ...]) -> str:
     )
 
 
-def _list(numbers: NDArray[np.int64]) -> str:
+def _list(numbers: Ints) -> str:
     return blocks(numbers + 1, separator=", ")
 
 
@@ -309,7 +310,7 @@ def _number_rows(array: NDArray) -> str:
     return rows(np.arange(1, len(array) + 1), array, separator=", ")
 
 
-def _faces(members: NDArray[np.int64], letter: str = "S") -> str:
+def _faces(members: Ints, letter: str = "S") -> str:
     return rows(members[:, 0] + 1, FACE_NUMBERS[members[:, 1]], separator=f", {letter}")
 
 
@@ -317,7 +318,7 @@ def _number(value: float) -> str:
     return repr(_shorten_number(value))
 
 
-def _fitting(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _fitting(values: Floats) -> Floats:
     """Round values so that none is longer than `NUMBER_CHARACTERS`."""
     return np.array([_shorten_number(x) for x in values.ravel().tolist()]).reshape(values.shape)
 
@@ -356,5 +357,5 @@ def input_sets(path: Path, mesh: Mesh) -> Sets | None:
     return Sets(facets, {name: members for name, members in cells.items() if name not in own})
 
 
-def _integers(text: str) -> NDArray[np.int64]:
+def _integers(text: str) -> Ints:
     return np.array(text.replace(",", " ").split(), dtype=np.int64)

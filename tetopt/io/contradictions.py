@@ -13,10 +13,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.io.text import plain
+from tetopt.system.arrays import Floats
 
 SAME_VOXELS = 0.05  # of a voxel's shortest edge: positions this close are equal
 # of a distance: quaternions in 32 bits turn an image by up to 7e-4 near half a turn
@@ -43,8 +43,8 @@ SPACES_OF_ITK = (  # of NRRD: ITK turns their coordinates to LPS and takes all o
 
 def notes_of_places(
     names: tuple[str, str],
-    used: NDArray[np.float64],
-    other: NDArray[np.float64],
+    used: Floats,
+    other: Floats,
     shape: Sequence[int],
 ) -> list[str]:
     """Return a warning if two affines, (n+1, n+1), mm, place the voxels of a `shape` differently,
@@ -124,7 +124,7 @@ def notes_of_metaimage(fields: Mapping[str, str]) -> list[str]:
     return notes
 
 
-def _along(directions: NDArray[np.float64], ends: str) -> list[str]:
+def _along(directions: Floats, ends: str) -> list[str]:
     """Return a letter per row, of the end of the world axis that it runs along, by the ends of
     +x, +y and +z.
     """
@@ -136,7 +136,7 @@ def _along(directions: NDArray[np.float64], ends: str) -> list[str]:
     ]
 
 
-def _is_other_orientation(letters: str, directions: NDArray[np.float64]) -> bool:
+def _is_other_orientation(letters: str, directions: Floats) -> bool:
     """Return whether MetaImage's three letters fit the directions neither as ends nor as beginnings
     of the axes.
 
@@ -193,7 +193,7 @@ def notes_of_nrrd(fields: Mapping[str, str], sizes: Sequence[int]) -> list[str]:
     return notes
 
 
-def _numbers(text: str) -> NDArray[np.float64]:
+def _numbers(text: str) -> Floats:
     """Parse numbers; empty if there are others, which the library will refuse."""
     try:
         return np.array([float(word) for word in text.split()])

@@ -25,6 +25,7 @@ from tetopt.model.model import (
     mass_densities,
     traction_forces,
 )
+from tetopt.system.arrays import Floats, Ints
 
 MOST_MATERIAL_PARTS = 100  # with more, FEBio Studio's list of parts is unusable
 # FEBio's names of consistent systems of units
@@ -87,7 +88,7 @@ class _Part(NamedTuple):
     young: str  # a number, or the name of a map
     nu: str
     density: str
-    cells: NDArray[np.int64]
+    cells: Ints
 
 
 def febio(model: Model) -> bytes:
@@ -281,7 +282,7 @@ def _loads(model: Model) -> list[str]:
     ]
 
 
-def _dead_forces(model: Model) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _dead_forces(model: Model) -> tuple[Ints, Floats]:
     """Return the nodes with forces from tractions and weight, and these forces, (P, 3)."""
     total = traction_forces(model, model.loads)
     for load in model.loads:
@@ -298,7 +299,7 @@ def _dead_forces(model: Model) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     return nodes, total[nodes]
 
 
-def _springs(model: Model) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _springs(model: Model) -> tuple[Ints, Floats]:
     """Return the nodes on springs, and their stiffness, (P,)."""
     total = np.zeros(len(elements(model)[0]))
     for load in model.loads:
@@ -309,7 +310,7 @@ def _springs(model: Model) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     return nodes, total[nodes]
 
 
-def _ground(model: Model, points: NDArray[np.float64]) -> list[str]:
+def _ground(model: Model, points: Floats) -> list[str]:
     """Return the far ends of springs, numbered after the nodes: along x, y and z from each node
     on springs.
     """
@@ -322,7 +323,7 @@ def _ground(model: Model, points: NDArray[np.float64]) -> list[str]:
     return [f'<Nodes name="far ends of springs">\n{lines}</Nodes>\n']
 
 
-def _force_and_spring_sets(model: Model, points: NDArray[np.float64]) -> list[str]:
+def _force_and_spring_sets(model: Model, points: Floats) -> list[str]:
     forced, sprung = _dead_forces(model)[0], _springs(model)[0]
     sets = [f'<NodeSet name="{DEAD_FORCES}">{_list(forced)}</NodeSet>\n'] if len(forced) else []
     if len(sprung) == 0:
@@ -337,7 +338,7 @@ def _force_and_spring_sets(model: Model, points: NDArray[np.float64]) -> list[st
     return sets
 
 
-def _discrete(constants: NDArray[np.float64]) -> list[str]:
+def _discrete(constants: Floats) -> list[str]:
     """Return a material for each node on springs, and the assignment of springs to materials."""
     materials = [
         f'<discrete_material id="{k}" name="spring {k}" type="linear '
@@ -366,9 +367,7 @@ def _condition(load: Load) -> str:
     )
 
 
-def _items(
-    tag: str, array: NDArray, ids: NDArray[np.int64] | None = None, number: str = "id"
-) -> str:
+def _items(tag: str, array: NDArray, ids: Ints | None = None, number: str = "id") -> str:
     """Return a line for each row of an array, numbered from 1 or by `ids`."""
     lines = rows(array, separator=",").splitlines()
     numbers = range(1, len(lines) + 1) if ids is None else ids.tolist()
@@ -377,5 +376,5 @@ def _items(
     )
 
 
-def _list(numbers: NDArray[np.int64]) -> str:
+def _list(numbers: Ints) -> str:
     return ",".join(map(str, (numbers + 1).tolist()))

@@ -29,6 +29,7 @@ from tetopt.model.loads import known_set
 from tetopt.model.materials import Materials
 from tetopt.model.model import Model, in_space, in_units, locking_words
 from tetopt.model.sets import MOST_LETTERS, SET_NAME, Sets, is_set
+from tetopt.system.arrays import Ints
 
 
 class Format(NamedTuple):
@@ -348,7 +349,7 @@ def _check_model(path: Path, model: Model) -> Model:
 
 def _check_sets(
     path: Path, sets: Mapping[str, ArrayLike], ends: tuple[int, ...], what: str
-) -> dict[str, NDArray[np.int64]]:
+) -> dict[str, Ints]:
     """Return the sets as arrays; InputError unless each has ascending rows of integers from 0 to
     below `ends`.
     """

@@ -24,6 +24,7 @@ from tetopt.io.apart import read_apart
 from tetopt.mesh import Mesh
 from tetopt.model.fields import half_turned_fields, scaled_fields
 from tetopt.model.model import SPACES, STRESS_UNITS, half_turn
+from tetopt.system.arrays import Floats, Ints
 from tetopt.system.budget import check_memory, memory_words
 from tetopt.system.extras import install_hint
 from tetopt.system.incoming import regular_file
@@ -65,7 +66,7 @@ class Results(NamedTuple):
     (1, True)
     """
 
-    point_data: dict[str, NDArray[np.float64]]
+    point_data: dict[str, Floats]
     order: int
     notes: tuple[str, ...]
 
@@ -73,9 +74,9 @@ class Results(NamedTuple):
 class _Grid(NamedTuple):
     """The contents of the file."""
 
-    points: NDArray[np.float64]  # (N, 3)
-    ids: NDArray[np.int64]  # (N,)
-    cells: list[NDArray[np.int64]]  # by kind
+    points: Floats  # (N, 3)
+    ids: Ints  # (N,)
+    cells: list[Ints]  # by kind
     n_times: int
     arrays: list[dict[str, NDArray]]  # for each requested time, by the file's names
 
@@ -154,7 +155,7 @@ def read_frd(path: str | Path, mesh: Mesh) -> Results:
         path, mesh, grid, tuple(each.lower() for each in spaces[:1]) or SPACES
     )
     notes = [] if stated else [f"{path.name} does not state its units: assuming mm and kPa"]
-    point_data: dict[str, NDArray[np.float64]] = {}
+    point_data: dict[str, Floats] = {}
     for step, number in sorted(of_steps.items()):
         if stages[number].n_nodes != len(grid.points):
             raise InputError(
@@ -281,9 +282,7 @@ def _stages(path: Path, whole: bytes) -> list[_Stage]:
     return [_Stage(*key, count) for key, count in sorted(stages.items())]
 
 
-def _results_of_step(
-    path: Path, arrays: dict[str, NDArray], step: int
-) -> dict[str, NDArray[np.float64]]:
+def _results_of_step(path: Path, arrays: dict[str, NDArray], step: int) -> dict[str, Floats]:
     """Return the file's arrays of this step after checking them; InputError unless they are
     usable.
     """
@@ -297,7 +296,7 @@ def _results_of_step(
     return arrays
 
 
-def _on_mesh(arrays: dict[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
+def _on_mesh(arrays: dict[str, Floats]) -> dict[str, Floats]:
     """Return CalculiX's arrays under tetopt's names, in the file's axes and units."""
     point_data = {"displacement": arrays["DISP"]}
     if "TOSTRAIN" in arrays:

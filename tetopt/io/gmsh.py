@@ -61,6 +61,7 @@ from tetopt.model.fields import node_field
 from tetopt.model.file import MASK_TEXT
 from tetopt.model.model import Model, element_facets, elements
 from tetopt.model.sets import facet_triples
+from tetopt.system.arrays import Floats, Ints
 
 # gmsh's numbers for elements by dimension and order: line, triangle, tetrahedron of order 1, then
 # of order 2.
@@ -251,13 +252,13 @@ def _section(name: str, *parts: str) -> str:
     return f"${name}\n{''.join(parts)}$End{name}\n"
 
 
-def _geometry(model: Model) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _geometry(model: Model) -> tuple[Floats, Ints]:
     """Return points (P, 3) and cells, see `elements`."""
     points, cells = elements(model)
     return np.column_stack([points, np.zeros((len(points), 3 - model.mesh.ndim))]), cells
 
 
-def _nodes(model: Model, cells: NDArray[np.int64], part: Part) -> NDArray[np.int64]:
+def _nodes(model: Model, cells: Ints, part: Part) -> Ints:
     """Return the nodes of each element, from 0, in gmsh's order."""
     if part.rows.ndim == 1:
         return cells[part.rows][:, TET10_ORDER] if cells.shape[1] == 10 else cells[part.rows]
@@ -272,7 +273,7 @@ def _parts(model: Model) -> list[Part]:
     return [part for part in number_parts(model) if len(part.numbers)]
 
 
-def _is_of_labels(model: Model, labels: NDArray[np.int64]) -> bool:
+def _is_of_labels(model: Model, labels: Ints) -> bool:
     """Return whether all cells of a label have one material."""
     if model.materials is None:
         return True
@@ -300,7 +301,7 @@ def _by_entity(part: Part) -> Part:
 # Sections
 
 
-def _starts(part: Part) -> NDArray[np.int64]:
+def _starts(part: Part) -> Ints:
     """Return the start of each entity in a part sorted by entity."""
     return np.searchsorted(part.entities, list(part.groups_of))
 
@@ -322,7 +323,7 @@ def _entity_lines(model: Model, part: Part) -> str:
     )
 
 
-def _element_blocks(model: Model, cells: NDArray[np.int64], part: Part) -> str:
+def _element_blocks(model: Model, cells: Ints, part: Part) -> str:
     lines = rows(part.numbers, _nodes(model, cells, part) + 1).splitlines(keepends=True)
     ends = np.append(_starts(part), len(lines)).tolist()
     kind = ELEMENT_TYPES[part.dim, model.order]
@@ -332,7 +333,7 @@ def _element_blocks(model: Model, cells: NDArray[np.int64], part: Part) -> str:
     )
 
 
-def _element_lines(model: Model, cells: NDArray[np.int64], part: Part) -> str:
+def _element_lines(model: Model, cells: Ints, part: Part) -> str:
     """Return lines of number, type, two tags (group, entity) and nodes."""
     kind = np.full(len(part.numbers), ELEMENT_TYPES[part.dim, model.order])
     place = np.searchsorted(list(part.groups_of), part.entities)
@@ -369,14 +370,14 @@ def _views(model: Model, parts: list[Part]) -> list[str]:
     ]
 
 
-def _view(section: str, name: str, numbers: NDArray[np.int64], values: NDArray) -> str:
+def _view(section: str, name: str, numbers: Ints, values: NDArray) -> str:
     n_columns = values[0].size
     return _section(
         section, f'1\n"{name}"\n1\n0.0\n3\n0\n{n_columns}\n{len(numbers)}\n', rows(numbers, values)
     )
 
 
-def _view_columns(fields: dict[str, NDArray]) -> dict[str, NDArray[np.float64]]:
+def _view_columns(fields: dict[str, NDArray]) -> dict[str, Floats]:
     """Convert fields to views: numbers, vectors and tensors; others column by column."""
     names = names_apart(fields, lambda name: name.replace('"', "'"))  # gmsh cannot escape quotes
     return as_columns(
@@ -384,7 +385,7 @@ def _view_columns(fields: dict[str, NDArray]) -> dict[str, NDArray[np.float64]]:
     )
 
 
-def _fields(model: Model) -> dict[str, NDArray[np.float64]]:
+def _fields(model: Model) -> dict[str, Floats]:
     """Return cell data and moduli, (M,), (M, 3) or (M, 9) float64, by name."""
     fields = dict(model.cell_data)
     if model.materials is not None:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from tetopt.io.tags import number_parts, part_comments
 from tetopt.io.text import rows
 from tetopt.model.model import Model, element_facets, elements
+from tetopt.system.arrays import Ints
 
 ELEMENT_KEYWORDS = {1: "Edges", 2: "Triangles", 3: "Tetrahedra"}
 
@@ -50,5 +51,5 @@ def medit(model: Model) -> bytes:
     ).encode("utf-8", "backslashreplace")
 
 
-def _section(keyword: str, values: NDArray, refs: NDArray[np.int64]) -> str:
+def _section(keyword: str, values: NDArray, refs: Ints) -> str:
     return f"\n{keyword}\n{len(values)}\n{rows(values, refs)}"

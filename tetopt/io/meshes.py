@@ -27,6 +27,7 @@ from tetopt.model.fields import half_turned_fields, is_stress, scaled_fields
 from tetopt.model.file import MeshFile, text_in
 from tetopt.model.model import ON_PREFIX, STRESS_UNITS, half_turn
 from tetopt.model.sets import SET_NAME, Sets, free_name, rows_of
+from tetopt.system.arrays import Ints
 from tetopt.system.incoming import regular_file
 
 MESH_SUFFIXES = (*VTK_SUFFIXES, ".msh", ".msh2")
@@ -112,7 +113,7 @@ def load_mesh(path: str | Path) -> MeshFile:
     )
 
 
-def _middles(raw: Raw, kind: str) -> tuple[NDArray[np.int64], bool, tuple[str, ...]]:
+def _middles(raw: Raw, kind: str) -> tuple[Ints, bool, tuple[str, ...]]:
     """Return the mid-edge nodes (E,) in the order of `quadratic`, none for order 1; whether any
     edge is curved; and notes on curved edges and on dropped mid-edge nodes.
     """
@@ -165,9 +166,7 @@ def _numbers(
     return fields, tuple(notes)
 
 
-def _sets_of_groups(
-    raw: Raw, mesh: Mesh, kind: str, used: NDArray[np.int64]
-) -> tuple[Sets, tuple[str, ...]]:
+def _sets_of_groups(raw: Raw, mesh: Mesh, kind: str, used: Ints) -> tuple[Sets, tuple[str, ...]]:
     """Return gmsh's groups of cells and of facets as sets, and notes on renamed ones."""
     place = np.full(len(raw.points), -1)
     place[used] = np.arange(len(used))

@@ -20,13 +20,13 @@ condition.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.io.tags import all_sets, number_parts, part_comments
 from tetopt.io.text import blocks, rows
 from tetopt.mesh import Mesh
 from tetopt.model.model import Model
 from tetopt.model.sets import facet_triples
+from tetopt.system.arrays import Ints
 
 # MFEM's numbers of simplices by dimension: segment, triangle, tetrahedron
 ELEMENT_GEOMETRIES = {1: 1, 2: 2, 3: 4}
@@ -72,7 +72,7 @@ def mfem(model: Model) -> bytes:
     ).encode("utf-8", "backslashreplace")
 
 
-def _elements(attributes: NDArray[np.int64], dim: int, nodes: NDArray[np.int64]) -> str:
+def _elements(attributes: Ints, dim: int, nodes: Ints) -> str:
     return f"{len(nodes)}\n" + rows(attributes, np.full(len(nodes), ELEMENT_GEOMETRIES[dim]), nodes)
 
 

@@ -46,6 +46,7 @@ from tetopt.io.volumes import (
     plane_affine,
     volume_index,
 )
+from tetopt.system.arrays import Floats
 from tetopt.system.incoming import irregular
 
 NIFTI_HEAD_BYTES = 1024  # read from a file: the longest header has 540
@@ -71,9 +72,7 @@ DATA_ERRORS = (*FILE_ERRORS, ValueError, TypeError, OverflowError)
 HEADER_ERRORS = (*DATA_ERRORS, KeyError, HeaderDataError, WrapStructError, MGHError)
 
 
-def read_nibabel(
-    path: Path, request: Request, notes: list[str]
-) -> tuple[NDArray, NDArray[np.float64]]:
+def read_nibabel(path: Path, request: Request, notes: list[str]) -> tuple[NDArray, Floats]:
     """Return data and affine, 2-D or 3-D; InputError without a leading path."""
     header_file, voxel_file = _files_of(path)
     with _nibabel_heard() as words:
@@ -227,7 +226,7 @@ def _notes_of_place(header: Any, shape: tuple[int, ...], head: bytes) -> list[st
     return [f"{guess}; if they matter, convert it again with its sform or qform", *notes]
 
 
-def _units(header: Any, notes: list[str]) -> NDArray[np.float64] | None:
+def _units(header: Any, notes: list[str]) -> Floats | None:
     """Return the length of the file's unit, mm, for each axis; None if it states none."""
     if isinstance(header, MGHHeader):
         return None

@@ -8,14 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.interop.conversions import CELL_DIMENSIONS, corner_kinds
+from tetopt.system.arrays import Floats, Ints
 
 
 class RawGrid(NamedTuple):
     """A VTK unstructured grid as plain arrays."""
 
-    points: NDArray[np.float64]  # (N, 3)
-    connectivity: NDArray[np.int64]
-    offsets: NDArray[np.int64]  # (M + 1,), into the connectivity
+    points: Floats  # (N, 3)
+    connectivity: Ints
+    offsets: Ints  # (M + 1,), into the connectivity
     cell_types: NDArray[np.uint8]  # (M,)
     point_data: dict[str, NDArray]
     cell_data: dict[str, NDArray]
@@ -28,21 +29,21 @@ class Group(NamedTuple):
 
     label: str  # in the file
     kind: str
-    members: NDArray[np.int64]  # ascending
+    members: Ints  # ascending
     number: int = 0  # in the file
 
 
 class Raw(NamedTuple):
     """A file's cells by type."""
 
-    points: NDArray[np.float64]  # (N, 3)
-    cells: dict[str, NDArray[np.int64]]
+    points: Floats  # (N, 3)
+    cells: dict[str, Ints]
     cell_data: dict[str, dict[str, NDArray]]  # by name, then type
     point_data: dict[str, NDArray]  # by name, one row per point
     field_data: dict[str, NDArray]
     groups: list[Group]
     space: str
-    middles: dict[str, NDArray[np.int64]] = {}  # noqa: RUF012 - never changed; see `by_corners`
+    middles: dict[str, Ints] = {}  # noqa: RUF012 - never changed; see `by_corners`
     notes: tuple[str, ...] = ()  # one line for each dropped item
 
 

@@ -36,6 +36,7 @@ from tetopt.io.volumes import (
     volume_index,
 )
 from tetopt.model.label_names import LabelTable
+from tetopt.system.arrays import Floats, Ints
 from tetopt.system.extras import install_hint
 from tetopt.system.incoming import irregular
 
@@ -117,14 +118,12 @@ class Frame(NamedTuple):
 class FrameGrid(NamedTuple):
     """Where frames lie."""
 
-    affine: NDArray[np.float64]  # (4, 4), RAS
-    slices: NDArray[np.int64]  # of each frame, from 0
+    affine: Floats  # (4, 4), RAS
+    slices: Ints  # of each frame, from 0
     n_slices: int
 
 
-def read_dicom(
-    path: Path, request: Request, notes: list[str]
-) -> tuple[NDArray, NDArray[np.float64]]:
+def read_dicom(path: Path, request: Request, notes: list[str]) -> tuple[NDArray, Floats]:
     """Return data and affine of a file, or of the one series in a folder; InputError without a
     leading path.
     """
@@ -194,7 +193,7 @@ def _read(read: Callable[..., Any], path: Path, *rest: Any) -> Any:
 # In the child
 
 
-def image_of(path: str, volume: int | None) -> tuple[NDArray, NDArray[np.float64], list[str]]:
+def image_of(path: str, volume: int | None) -> tuple[NDArray, Floats, list[str]]:
     """Return data, affine and warnings."""
     notes: list[str] = []
     files = _series(Path(path), notes)
@@ -712,7 +711,7 @@ def _place_frames(frames: list[Frame], notes: list[str], *, is_sparse: bool) -> 
     return FrameGrid(affine, slices, int(slices.max()) + 1)
 
 
-def _ranks(points: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.int64]:
+def _ranks(points: Floats, normal: Floats) -> Ints:
     """Return the rank of each point, (n, 3), along the normal; the same for those at one place."""
     order = np.argsort(points @ normal, kind="stable")
     is_new = np.linalg.norm(np.diff(points[order], axis=0), axis=1) > _SAME_PLACE_MM
@@ -722,8 +721,8 @@ def _ranks(points: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[
 
 
 def _even(
-    points: NDArray[np.float64], normal: NDArray[np.float64], frames: list[Frame], notes: list[str]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    points: Floats, normal: Floats, frames: list[Frame], notes: list[str]
+) -> tuple[Floats, Ints]:
     """Return the step between slices, and each one's rank; InputError unless each has a place,
     evenly spaced.
     """
@@ -757,8 +756,8 @@ def _even(
 
 
 def _sparse(
-    points: NDArray[np.float64], normal: NDArray[np.float64], frames: list[Frame], notes: list[str]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    points: Floats, normal: Floats, frames: list[Frame], notes: list[str]
+) -> tuple[Floats, Ints]:
     """Return the step between slices, and each frame's slice; InputError unless all lie at
     multiples of the step.
 
@@ -806,9 +805,7 @@ def _thickness(frame: Frame, notes: list[str]) -> float:
     return length
 
 
-def _check_step(
-    step: NDArray[np.float64], normal: NDArray[np.float64], frames: list[Frame], notes: list[str]
-) -> None:
+def _check_step(step: Floats, normal: Floats, frames: list[Frame], notes: list[str]) -> None:
     """Raise InputError for slices beside each other; note a step other than the one stated."""
     across = float(step @ normal)
     if across <= _SAME_PLACE_MM:
@@ -835,7 +832,7 @@ def _check_step(
         )
 
 
-def _unevenness(points: NDArray[np.float64], off: NDArray[np.float64]) -> str:
+def _unevenness(points: Floats, off: Floats) -> str:
     """Describe where slices at `points`, (n, 3), mm, are uneven: an unusual step, or else the
     largest `off` (n,).
     """
@@ -984,7 +981,7 @@ def _clear(data: NDArray, outside: set[int], names: dict[int, str], notes: list[
 
 def _write_segments(
     frames: list[Frame],
-    slices: NDArray[np.int64],
+    slices: Ints,
     data: NDArray,
     whole: int,
     names: dict[int, str],

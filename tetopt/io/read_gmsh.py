@@ -18,6 +18,7 @@ from tetopt.io.apart import read_apart
 from tetopt.io.gmsh import OwnComments, own_comments
 from tetopt.io.raw import Group, Raw, by_corners
 from tetopt.model.label_names import LABEL_FIELD, TABLE_TEXT, LabelTable, table_words
+from tetopt.system.arrays import Ints
 from tetopt.system.budget import check_memory, memory_words
 
 if TYPE_CHECKING:
@@ -161,9 +162,7 @@ def _of_ours(raw: Raw, comments: OwnComments) -> Raw:
     )
 
 
-def _members(
-    raw: Raw, kind: str, entities_of: dict[str, list[int]]
-) -> dict[str, NDArray[np.int64]]:
+def _members(raw: Raw, kind: str, entities_of: dict[str, list[int]]) -> dict[str, Ints]:
     """Return the elements of a type in each set, ascending, given the entities of the set.
 
     When gmsh saves a file again, it keeps tetopt's comments and entities, but not all of their
@@ -178,7 +177,7 @@ def _members(
 
 
 def _groups(
-    cells: dict[str, NDArray[np.int64]],
+    cells: dict[str, Ints],
     cell_data: dict[str, dict[str, NDArray]],
     names: dict[tuple[int, int], str],
     groups_of: dict[tuple[int, int], list[int]] | None,
@@ -189,7 +188,7 @@ def _groups(
     for kind, dim in CELL_DIMENSIONS.items():
         if dim not in DEFAULT_LABELS or len(tags.get(kind, ())) != len(cells.get(kind, ())):
             continue
-        parts: dict[int, list[NDArray[np.int64]]] = {}
+        parts: dict[int, list[Ints]] = {}
         for value, members in _by_value(tags.get(kind, np.empty(0))).items():
             for group in [value] if groups_of is None else groups_of.get((dim, value), []):
                 parts.setdefault(abs(group), []).append(members)  # the sign is an orientation
@@ -200,7 +199,7 @@ def _groups(
     return groups
 
 
-def _by_value(tags: NDArray) -> dict[int, NDArray[np.int64]]:
+def _by_value(tags: NDArray) -> dict[int, Ints]:
     """Return the positions of each value, ascending."""
     order = np.argsort(tags, kind="stable")
     values, starts = np.unique(tags[order], return_index=True)

@@ -20,6 +20,7 @@ from tetopt.io.itk_headers import NRRD_SUFFIXES, check_header, data_files, heade
 from tetopt.io.segments import labels_of_layers, segments_of
 from tetopt.io.units import mm_of_axes, notes_of_size
 from tetopt.io.volumes import UNREADABLE_FILE, Reader, Request, one_line, volume_index
+from tetopt.system.arrays import Floats
 from tetopt.system.extras import install_hint
 
 # ITK chooses its reader by the case-sensitive suffix; naming the reader also opens SCAN.MHA.
@@ -33,7 +34,7 @@ ITK_READERS = {
 SPATIAL_KINDS = ("domain", "space", "???", "none")
 
 
-def read_itk(path: Path, request: Request, notes: list[str]) -> tuple[NDArray, NDArray[np.float64]]:
+def read_itk(path: Path, request: Request, notes: list[str]) -> tuple[NDArray, Floats]:
     """Return data and affine of a file; InputError without a leading path."""
     _check_installed()
     header, size = check_header(path)
@@ -68,7 +69,7 @@ def read_itk(path: Path, request: Request, notes: list[str]) -> tuple[NDArray, N
 ITK = Reader(tuple(ITK_READERS), read_itk, shape=header_sizes, other_files=data_files)
 
 
-def _nrrd_units(fields: dict[str, str], notes: list[str]) -> NDArray[np.float64] | None:
+def _nrrd_units(fields: dict[str, str], notes: list[str]) -> Floats | None:
     """Return the lengths of units along the world axes, mm; None if there are none."""
     name, key = ("space units", "spaceunits") if "spaceunits" in fields else ("units", "units")
     if key not in fields:
@@ -88,7 +89,7 @@ def _nrrd_units(fields: dict[str, str], notes: list[str]) -> NDArray[np.float64]
     return mm_of_axes(words[:3], name, notes)
 
 
-def _metaimage_units(fields: dict[str, str], notes: list[str]) -> NDArray[np.float64] | None:
+def _metaimage_units(fields: dict[str, str], notes: list[str]) -> Floats | None:
     words = [fields.get("DistanceUnits", "").strip("?")] * 3
     return mm_of_axes(words, "DistanceUnits", notes)
 
@@ -101,9 +102,7 @@ def _check_installed() -> None:
 # In the child
 
 
-def _volume_of(
-    path: str, volume: int | None, has_layers: bool = False
-) -> tuple[NDArray, NDArray[np.float64]]:
+def _volume_of(path: str, volume: int | None, has_layers: bool = False) -> tuple[NDArray, Floats]:
     """Return data, with layers on a last axis if it has them, and affine."""
     import SimpleITK as sitk
 
@@ -141,7 +140,7 @@ def _check_components(count: int) -> None:
         )
 
 
-def _ras_affine(source: Any) -> NDArray[np.float64]:
+def _ras_affine(source: Any) -> Floats:
     """Return the RAS affine of a SimpleITK image or reader (LPS), for its first three axes or
     its two.
     """

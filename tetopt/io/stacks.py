@@ -27,6 +27,7 @@ from tetopt.io.read_dicom import is_dicom
 from tetopt.io.text import plain
 from tetopt.io.units import mm_of_unit
 from tetopt.io.volumes import UNREADABLE_FILE, Reader, Request, check_room, exact_type, one_line
+from tetopt.system.arrays import Floats
 from tetopt.system.extras import install_hint
 from tetopt.system.incoming import irregular
 
@@ -67,7 +68,7 @@ def parse_spacing(text: str) -> tuple[float, ...]:
         ) from None
 
 
-def spacing_of(spacing_mm: float | Sequence[float], n: int) -> NDArray[np.float64]:
+def spacing_of(spacing_mm: float | Sequence[float], n: int) -> Floats:
     """Return n voxel sizes, mm, from one or n; InputError unless they are positive."""
     sizes = np.atleast_1d(np.asarray(spacing_mm, dtype=np.float64))
     if sizes.shape not in ((1,), (n,)) or not (np.isfinite(sizes) & (sizes > 0.0)).all():
@@ -77,7 +78,7 @@ def spacing_of(spacing_mm: float | Sequence[float], n: int) -> NDArray[np.float6
     return np.broadcast_to(sizes, n).copy()
 
 
-def check_spacing(spacing_mm: float | Sequence[float] | None, own: NDArray[np.float64]) -> None:
+def check_spacing(spacing_mm: float | Sequence[float] | None, own: Floats) -> None:
     """Raise InputError if `spacing_mm` differs from the file's own voxel sizes, mm; NaN for
     unknown ones.
     """
@@ -101,9 +102,7 @@ class Tiff(NamedTuple):
     notes: Sequence[str] = ()
 
 
-def read_pictures(
-    path: Path, request: Request, notes: list[str]
-) -> tuple[NDArray, NDArray[np.float64]]:
+def read_pictures(path: Path, request: Request, notes: list[str]) -> tuple[NDArray, Floats]:
     """Return data and affine of a picture, or of a TIFF file's stack of pages; InputError
     without a leading path.
     """
@@ -125,9 +124,7 @@ def read_pictures(
     return _scale_values(tiff.voxels, tiff.scale), _affine(steps)
 
 
-def read_slices(
-    path: Path, request: Request, notes: list[str]
-) -> tuple[NDArray, NDArray[np.float64]]:
+def read_slices(path: Path, request: Request, notes: list[str]) -> tuple[NDArray, Floats]:
     """Return data and affine of a folder of slices, in their order; InputError without a leading
     path.
     """
@@ -161,7 +158,7 @@ def _has_tifffile() -> bool:
 
 def _steps(
     tiff: Tiff, n: int, spacing_mm: float | Sequence[float] | None, notes: list[str]
-) -> NDArray[np.float64] | None:
+) -> Floats | None:
     """Return n voxel sizes, mm, as the file or `spacing_mm` states; None without any. InputError
     if they differ.
     """
@@ -258,11 +255,11 @@ def _series(names: list[str]) -> tuple[list[str], list[str]]:
     return order, notes
 
 
-def _affine(sizes: NDArray[np.float64]) -> NDArray[np.float64]:
+def _affine(sizes: Floats) -> Floats:
     return np.diag([-sizes[0], -sizes[1], sizes[2], 1.0])
 
 
-def _sizes(sizes: NDArray[np.float64]) -> str:
+def _sizes(sizes: Floats) -> str:
     return " x ".join("unknown" if np.isnan(size) else f"{size:.6g}" for size in sizes)
 
 

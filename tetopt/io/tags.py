@@ -37,6 +37,7 @@ from tetopt.model.sets import (
     free_name,
     label_set_names,
 )
+from tetopt.system.arrays import Ints
 
 UNNAMED_GROUP = "unnamed"  # the group of cells in no other group
 LEAST_ROOM = 1000  # numbers reserved for labels
@@ -49,8 +50,8 @@ class Tagged(NamedTuple):
     all sets of an item.
     """
 
-    items: NDArray[np.int64]  # (T,) or (T, 2): all cells or facets in sets, ascending
-    tags: NDArray[np.int64]  # (T,) from 1
+    items: Ints  # (T,) or (T, 2): all cells or facets in sets, ascending
+    tags: Ints  # (T,) from 1
     tags_of: dict[str, list[int]]  # the tags of each set
 
 
@@ -60,16 +61,16 @@ class Part(NamedTuple):
     """
 
     dim: int
-    numbers: NDArray[np.int64]  # (E,) from 1
-    rows: NDArray[np.int64]  # (E,) cells, or (E, 2) facets
-    entities: NDArray[np.int64]  # (E,) the number of each element's entity
+    numbers: Ints  # (E,) from 1
+    rows: Ints  # (E,) cells, or (E, 2) facets
+    entities: Ints  # (E,) the number of each element's entity
     # by entity, ascending: the numbers of its physical groups, the smallest set first
     groups_of: dict[int, list[int]]
     names: dict[int, str]  # names of the groups, by number
     sets: dict[str, list[int]]  # the entities of each set
 
 
-def tag_sets(sets: dict[str, NDArray[np.int64]]) -> Tagged:
+def tag_sets(sets: dict[str, Ints]) -> Tagged:
     """Return one tag for each combination of sets that occurs, from 1 in the order of first
     occurrence.
 
@@ -92,7 +93,7 @@ def tag_sets(sets: dict[str, NDArray[np.int64]]) -> Tagged:
     return Tagged(items, rank[kind.ravel()], tags_of)
 
 
-def cell_tags(model: Model, labels: NDArray[np.int64] | None = None) -> Tagged:
+def cell_tags(model: Model, labels: Ints | None = None) -> Tagged:
     """Return all cells, with one tag for each combination of label, material ("material_1", ...)
     and cell sets.
 
@@ -120,7 +121,7 @@ def cell_tags(model: Model, labels: NDArray[np.int64] | None = None) -> Tagged:
     return Tagged(np.arange(len(material)), which.ravel() + 1, tags_of)
 
 
-def facet_tags(mesh: Mesh, sets: dict[str, NDArray[np.int64]]) -> Tagged:
+def facet_tags(mesh: Mesh, sets: dict[str, Ints]) -> Tagged:
     """Return `tag_sets` for facet sets; a facet that sets hold from both of its sides is one item.
 
     It is listed as in the first set that contains it; items are in the order of the facets' nodes.
@@ -134,14 +135,14 @@ def facet_tags(mesh: Mesh, sets: dict[str, NDArray[np.int64]]) -> Tagged:
     return combined._replace(items=np.concatenate(list(sets.values()))[first])
 
 
-def group_of_zero(labels: NDArray[np.int64]) -> int:
+def group_of_zero(labels: Ints) -> int:
     """Return the number of label 0, the first after all labels, because 0 means none in the
     formats.
     """
     return int(labels.max()) + 1
 
 
-def group_labels(model: Model) -> NDArray[np.int64] | None:
+def group_labels(model: Model) -> Ints | None:
     """Return the numbers of the cells' labels (M,), if any: the labels, unless there are
     `renumbered_labels`.
     """
@@ -219,9 +220,7 @@ def _part(
     return Part(dim, numbers, of_items.items, number[of_items.tags - 1], by_number, names, sets)
 
 
-def _cell_groups(
-    model: Model, labels: NDArray[np.int64] | None
-) -> tuple[dict[int, str], NDArray[np.int64]]:
+def _cell_groups(model: Model, labels: Ints | None) -> tuple[dict[int, str], Ints]:
     """Return the names of the cells' groups by number, ascending, and the number of each cell's
     group.
     """
@@ -250,7 +249,7 @@ def _cell_groups(
     return dict(enumerate(listed, 1)), group
 
 
-def _disjoint_sets(model: Model) -> tuple[list[str], NDArray[np.int64]]:
+def _disjoint_sets(model: Model) -> tuple[list[str], Ints]:
     """Return cell sets that do not overlap previous ones, and the number, from 1, of each cell's
     set or "unnamed".
     """
@@ -289,7 +288,7 @@ def _facets(model: Model, room: int) -> Part:
     )
 
 
-def material_names(model: Model, taken: dict[str, NDArray[np.int64]]) -> list[str]:
+def material_names(model: Model, taken: dict[str, Ints]) -> list[str]:
     """Return names "material_1", ... of the model's materials; InputError if a set in `taken`
     has such a name.
     """
@@ -338,7 +337,7 @@ def named_materials(model: Model) -> list[str]:
     return names
 
 
-def check_apart(names: list[str], taken: dict[str, NDArray[np.int64]]) -> None:
+def check_apart(names: list[str], taken: dict[str, Ints]) -> None:
     """Raise InputError if a set has a name that the file uses for something else."""
     lower = {name.lower() for name in names}
     if both := [name for name in taken if name.lower() in lower]:

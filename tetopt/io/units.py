@@ -8,10 +8,10 @@ import re
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.io.text import plain
+from tetopt.system.arrays import Floats
 
 # NGFF's units of length, with names of UDUNITS-2, in mm.
 MM_PER_LENGTH = {
@@ -93,7 +93,7 @@ def mm_of_unit(word: str, name: str = "unit") -> float | None:
     )
 
 
-def mm_of_axes(words: Sequence[str], name: str, notes: list[str]) -> NDArray[np.float64] | None:
+def mm_of_axes(words: Sequence[str], name: str, notes: list[str]) -> Floats | None:
     """Return the length of each axis's unit, mm, assuming mm where one is missing; None if all are
     missing.
 
@@ -117,9 +117,7 @@ def mm_of_axes(words: Sequence[str], name: str, notes: list[str]) -> NDArray[np.
     return np.array([1.0 if mm is None else mm for mm in lengths])
 
 
-def notes_of_size(
-    shape: Sequence[int], affine: NDArray[np.float64], lengths: NDArray[np.float64] | None
-) -> list[str]:
+def notes_of_size(shape: Sequence[int], affine: Floats, lengths: Floats | None) -> list[str]:
     """Return a warning if the longest side of the image's box is unusual.
 
     `lengths` are those of the axes' units, mm; None if the file states no unit, which may then be

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
+from tetopt.system.arrays import Floats
 from tetopt.system.budget import check_memory
 
 IMAGE_BYTES = 8  # per voxel of an `Image`, at most
@@ -64,7 +65,7 @@ class Reader(NamedTuple):
     """
 
     suffixes: tuple[str, ...]
-    read: Callable[[Path, Request, list[str]], tuple[NDArray, NDArray[np.float64]]]
+    read: Callable[[Path, Request, list[str]], tuple[NDArray, Floats]]
     is_this: Callable[[Path], bool] = lambda _path: False
     shape: Callable[[Path], tuple[int, ...] | None] = lambda _path: None
     other_files: Callable[[Path], list[Path]] = _no_files
@@ -129,7 +130,7 @@ def one_line(words: object) -> str:
     return " ".join(str(words).split())
 
 
-def plane_affine(columns: NDArray[np.float64], origin: NDArray[np.float64]) -> NDArray[np.float64]:
+def plane_affine(columns: Floats, origin: Floats) -> Floats:
     """Return the 2-D affine (3, 3) of a plane in 3-D with voxel steps `columns` (3, 2) and first
     voxel `origin`, mm.
     """

@@ -110,6 +110,7 @@ from tetopt.model.fields import NODE_MODULI, node_field
 from tetopt.model.loads import load_words
 from tetopt.model.model import Model, element_facets, elements, header_lines
 from tetopt.model.sets import Sets
+from tetopt.system.arrays import Floats, Ints
 
 # By dimension and order, with VTK's order of nodes; lines must state their number of nodes.
 TOPOLOGY_TYPES = {
@@ -232,7 +233,7 @@ def _facet_grid(model: Model) -> str:
     return _tag_grid("facets", model, model.mesh.ndim - 1, nodes, combined)
 
 
-def _tag_grid(name: str, model: Model, dim: int, nodes: NDArray[np.int64], combined: Tagged) -> str:
+def _tag_grid(name: str, model: Model, dim: int, nodes: Ints, combined: Tagged) -> str:
     named = "".join(
         _information(each, " ".join(map(str, those))) for each, those in combined.tags_of.items()
     )
@@ -241,7 +242,7 @@ def _tag_grid(name: str, model: Model, dim: int, nodes: NDArray[np.int64], combi
     return f'<Grid Name="{name}" GridType="Uniform">\n{named}{TIME_ELEMENT}{body}{tags}</Grid>\n'
 
 
-def _body(model: Model, dim: int, nodes: NDArray[np.int64], node_item: str, point_item: str) -> str:
+def _body(model: Model, dim: int, nodes: Ints, node_item: str, point_item: str) -> str:
     return (
         f"<Topology TopologyType={TOPOLOGY_TYPES[dim, model.order]} "
         f'NumberOfElements="{len(nodes)}">\n'
@@ -286,5 +287,5 @@ def _information(name: str, value: str) -> str:
     )
 
 
-def _values_text(values: NDArray[np.float64]) -> str:
+def _values_text(values: Floats) -> str:
     return " ".join(map(repr, values.tolist()))

@@ -25,6 +25,7 @@ from tetopt.io.apart import read_apart
 from tetopt.io.text import plain
 from tetopt.io.units import mm_of_axes, notes_of_size
 from tetopt.io.volumes import Reader, Request, check_room, one_line, volume_index
+from tetopt.system.arrays import Floats
 from tetopt.system.budget import check_memory
 from tetopt.system.extras import install_hint
 from tetopt.system.files import folder_written_whole
@@ -68,7 +69,7 @@ class ZarrLevel(NamedTuple):
     array: Any
     names: tuple[str, ...]  # of all axes
     space: tuple[int, ...]  # the three spatial axes, in order
-    affine: NDArray[np.float64]  # (4, 4), from indices along these three axes to world, mm
+    affine: Floats  # (4, 4), from indices along these three axes to world, mm
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -87,9 +88,9 @@ class _Axes(NamedTuple):
     names: tuple[str, ...]
     space: list[int]  # numbers of the spatial axes
     rows: list[int]  # of the affine, for each spatial axis
-    steps: NDArray[np.float64]  # mm along this row per unit of the axis
+    steps: Floats  # mm along this row per unit of the axis
     notes: list[str]
-    mm: NDArray[np.float64] | None  # lengths of units, if there are any
+    mm: Floats | None  # lengths of units, if there are any
 
 
 def is_zarr(path: Path) -> bool:
@@ -108,9 +109,7 @@ def is_node(path: Path) -> bool:
     return any((path / name).exists() for name in NODE_FILES)
 
 
-def read_zarr(
-    path: Path, request: Request, notes: list[str]
-) -> tuple[NDArray, NDArray[np.float64]]:
+def read_zarr(path: Path, request: Request, notes: list[str]) -> tuple[NDArray, Floats]:
     """Return data and affine of the requested box of the finest level, of which nothing else is
     read.
     """
@@ -240,7 +239,7 @@ def zarr_levels(path: Path, notes: list[str]) -> list[ZarrLevel]:
         ) from error
 
 
-def save_zarr(path: Path, affine: NDArray[np.float64], values: NDArray) -> None:
+def save_zarr(path: Path, affine: Floats, values: NDArray) -> None:
     """Write an OME-Zarr image (NGFF 0.5, Zarr's format 3), whole or not at all.
 
     Its axes are named x, y, z in the order of the indices. Scale and translation are the lengths of
@@ -387,9 +386,7 @@ def _axes_of(axes: list[dict[str, Any]]) -> _Axes:
     return _Axes(names, space, list(rows), np.array(signs) * (1.0 if mm is None else mm), notes, mm)
 
 
-def _scale_and_shift(
-    transforms: list[dict[str, Any]], n: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _scale_and_shift(transforms: list[dict[str, Any]], n: int) -> tuple[Floats, Floats]:
     """Combine successive scales and translations of n axes."""
     scale, shift, has_scale = np.ones(n), np.zeros(n), False
     for each in transforms:
@@ -415,7 +412,7 @@ def _unusable(what: str, value: object, expected: str) -> InputError:
     )
 
 
-def _own_affine(array: Any) -> NDArray[np.float64] | None:
+def _own_affine(array: Any) -> Floats | None:
     """Return the attribute "affine" of an array, (4, 4), for its spatial axes in order."""
     affine = array.attrs.asdict().get("affine")
     return None if affine is None else check_affine(affine, 3)

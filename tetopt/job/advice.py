@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.contents.labels import BACKGROUND_LABEL
 from tetopt.engine.aim import Mode
@@ -25,6 +24,7 @@ from tetopt.model.label_names import count_of_labels, label_words
 from tetopt.start.label_sizes import SizesByLabel
 from tetopt.start.octree import is_for_walls
 from tetopt.start.sizes import LONG_EDGE, EdgeRatios, Sizes
+from tetopt.system.arrays import Floats
 
 # Of the cells, over the voxels': other volumes are told beside the verdict.
 NEAR_VOLUME, NEAR_MASK = (0.85, 1.15), (0.95, 1.05)
@@ -477,7 +477,7 @@ def of_empty(
     result: MeshingResult,
     is_free: bool,
     n_empty: int,
-    spacing: NDArray[np.float64],
+    spacing: Floats,
     is_masked: bool = False,
 ) -> Iterator[Problem]:
     """Yield a problem if many cells contain no voxel centre; `spacing` (n,) are the edges of the

@@ -11,7 +11,6 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.contents.content import Content
 from tetopt.contents.domain import INSIDE_FRACTION
@@ -41,6 +40,7 @@ from tetopt.model.model import Model
 from tetopt.report.tables import curving_in_words
 from tetopt.start.memory import bytes_of, next_bytes
 from tetopt.start.octree import is_for_walls
+from tetopt.system.arrays import Ints
 from tetopt.system.budget import (
     BYTES_PER_GB,
     MemoryLimit,
@@ -70,7 +70,7 @@ def mesh_task(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
     def most_bytes(nodes: int) -> float:
         return max(before[0], before[1] + bytes_of(content, nodes))
 
-    def keep(mesh: Mesh, labels: NDArray[np.int64] | None) -> None:
+    def keep(mesh: Mesh, labels: Ints | None) -> None:
         if labels is None and task.source.labels is not None:
             labels = cell_labels(task.source.labels, mesh)
         beside = islice(kept_places(job.output, ".vtu"), 1)

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, cast, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 import tetopt
 from tetopt.errors import InputError, error_words
@@ -45,6 +44,7 @@ from tetopt.model.sets import (
     parse_set,
     standard_names,
 )
+from tetopt.system.arrays import Ints
 from tetopt.system.files import kept_places
 
 MEAN_FIELD = r"mean(_\d+)?"  # of the image, and of further contrasts
@@ -395,7 +395,7 @@ def save_for_solver(output: Path, model: Model, solver: SolverOptions) -> None:
     save_model(output, model, space=solver.space, units=solver.units)
 
 
-def keep_early(mesh: Mesh, labels: NDArray[np.int64] | None, places: Iterable[Path]) -> Path | None:
+def keep_early(mesh: Mesh, labels: Ints | None, places: Iterable[Path]) -> Path | None:
     """Keep an optimised mesh in the first possible place until all is written, in case the
     process ends; return it.
     """

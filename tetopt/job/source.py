@@ -66,6 +66,7 @@ from tetopt.model.label_names import (
 )
 from tetopt.model.sets import box_of, box_text
 from tetopt.model.tissues import is_preset, merge_labels, numbers_by_name, renumber_labels
+from tetopt.system.arrays import Ints
 
 
 class Source(NamedTuple):
@@ -114,7 +115,7 @@ class Source(NamedTuple):
         spread = self.content.spread
         return spread.low == spread.high
 
-    def fields(self, mesh: Mesh, labels: NDArray[np.int64] | None = None) -> dict[str, NDArray]:
+    def fields(self, mesh: Mesh, labels: Ints | None = None) -> dict[str, NDArray]:
         """Return the fields of the mesh's file: those of `cell_fields`, means of further contrasts,
         and the label.
 

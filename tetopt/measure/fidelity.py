@@ -38,7 +38,7 @@ from tetopt.geometry.simplex import centroids, volumes
 from tetopt.geometry.topology import Facets, components, facets, lexicographic_order
 from tetopt.image import Image, transform_vectors
 from tetopt.mesh import Mesh
-from tetopt.system.arrays import plain_array
+from tetopt.system.arrays import Bools, Floats, Ints, plain_array
 from tetopt.system.kernel_cache import njit
 from tetopt.system.slabs import count_pairs, over_slabs, sum_over_slabs
 
@@ -55,8 +55,8 @@ EVEN_STEPS = {2: 0.7548776662466927 ** np.arange(1, 3), 3: 0.8191725133961645 **
 class FacetSurface(NamedTuple):
     """Triangles in space, or segments in the plane; the surface may be open."""
 
-    points: NDArray[np.float64]  # (P, n)
-    facets: NDArray[np.int64]  # (T, n), indices of points; not oriented
+    points: Floats  # (P, n)
+    facets: Ints  # (T, n), indices of points; not oriented
 
 
 class Thickness(NamedTuple):
@@ -244,7 +244,7 @@ class MaskFidelity(NamedTuple):
     lost_components: tuple[LostComponent, ...] = ()
 
 
-def cell_labels(labels: Image, mesh: Mesh) -> NDArray[np.int64]:
+def cell_labels(labels: Image, mesh: Mesh) -> Ints:
     """Label of each cell: the most frequent one of its voxels, the smallest of several.
 
     A cell without voxel centre has the label of the voxel nearest to its centroid.
@@ -366,8 +366,8 @@ def label_fidelity(
 def label_pieces(
     rows: NDArray[np.integer],
     painted: NDArray[np.integer],
-    is_covered: NDArray[np.bool_],
-    affine: NDArray[np.float64],
+    is_covered: Bools,
+    affine: Floats,
 ) -> Iterator[tuple[int, tuple[slice, ...], int, bool, int, tuple[LostComponent, ...]]]:
     """Yield each label's row and box in the voxels, the number of its voxels that cells should
     represent, True if one lies in its cells, and its number of components and the lost ones.
@@ -390,7 +390,7 @@ def _label_columns(
     true: NDArray[np.integer],
     painted: NDArray[np.integer],
     owner: NDArray[np.integer],
-    label_of_cell: NDArray[np.int64],
+    label_of_cell: Ints,
     outside: int,
 ) -> dict[str, NDArray]:
     """Volumes and overlaps of all labels, by the names of `LabelFidelity`."""
@@ -426,9 +426,9 @@ def _label_distances(
     labels: Image,
     mesh: Mesh,
     true: NDArray[np.integer],
-    label_of_cell: NDArray[np.int64],
+    label_of_cell: Ints,
     outside: int,
-) -> Callable[[int, tuple[slice, ...]], NDArray[np.float64]]:
+) -> Callable[[int, tuple[slice, ...]], Floats]:
     """Return a function that measures the distances between the surfaces of a label, by its row
     and the box of its voxels, both ways.
     """
@@ -437,7 +437,7 @@ def _label_distances(
     nodes, sides = _labels_beside_facets(labels, pieces, of_piece, shared, outside)
     face = _face(labels.voxel_volume, labels.ndim)
 
-    def distances(row: int, box: tuple[slice, ...]) -> NDArray[np.float64]:
+    def distances(row: int, box: tuple[slice, ...]) -> Floats:
         part, affine = _with_margin(labels, true, box)
         ours = FacetSurface(pieces.points, nodes[(sides == row).sum(axis=1) == 1])
         return np.concatenate(_distances(ours, half_level_surface(part == row, affine), face))
@@ -449,9 +449,9 @@ def _overlaps(
     labels: Image,
     rows: NDArray[np.integer],
     mesh: Mesh,
-    label_of_cell: NDArray[np.int64],
+    label_of_cell: Ints,
     n_labels: int,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[float, float]]:
+) -> tuple[Floats, Floats, tuple[float, float]]:
     """Volume of each label's voxels in its cells, of these cells, and outside the mesh, of label 0
     and of all labels.
 
@@ -586,7 +586,7 @@ def mask_fidelity(
     )
 
 
-def half_level_surface(level: NDArray, affine: NDArray[np.float64]) -> FacetSurface:
+def half_level_surface(level: NDArray, affine: Floats) -> FacetSurface:
     """The surface where a field of 0 to 1 on voxels is 1/2, by marching cubes (marching squares in
     2-D).
 
@@ -636,7 +636,7 @@ def half_level_surface(level: NDArray, affine: NDArray[np.float64]) -> FacetSurf
     )
 
 
-def surface_distances(points: NDArray[np.float64], surface: FacetSurface) -> NDArray[np.float64]:
+def surface_distances(points: Floats, surface: FacetSurface) -> Floats:
     """Distance of points (K, n) from the nearest point of a surface, (K,) float64 in their unit;
     exact.
 
@@ -651,9 +651,7 @@ def surface_distances(points: NDArray[np.float64], surface: FacetSurface) -> NDA
     return triangle_distances(points, nodes, corners)
 
 
-def evenly_spread(
-    surface: FacetSurface, count: int, areas: NDArray[np.float64] | None = None
-) -> NDArray[np.float64]:
+def evenly_spread(surface: FacetSurface, count: int, areas: Floats | None = None) -> Floats:
     """`count` points on a surface, (count, n) float64, each for the same area (length in 2-D);
     deterministic.
 
@@ -675,7 +673,7 @@ def evenly_spread(
     return first + ((points[nodes[at, 1:]] - first[:, None]) * place[..., None]).sum(axis=1)
 
 
-def euler_characteristic(surface_facets: NDArray[np.int64]) -> int:
+def euler_characteristic(surface_facets: Ints) -> int:
     """Points minus edges plus triangles of a surface (T, 3); points minus segments of a curve
     (T, 2).
     """
@@ -714,9 +712,7 @@ def voxel_cells(image: Image, mesh: Mesh) -> NDArray[np.int32]:
     return owner if n_pieces == 1 else owner // np.int32(n_pieces)
 
 
-def _most_frequent(
-    rows: NDArray[np.integer], owner: NDArray[np.integer], otherwise: NDArray[np.int64]
-) -> NDArray[np.int64]:
+def _most_frequent(rows: NDArray[np.integer], owner: NDArray[np.integer], otherwise: Ints) -> Ints:
     """The most frequent row of the voxels of each cell, the smallest of equally frequent ones,
     or `otherwise` (M,).
     """
@@ -728,9 +724,7 @@ def _most_frequent(
     return of_cell
 
 
-def painted_voxels(
-    owner: NDArray[np.integer], of_cell: NDArray[np.int64], outside: int
-) -> NDArray[np.integer]:
+def painted_voxels(owner: NDArray[np.integer], of_cell: Ints, outside: int) -> NDArray[np.integer]:
     """Row of the cell that owns each voxel, in the image's shape; `outside` where there is none."""
     table = _narrow(np.append(of_cell, outside))
     painted = np.empty(owner.shape, dtype=table.dtype)
@@ -747,18 +741,16 @@ def _narrow(rows: NDArray[np.integer]) -> NDArray[np.integer]:
     return rows.astype(np.int16 if rows.max(initial=0) < 2**15 - 1 else np.int32)
 
 
-def _voxel_counts(rows: NDArray[np.integer], n: int) -> NDArray[np.int64]:
+def _voxel_counts(rows: NDArray[np.integer], n: int) -> Ints:
     """Number of voxels of each row, (n,); -1 is no row."""
 
-    def count(first: int, stop: int) -> NDArray[np.int64]:
+    def count(first: int, stop: int) -> Ints:
         return np.bincount(rows[first:stop].ravel() + 1, minlength=n + 1)[1:]
 
     return sum_over_slabs(count, len(rows), rows.size, n)
 
 
-def _voxel_dice(
-    true: NDArray[np.integer], painted: NDArray[np.integer], n_true: NDArray[np.int64]
-) -> NDArray[np.float64]:
+def _voxel_dice(true: NDArray[np.integer], painted: NDArray[np.integer], n_true: Ints) -> Floats:
     """Dice of the voxels of each label, (K,), with those that cells give it; `n_true` are the
     numbers of the former.
     """
@@ -766,7 +758,7 @@ def _voxel_dice(
     return 2.0 * both / np.maximum(n_true + _voxel_counts(painted, len(n_true)), 1)
 
 
-def check_cell_labels(of_cell: ArrayLike, mesh: Mesh) -> NDArray[np.int64]:
+def check_cell_labels(of_cell: ArrayLike, mesh: Mesh) -> Ints:
     """One label for each cell, (M,) int64; raise InputError unless all are whole numbers from 0
     to `LARGEST_LABEL`.
     """
@@ -784,9 +776,7 @@ def check_cell_labels(of_cell: ArrayLike, mesh: Mesh) -> NDArray[np.int64]:
     return values.astype(np.int64)
 
 
-def by_row(
-    labels: NDArray[np.int32], of_cell: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.integer], NDArray[np.int64]]:
+def by_row(labels: NDArray[np.int32], of_cell: Ints) -> tuple[Ints, NDArray[np.integer], Ints]:
     """Return all labels (K,), ascending and from 0, and of voxels and cells their rows; -1 for
     `OUTSIDE_LABEL`.
     """
@@ -802,7 +792,7 @@ def by_row(
     return values[1:], rows, np.searchsorted(values[1:], of_cell)
 
 
-def one_layer_fractions(mesh: Mesh, of_cell: NDArray[np.int64], shared: Facets) -> dict[int, float]:
+def one_layer_fractions(mesh: Mesh, of_cell: Ints, shared: Facets) -> dict[int, float]:
     """Fraction of each label's volume in cells whose nodes all lie on its surface; `shared` are the
     mesh's facets.
 
@@ -821,8 +811,8 @@ def one_layer_fractions(mesh: Mesh, of_cell: NDArray[np.int64], shared: Facets) 
 
 
 def _labels_beside_facets(
-    labels: Image, mesh: Mesh, of_cell: NDArray[np.int64], shared: Facets, outside: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    labels: Image, mesh: Mesh, of_cell: Ints, shared: Facets, outside: int
+) -> tuple[Ints, Ints]:
     """All facets (F, n) and the labels on both sides (F, 2), the same label on both sides of the
     box.
     """
@@ -835,7 +825,7 @@ def _labels_beside_facets(
 
 def _with_margin(
     labels: Image, data: NDArray[np.integer], box: tuple[slice, ...]
-) -> tuple[NDArray[np.integer], NDArray[np.float64]]:
+) -> tuple[NDArray[np.integer], Floats]:
     """The part of an array in a box with a margin of one voxel, where available, and the part's
     affine.
     """
@@ -852,9 +842,7 @@ def _face(voxel_volume: float, n: int) -> float:
     return voxel_volume ** ((n - 1) / n)
 
 
-def _distances(
-    one: FacetSurface, other: FacetSurface, face: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _distances(one: FacetSurface, other: FacetSurface, face: float) -> tuple[Floats, Floats]:
     """Distances from equally dense points on each of two surfaces to the other; none if a
     surface is empty.
     """
@@ -869,7 +857,7 @@ def _distances(
     return surface_distances(spread, other), surface_distances(spread_there, one)
 
 
-def surface_areas(surface: FacetSurface) -> NDArray[np.float64]:
+def surface_areas(surface: FacetSurface) -> Floats:
     """Area of each triangle, or length of each segment, (T,) float64."""
     if surface.points.shape[1] == 2:
         first, second = (surface.points[nodes].T for nodes in surface.facets.T)
@@ -898,7 +886,7 @@ def facet_vectors(points: NDArray, nodes: NDArray) -> NDArray:
     return vectors
 
 
-def _mean_and_p95(distances: NDArray[np.float64]) -> tuple[float, float]:
+def _mean_and_p95(distances: Floats) -> tuple[float, float]:
     if len(distances) == 0:
         return np.nan, np.nan
     return float(distances.mean()), float(np.percentile(distances, 95.0))
@@ -908,7 +896,7 @@ def _dice(both: float, one: float, other: float) -> float:
     return float(2 * both / (one + other)) if one + other > 0 else 0.0
 
 
-def _n_components(cells: NDArray[np.int64], shared: Facets | None = None) -> int:
+def _n_components(cells: Ints, shared: Facets | None = None) -> int:
     return int(components(cells, shared).max()) + 1 if len(cells) else 0
 
 
@@ -945,9 +933,7 @@ def image_fit(image: Image, mesh: Mesh) -> ImageFit:
     return ImageFit(E_D, unexplained_of(*moments), n_voxels, n_empty, overlap_of(image, mesh))
 
 
-def unexplained_of(
-    n_voxels: NDArray[np.int64], mean: NDArray[np.float64], variance: NDArray[np.float64]
-) -> float | None:
+def unexplained_of(n_voxels: Ints, mean: Floats, variance: Floats) -> float | None:
     """Return the fraction of the variance of the voxels in cells that is left within cells; None
     if they are equal.
     """

@@ -41,6 +41,7 @@ from tetopt.measure.fidelity import (
     surface_areas,
 )
 from tetopt.mesh import Mesh
+from tetopt.system.arrays import Bools, Floats, Ints
 from tetopt.system.kernel_cache import njit
 
 # least turn of the normals at a folded ridge: a dihedral angle below 120 degrees
@@ -166,7 +167,7 @@ def label_interfaces(
     fans = surface_fans(surfaces, ridges)
     n_labels = len(values)
 
-    def counts(which: NDArray[np.int64], weights: NDArray | None = None) -> NDArray:
+    def counts(which: Ints, weights: NDArray | None = None) -> NDArray:
         """Counts by label, without the outside."""
         return np.bincount(
             which[which >= 0], None if weights is None else weights[which >= 0], n_labels
@@ -215,14 +216,14 @@ def label_interfaces(
     return rows
 
 
-def _smooth_area(is_label: NDArray[np.bool_], labels: Image, is_large: bool) -> float:
+def _smooth_area(is_label: Bools, labels: Image, is_large: bool) -> float:
     """Area of the smooth surface of a label's voxels; at their volume if these are enough."""
     nets = smooth_surface(is_label, labels.affine)
     volume = np.count_nonzero(is_label) * labels.voxel_volume
     return area_at_volume(nets, volume) if is_large else float(surface_areas(nets).sum())
 
 
-def smooth_surface(is_label: NDArray[np.bool_], affine: NDArray[np.float64]) -> FacetSurface:
+def smooth_surface(is_label: Bools, affine: Floats) -> FacetSurface:
     """Surface nets of a label's voxels, in mm, without the translation to their place in the world.
 
     Points of the nets move repeatedly halfway to their neighbours' mean, within a voxel's diagonal
@@ -306,7 +307,7 @@ def _node_sums(vectors: NDArray, nodes: NDArray, n_nodes: int) -> NDArray:
     return sums
 
 
-def voxel_euler(is_label: NDArray[np.bool_]) -> int:
+def voxel_euler(is_label: Bools) -> int:
     """Euler number of the closed surface of voxels that are connected by faces.
 
     It is twice the Euler number of the enclosed solid: voxels, minus pairs that share a face, plus
@@ -324,7 +325,7 @@ def voxel_euler(is_label: NDArray[np.bool_]) -> int:
     return 2 * total
 
 
-def voxel_cavities(is_label: NDArray[np.bool_]) -> int:
+def voxel_cavities(is_label: Bools) -> int:
     """Number of enclosed components of the space around voxels, which corners connect; 0 in 2-D."""
     if is_label.ndim == 2:
         return 0
@@ -332,9 +333,7 @@ def voxel_cavities(is_label: NDArray[np.bool_]) -> int:
     return component_runs(outside, outside, has_corners=True)[0] - 1
 
 
-def _turns(
-    points: NDArray[np.float64], surfaces: LabelSurfaces, ridges: Ridges
-) -> NDArray[np.float64]:
+def _turns(points: Floats, surfaces: LabelSurfaces, ridges: Ridges) -> Floats:
     """Angle between the normals of the two facets at each ridge, (R,), degrees; nan with more
     facets.
     """
@@ -357,11 +356,11 @@ def _turns(
 
 def _cell_eulers(
     shared: Facets,
-    cells: NDArray[np.int64],
-    of_cell: NDArray[np.int64],
-    n_ridges: NDArray[np.int64],
-    n_nodes: NDArray[np.int64],
-) -> NDArray[np.int64]:
+    cells: Ints,
+    of_cell: Ints,
+    n_ridges: Ints,
+    n_nodes: Ints,
+) -> Ints:
     """`voxel_euler` of each label's cells: cells, minus facets between them, plus inner edges,
     minus inner nodes.
 
@@ -382,15 +381,13 @@ def _cell_eulers(
     return 2 * total
 
 
-def _distinct(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+def _distinct(numbers: Ints) -> Ints:
     """Distinct numbers, ascending; sorting takes less time than `np.unique`, which hashes them."""
     ordered = np.sort(numbers, axis=None)
     return ordered[np.append(True, ordered[1:] != ordered[:-1])]
 
 
-def _cell_cavities(
-    shared: Facets, cells: NDArray[np.int64], of_cell: NDArray[np.int64], n_labels: int
-) -> NDArray[np.int64]:
+def _cell_cavities(shared: Facets, cells: Ints, of_cell: Ints, n_labels: int) -> Ints:
     """`voxel_cavities` of each label's cells, where nodes connect the space around them.
 
     Cells connected by facets have one closed surface for each part of the space around them

@@ -38,6 +38,7 @@ from tetopt.geometry.topology import components
 from tetopt.image import Image, transform_vectors
 from tetopt.measure.fidelity import label_pieces, painted_voxels
 from tetopt.mesh import Mesh
+from tetopt.system.arrays import Bools, Floats, Ints
 
 # least Dice of a mesh with its mask, below which cells are too large for the mask's detail
 MASK_DICE = 0.9
@@ -110,7 +111,7 @@ class LabelFit(NamedTuple):
 def measure(
     mesh: Mesh,
     content: Content,
-    labels: NDArray[np.int64] | None = None,
+    labels: Ints | None = None,
     *,
     is_filled: bool = False,
     initial: Mesh | None = None,
@@ -225,7 +226,7 @@ def judge(rows: dict[str, Any], required: Requirements) -> dict[str, str]:
     return violated
 
 
-def _say_min_dihedral(angles: NDArray[np.float64], required: Requirements) -> str:
+def _say_min_dihedral(angles: Floats, required: Requirements) -> str:
     below = int((angles < required.min_dihedral - ANGLE_ROUNDING).sum())
     first = (
         "more `iterations`, as none was made"
@@ -405,12 +406,12 @@ def _cover(mesh: Mesh, image: Image, n_voxels: int, initial: Mesh | None, n_init
     return Cover("its initial domain", gained, volume, before, n, BOUNDARY_ROUNDING)
 
 
-def _dice(one: NDArray[np.bool_], other: NDArray[np.bool_]) -> float:
+def _dice(one: Bools, other: Bools) -> float:
     return 2.0 * int((one & other).sum()) / max(int(one.sum() + other.sum()), 1)
 
 
 def _mask_components(
-    content: Content, inside: NDArray[np.bool_], mesh: Mesh, owner: NDArray[np.integer]
+    content: Content, inside: Bools, mesh: Mesh, owner: NDArray[np.integer]
 ) -> MaskComponents:
     n_cells = np.sort(np.bincount(components(mesh.cells)))[::-1]
     planes, affine = _own_voxels(content)
@@ -420,9 +421,7 @@ def _mask_components(
     return MaskComponents(n_mask, tuple(n_cells.tolist()), lost, bare)
 
 
-def _bare_parts(
-    mesh: Mesh, is_bare: NDArray[np.bool_], affine: NDArray[np.float64]
-) -> tuple[LostComponent, ...]:
+def _bare_parts(mesh: Mesh, is_bare: Bools, affine: Floats) -> tuple[LostComponent, ...]:
     """Components of a mask's voxels without a cell that lie farther from the nearest node than
     its longest edge.
     """
@@ -449,7 +448,7 @@ def _list_components(pieces: list[tuple[LostComponent, str]]) -> str:
 
 
 def _label_fits(
-    content: Content, mesh: Mesh, of_cell: NDArray[np.int64], owner: NDArray[np.integer]
+    content: Content, mesh: Mesh, of_cell: Ints, owner: NDArray[np.integer]
 ) -> list[LabelFit]:
     """Compare each label with its cells, as `tetopt.measure.fidelity.label_fidelity` does."""
     planes, affine = _own_voxels(content)
@@ -473,7 +472,7 @@ def _label_fits(
     return fits
 
 
-def _own_voxels(content: Content) -> tuple[tuple[slice, ...], NDArray[np.float64]]:
+def _own_voxels(content: Content) -> tuple[tuple[slice, ...], Floats]:
     """Select the voxels of a content that have the centres of its image's own voxels; also
     return their affine.
     """

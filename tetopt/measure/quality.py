@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tetopt.geometry.quadratic import curved_volumes, quadratic
 from tetopt.geometry.simplex import Cells, Points, dihedral_angles, rho, squared_edges, volumes
 from tetopt.interop import notebook
-from tetopt.system.arrays import simplex_arrays
+from tetopt.system.arrays import Floats, simplex_arrays
 
 BAD_SHAPE = 0.3  # n rho below which a cell counts as bad: 1 is the regular simplex
 SHORT_EDGE = 0.25  # of the longest: a shorter edge makes a flat cell a wedge
@@ -59,15 +59,13 @@ def quality_errors(points: Points, cells: Cells) -> QualityErrors:
     return _errors_of(rho(points, cells), points.shape[1])
 
 
-def _errors_of(shape: NDArray[np.float64], n: int) -> QualityErrors:
+def _errors_of(shape: Floats, n: int) -> QualityErrors:
     error = np.maximum(1.0 / n - shape, 0.0)
     harmonic = 0.0 if (error == 0.0).any() else len(error) / float((1.0 / error).sum())
     return QualityErrors(float(error.mean()), harmonic, float((error**2).sum()), float(error.max()))
 
 
-def rho_histogram(
-    points: Points, cells: Cells, bins: int = 40
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def rho_histogram(points: Points, cells: Cells, bins: int = 40) -> tuple[Floats, Floats]:
     """Normalised histogram of rho over [0, 1/n] as in Fig. 1(d): fraction of cells, (bins,), and
     edges, (bins + 1,).
     """
@@ -78,7 +76,7 @@ def rho_histogram(
     return counts / len(cells), edges
 
 
-def bad_kinds(points: Points, cells: Cells, shape: NDArray[np.float64]) -> NDArray[np.str_]:
+def bad_kinds(points: Points, cells: Cells, shape: Floats) -> NDArray[np.str_]:
     """The kind of each cell of these `rho`, (M,) str: "good" if n rho >= 0.3, else the kind of bad
     shape.
 
@@ -107,7 +105,7 @@ def bad_kinds(points: Points, cells: Cells, shape: NDArray[np.float64]) -> NDArr
     return kinds
 
 
-def _tet_kinds(corners: NDArray[np.float64]) -> NDArray[np.str_]:
+def _tet_kinds(corners: Floats) -> NDArray[np.str_]:
     """Kinds of bad tetrahedra, corners (B, 4, 3)."""
     centred = corners - corners.mean(axis=1, keepdims=True)
     _, spread, axes = np.linalg.svd(centred)
@@ -203,7 +201,7 @@ class Quality(NamedTuple):
         return notebook.card_html("Quality", rows)
 
 
-def _of_cells(points: Points, cells: Cells) -> tuple[NDArray[np.float64], ...]:
+def _of_cells(points: Points, cells: Cells) -> tuple[Floats, ...]:
     """Rho, volume, smallest and largest angle, and squares of the shortest and longest edge of
     cells, (M,) each.
     """

@@ -9,7 +9,6 @@ underlying pixels".
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.contents.content import Content, own_image
 from tetopt.contents.labels import check_labels
@@ -19,6 +18,7 @@ from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.measure.judge import warn_of_other_mask
 from tetopt.mesh import Mesh
+from tetopt.system.arrays import Bools, Ints
 
 
 def segment(image: Image | Content, mesh: Mesh, classes: int) -> Image:
@@ -68,7 +68,7 @@ def segment(image: Image | Content, mesh: Mesh, classes: int) -> Image:
     return Image(np.where(owner >= 0, class_of_cell[owner], 0), whole.affine)
 
 
-def threshold_image(image: Image, classes: int, inside: NDArray[np.bool_] | None = None) -> Image:
+def threshold_image(image: Image, classes: int, inside: Bools | None = None) -> Image:
     """Segment an image's voxels, by default all, into the same classes without a mesh; those not
     `inside` get 0.
     """
@@ -104,9 +104,7 @@ def dice(labels: Image, truth: Image) -> dict[int, float]:
     return overlaps
 
 
-def _table(
-    labels: Image, truth: Image
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+def _table(labels: Image, truth: Image) -> tuple[Ints, Ints, Ints]:
     """The classes, the true labels, and the number of voxels of each class (rows) and true label
     (columns).
     """

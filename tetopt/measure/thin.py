@@ -37,6 +37,7 @@ from tetopt.measure.fidelity import (
     voxel_cells,
 )
 from tetopt.mesh import Mesh
+from tetopt.system.arrays import Floats, Ints
 
 THICK_VOXELS = 10.0  # times a voxel's shortest edge, at which thickness is clipped
 # mean ratio, over all directions, of a smooth surface to its voxels' faces
@@ -162,9 +163,7 @@ def _voxel_contacts(labels: Image, mask: Image | None) -> dict[int, float]:
     return total
 
 
-def _by_pair(
-    one: NDArray, other: NDArray, weights: NDArray[np.float64] | None = None
-) -> dict[int, float]:
+def _by_pair(one: NDArray, other: NDArray, weights: Floats | None = None) -> dict[int, float]:
     """Sums over pairs of labels, by the number of the pair."""
     pairs = np.minimum(one, other).astype(np.int64) * LABEL_BASE + np.maximum(one, other)
     numbers, place = np.unique(pairs, return_inverse=True)
@@ -278,7 +277,7 @@ def label_layers(what: Content, mesh: Mesh, of_cell: ArrayLike) -> dict[int, Lay
 def _percentiles(
     thickness: NDArray[np.float32],
     rows: NDArray[np.integer],
-    values: NDArray[np.int64],
+    values: Ints,
     most: float,
 ) -> dict[int, Thickness]:
     """Percentiles of the thickness at the voxels of each row, by label."""

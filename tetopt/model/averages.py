@@ -17,7 +17,6 @@ from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.energy.sampling import cell_of_voxel, nearest_values, nearest_voxels, ranges_of
 from tetopt.errors import InputError
@@ -26,6 +25,7 @@ from tetopt.geometry.simplex import centroids, volume_gradients, volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.model.mappings import ModulusMapping, mapped_values, young_from
+from tetopt.system.arrays import Bools, Floats, Ints
 
 DEFAULT_AVERAGE = "gauss"  # of moduli (docs/understand/moduli.md); `tetopt paper` keeps Eq. (2)
 POWER_WORDS = {"mean": 1.0, "geometric": 0.0, "harmonic": -1.0}
@@ -100,7 +100,7 @@ def young_image(image: Image, mapping: ModulusMapping) -> Image:
 
 def cell_young(
     image: Image, mesh: Mesh, mapping: ModulusMapping = None, average: str = "mean"
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return the modulus of each cell, (M,) float64, kPa: an average of the modulus field over it.
 
     Parameters
@@ -130,7 +130,7 @@ def cell_young(
     return _of_cells(field, mesh, owner, parsed.power)
 
 
-def cell_values(image: Image, mesh: Mesh, mapping: ModulusMapping) -> NDArray[np.float64]:
+def cell_values(image: Image, mesh: Mesh, mapping: ModulusMapping) -> Floats:
     """Return the mean over each cell of another quantity, such as Poisson's ratio or density; it
     may be negative.
 
@@ -152,7 +152,7 @@ def cell_values(image: Image, mesh: Mesh, mapping: ModulusMapping) -> NDArray[np
     return _of_cells(Image(values, image.affine), mesh, owner, 1.0)
 
 
-def node_young(image: Image, mesh: Mesh, mapping: ModulusMapping = None) -> NDArray[np.float64]:
+def node_young(image: Image, mesh: Mesh, mapping: ModulusMapping = None) -> Floats:
     """Return the modulus of each node, (N,) float64, kPa, for moduli that are linear within cells.
 
     This is the geometric mean of the voxels in the cells around the node, each weighted by the
@@ -187,7 +187,7 @@ def node_young(image: Image, mesh: Mesh, mapping: ModulusMapping = None) -> NDAr
 
 def element_young(
     image: Image, mesh: Mesh, mapping: ModulusMapping = None, average: str = "mean", order: int = 1
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return moduli for `tetopt.fem.elasticity.stiffness`: `cell_young` (M,), or at Gauss points
     (M, Q), kPa.
 
@@ -219,7 +219,7 @@ def element_young(
     )
 
 
-def gauss_young(node_young: NDArray[np.float64], mesh: Mesh, order: int) -> NDArray[np.float64]:
+def gauss_young(node_young: Floats, mesh: Mesh, order: int) -> Floats:
     """Interpolate nodal moduli (N,), kPa, to the Gauss points (M, Q) of cells of the given order.
 
     Moduli are linear within a cell, like temperature-dependent moduli in Abaqus and CalculiX.
@@ -231,7 +231,7 @@ def gauss_young(node_young: NDArray[np.float64], mesh: Mesh, order: int) -> NDAr
     return np.clip(np.einsum("qa,ca->cq", places, corners), low, high)
 
 
-def _see_voxels(image: Image, mesh: Mesh) -> tuple[Image, NDArray[np.int64]]:
+def _see_voxels(image: Image, mesh: Mesh) -> tuple[Image, Ints]:
     """Return the image with unused values replaced, and the cell of each voxel, (V,), -1 outside.
 
     Averages use voxels in cells, and those nearest to nodes and centroids, which stand in for cells
@@ -250,9 +250,7 @@ def _see_voxels(image: Image, mesh: Mesh) -> tuple[Image, NDArray[np.int64]]:
     ), owner
 
 
-def _places(
-    image: Image, mesh: Mesh, owner: NDArray[np.int64]
-) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64]]]:
+def _places(image: Image, mesh: Mesh, owner: Ints) -> Iterator[tuple[Ints, Floats]]:
     """Yield the numbers (K,) of voxels in the mesh and their cells' hat functions there, (K,
     n+1), in chunks.
     """
@@ -273,7 +271,7 @@ def _places(
 
 def _moduli(
     image: Image, mesh: Mesh, mapping: ModulusMapping, average: Average
-) -> tuple[Image, NDArray[np.int64]]:
+) -> tuple[Image, Ints]:
     """Return the modulus field, with unused voxels as in `_see_voxels`, and the cell of each voxel.
 
     Raises InputError if an average would be 0 because of a single modulus of 0.
@@ -294,9 +292,7 @@ def _moduli(
     return field, owner
 
 
-def _of_cells(
-    field: Image, mesh: Mesh, owner: NDArray[np.int64], power: float | None
-) -> NDArray[np.float64]:
+def _of_cells(field: Image, mesh: Mesh, owner: Ints, power: float | None) -> Floats:
     """Return the average over each cell; a cell without a voxel centre gets the value of the
     voxel at its centroid.
     """
@@ -305,9 +301,7 @@ def _of_cells(
     return averages
 
 
-def _averages(
-    field: Image, owner: NDArray[np.int64], power: float | None, n_parts: int
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _averages(field: Image, owner: Ints, power: float | None, n_parts: int) -> tuple[Floats, Bools]:
     """Return the power mean, or Hill's average, of the voxels of each part, and whether the part
     has none.
 
@@ -327,12 +321,12 @@ def _averages(
 
 
 def _powers(
-    part: NDArray[np.int64],
-    values: NDArray[np.float64],
-    n_voxels: NDArray[np.int64],
-    ranges: tuple[NDArray[np.float64], NDArray[np.float64]],
+    part: Ints,
+    values: Floats,
+    n_voxels: Ints,
+    ranges: tuple[Floats, Floats],
     power: float,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return the power mean of the values of each part, (K,); arbitrary for a part without
     values.
     """

@@ -68,16 +68,16 @@ from tetopt.model.materials import (
 )
 from tetopt.model.model import Model
 from tetopt.model.sets import Box, Sets, box_of, box_text, standard_sets, with_requested
-from tetopt.system.arrays import plain_array
+from tetopt.system.arrays import Floats, Ints, plain_array
 
 
 def build_model(
     mesh: Mesh | MeshFile | MeshingResult,
     image: Image | Content | None = None,
     *,
-    young: str | float | NDArray[np.float64] | ModulusMapping | ByLabel = None,
-    nu: str | float | NDArray[np.float64] | ModulusMapping | ByLabel = None,
-    density: str | float | NDArray[np.float64] | ModulusMapping | ByLabel = None,
+    young: str | float | Floats | ModulusMapping | ByLabel = None,
+    nu: str | float | Floats | ModulusMapping | ByLabel = None,
+    density: str | float | Floats | ModulusMapping | ByLabel = None,
     average: str = DEFAULT_AVERAGE,
     sets: Iterable[str] = (),
     loads: Iterable[str] = (),
@@ -360,7 +360,7 @@ def _table_of(about: dict[str, Any]) -> LabelTable:
     return table if isinstance(table, LabelTable) else table_of_words(table)
 
 
-def _with_table_in_words(about: dict[str, Any], labels: NDArray[np.int64] | None) -> dict[str, Any]:
+def _with_table_in_words(about: dict[str, Any], labels: Ints | None) -> dict[str, Any]:
     """Return the texts with a label table in JSON's types, in which all labels of cells have a
     colour.
     """
@@ -387,9 +387,7 @@ def _materials(cells: _ModelCells, choices: Choices) -> Materials:
     return materials(moduli, ratios, len(cells.mesh.cells), masses)
 
 
-def _varying_moduli(
-    cells: _ModelCells, choices: Choices
-) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
+def _varying_moduli(cells: _ModelCells, choices: Choices) -> tuple[Floats | None, Floats | None]:
     """Return `node_young` and moduli at Gauss points from a mapping of the intensity; None if
     the average has none.
     """
@@ -415,8 +413,8 @@ class _ModelCells(NamedTuple):
 
     mesh: Mesh
     image: Image | None
-    mean: NDArray[np.float64] | None  # (M,)
-    labels: NDArray[np.int64] | None  # (M,)
+    mean: Floats | None  # (M,)
+    labels: Ints | None  # (M,)
     names: dict[int, str]  # of labels
 
 
@@ -430,9 +428,7 @@ def _cells_of(
     return _ModelCells(mesh, image, mean, labels, _table_of(about).names)
 
 
-def _values(
-    value: Any, name: str, cells: _ModelCells, average: str = "mean"
-) -> NDArray[np.float64]:
+def _values(value: Any, name: str, cells: _ModelCells, average: str = "mean") -> Floats:
     """Return the value of each cell, or one for all."""
     mapping: Any = parse_any_mapping(value, name) if isinstance(value, str) else value
     if isinstance(mapping, dict):

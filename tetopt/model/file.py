@@ -35,6 +35,7 @@ from tetopt.model.sets import (
     standard_names,
     standard_sets,
 )
+from tetopt.system.arrays import Bools, Floats, Ints
 from tetopt.system.incoming import json_of
 
 # cell data in tetopt's files
@@ -347,7 +348,7 @@ def _binning_error(loaded: MeshFile) -> BinningError | None:
         return None
 
 
-def _gauss_moduli(model: Model, loaded: MeshFile) -> NDArray[np.float64] | None:
+def _gauss_moduli(model: Model, loaded: MeshFile) -> Floats | None:
     """Return the moduli at Gauss points (M, Q) in a file of tetopt's, if they still match its
     cells.
     """
@@ -370,7 +371,7 @@ def _gauss_moduli(model: Model, loaded: MeshFile) -> NDArray[np.float64] | None:
     return None
 
 
-def with_cells(loaded: MeshFile, labels: NDArray[np.int64], is_kept: NDArray[np.bool_]) -> MeshFile:
+def with_cells(loaded: MeshFile, labels: Ints, is_kept: Bools) -> MeshFile:
     """Return the mesh's file with a part of its cells, (M,), which have `labels`, (M,).
 
     Each interface of a label that stays with one that goes remains as a set of facets, with its
@@ -386,7 +387,7 @@ def with_cells(loaded: MeshFile, labels: NDArray[np.int64], is_kept: NDArray[np.
     now, number = np.cumsum(is_kept) - 1, numbered_edges(mesh.cells)[1]
     edges = np.unique(number[is_kept])  # in the order of the new mesh, as that of the nodes stays
     part = Mesh(mesh.points[used], cells, None if mesh.midpoints is None else mesh.midpoints[edges])
-    facets: dict[str, NDArray[np.int64]] = {}
+    facets: dict[str, Ints] = {}
     outer = {tuple(row) for row in boundary_rows(part).tolist()}
     for name, rows in facet_sets.items():
         gone = rows[~is_kept[rows[:, 0]]]

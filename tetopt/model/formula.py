@@ -9,9 +9,9 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.errors import InputError
+from tetopt.system.arrays import Floats
 
 # far more than any real formula; Python's parser takes half a minute for a million
 MOST_FORMULA_LETTERS = 10_000
@@ -38,7 +38,7 @@ UNARY_OPERATORS: dict[type[ast.unaryop], Callable[..., Any]] = {
 FORMULA_PARTS = f"numbers, h, + - * / **, brackets and {', '.join(FORMULA_FUNCTIONS)}"
 
 
-def parse_formula(text: str) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+def parse_formula(text: str) -> Callable[[Floats], Floats]:
     """Convert a formula of h to a function of intensities; operators and precedence are Python's.
 
     Formulas contain numbers, ``h``, ``+ - * / **``, brackets, ``abs``, ``sqrt``, ``exp`` and
@@ -79,7 +79,7 @@ def parse_formula(text: str) -> Callable[[NDArray[np.float64]], NDArray[np.float
             f'formula: expected {FORMULA_PARTS}, got "{_formula_text(text)}"'
         ) from error
 
-    def mapping(h: NDArray[np.float64]) -> NDArray[np.float64]:
+    def mapping(h: Floats) -> Floats:
         with np.errstate(all="ignore"):  # undefined values are rejected where the modulus is used
             return np.array(np.broadcast_to(value(h), h.shape), dtype=np.float64)
 
@@ -92,7 +92,7 @@ def _formula_text(text: str) -> str:
     return line if len(line) <= 60 else f"{line[:57]}..."
 
 
-def _compile_node(node: ast.expr, text: str, depth: int) -> Callable[[NDArray[np.float64]], Any]:
+def _compile_node(node: ast.expr, text: str, depth: int) -> Callable[[Floats], Any]:
     """Convert a syntax tree to a function of h.
 
     InputError if the tree contains anything not allowed, or is deeper than

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from tetopt.contents.labels import BACKGROUND_LABEL, colours_by_number, hex_colour
 from tetopt.errors import InputError
 from tetopt.model.sets import label_set_names
+from tetopt.system.arrays import Ints
 
 # key in a mesh's file and in a model's `about` for the result of `table_words`
 LABEL_FIELD = "label"  # cell data in files: the label of each cell
@@ -137,7 +138,7 @@ def kept_labels(
     return kept
 
 
-def labels_of(cell_data: Mapping[str, NDArray], n_cells: int) -> NDArray[np.int64] | None:
+def labels_of(cell_data: Mapping[str, NDArray], n_cells: int) -> Ints | None:
     """Return the field "label", (M,) int64, if it exists and holds whole numbers from 0; other
     programs' may not.
     """
@@ -177,7 +178,7 @@ def table_of_words(words: Any) -> LabelTable:
     return LabelTable(names, colours)
 
 
-def colour_labels(table: LabelTable, labels: NDArray[np.int64]) -> LabelTable:
+def colour_labels(table: LabelTable, labels: Ints) -> LabelTable:
     """Add the colours that labels have in pictures to the table; 0, the background, is light
     grey.
     """

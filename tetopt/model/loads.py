@@ -14,7 +14,6 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.errors import InputError, Remark, warn
 from tetopt.geometry.quadratic import (
@@ -37,6 +36,7 @@ from tetopt.model.sets import (
     nodes_of,
     place_of,
 )
+from tetopt.system.arrays import Floats, Ints
 
 # the sum of area vectors of a flat set is at least this fraction of its area
 PLANE_FRACTION = 1.0 - 1e-6
@@ -93,7 +93,7 @@ class Load(NamedTuple):
 
     kind: str
     set_name: str
-    numbers: NDArray[np.float64]
+    numbers: Floats
     step: int = 0
 
 
@@ -234,7 +234,7 @@ def _step_of(text: str) -> tuple[int, str]:
     return int(prefix), words
 
 
-def _parse_movement(text: str) -> NDArray[np.float64]:
+def _parse_movement(text: str) -> Floats:
     """Parse comma-separated numbers, NaN for the word free; empty for any other text."""
     parts = [part.strip() for part in text.split(",")]
     is_free = np.array([part == FREE_WORD for part in parts])
@@ -287,7 +287,7 @@ def _compression(load: Load, mesh: Mesh, sets: Sets) -> list[Load]:
     ]
 
 
-def _across(mesh: Mesh, sets: Sets, low: str, high: str) -> NDArray[np.float64]:
+def _across(mesh: Mesh, sets: Sets, low: str, high: str) -> Floats:
     """Return the vector from the outermost node of one side to that of the opposite, along
     `_upwards`, (n,) mm.
     """
@@ -299,7 +299,7 @@ def _across(mesh: Mesh, sets: Sets, low: str, high: str) -> NDArray[np.float64]:
     return upwards * float(top.max() - bottom.min()) + 0.0  # + 0.0: no -0
 
 
-def _upwards(mesh: Mesh, sets: Sets, low: str, high: str) -> NDArray[np.float64]:
+def _upwards(mesh: Mesh, sets: Sets, low: str, high: str) -> Floats:
     """Return the direction from one side to the opposite, (n,): the normal of a flat side, else
     the world's axis.
     """
@@ -366,9 +366,7 @@ def _check_apart(loads: list[Load], mesh: Mesh, sets: Sets) -> None:
 # Forces on facets
 
 
-def facet_weights(
-    mesh: Mesh, rows: NDArray[np.int64], order: int = 1
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def facet_weights(mesh: Mesh, rows: Ints, order: int = 1) -> tuple[Ints, Floats]:
     """Return the nodes of facets and the integrals of their shape functions over the facets, (K, w)
     each.
 
@@ -402,9 +400,7 @@ def facet_weights(
     return nodes, areas[:, None] * fractions
 
 
-def _curved_facets(
-    mesh: Mesh, rows: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+def _curved_facets(mesh: Mesh, rows: Ints) -> tuple[Ints, Floats, Floats]:
     """Return the nodes (K, w) of curved facets of order 2, shape functions (Q, w) at quadrature
     points, and outward normals (Q, K, n) there, scaled to the area (in 2-D the length) that each
     point represents.
@@ -421,9 +417,7 @@ def _curved_facets(
     return nodes, shape_values(places, 2), normals
 
 
-def facet_forces(
-    mesh: Mesh, sets: Sets, load: Load, order: int = 1
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def facet_forces(mesh: Mesh, sets: Sets, load: Load, order: int = 1) -> tuple[Ints, Floats]:
     """Return the nodes (P,), ascending, and nodal forces (P, n) of a pressure or traction, mN for a
     load in kPa.
 
@@ -446,9 +440,7 @@ def facet_forces(
     return _sum_rows(nodes[weights != 0.0], forces[weights != 0.0])
 
 
-def spring_constants(
-    mesh: Mesh, sets: Sets, load: Load, order: int = 1
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def spring_constants(mesh: Mesh, sets: Sets, load: Load, order: int = 1) -> tuple[Ints, Floats]:
     """Return the springs to the ground: nodes (P,), ascending, and stiffness (P,), mN/mm for a
     load in kPa/mm.
     """
@@ -457,9 +449,7 @@ def spring_constants(
     return which, load.numbers[0] * total[:, 0]
 
 
-def _sum_rows(
-    nodes: NDArray[np.int64], values: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _sum_rows(nodes: Ints, values: Floats) -> tuple[Ints, Floats]:
     """Return the distinct nodes, ascending, and the sum of the rows of each, (P, w)."""
     distinct, which = np.unique(nodes, return_inverse=True)
     columns = [

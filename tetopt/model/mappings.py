@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tetopt.errors import InputError
 from tetopt.model.formula import parse_formula
+from tetopt.system.arrays import Floats
 from tetopt.system.incoming import text_of, toml_of
 
 MAPPED_OPTIONS = ("young", "nu", "density")  # options of commands whose text is a mapping
@@ -23,10 +24,7 @@ FILES_IN_TEXTS = (*MAPPED_OPTIONS, "merge", "label_size")  # options whose text 
 NAMED_SUFFIXES = (".toml", ".csv")  # of that file
 
 ModulusMapping = (
-    Callable[[NDArray[np.float64]], ArrayLike]
-    | Sequence[Sequence[float]]
-    | NDArray[np.floating]
-    | None
+    Callable[[Floats], ArrayLike] | Sequence[Sequence[float]] | NDArray[np.floating] | None
 )
 
 
@@ -55,7 +53,7 @@ class ByLabel(NamedTuple):
     rest: float | None = None
 
 
-def mapped_values(mapping: ModulusMapping, intensities: ArrayLike) -> NDArray[np.float64]:
+def mapped_values(mapping: ModulusMapping, intensities: ArrayLike) -> Floats:
     """Apply a mapping to intensities; returns float64 values of the same shape.
 
     Parameters
@@ -87,7 +85,7 @@ def mapped_values(mapping: ModulusMapping, intensities: ArrayLike) -> NDArray[np
     return values
 
 
-def young_from(mapping: ModulusMapping, intensities: ArrayLike) -> NDArray[np.float64]:
+def young_from(mapping: ModulusMapping, intensities: ArrayLike) -> Floats:
     """Map intensities to Young's moduli, kPa, float64 of the same shape: `mapped_values`, checked.
 
     Raises
@@ -357,7 +355,7 @@ def _check_pairs(pairs: list[tuple[float, float]]) -> list[tuple[float, float]]:
     return pairs
 
 
-def check_young(young: NDArray[np.float64]) -> NDArray[np.float64]:
+def check_young(young: Floats) -> Floats:
     """Return the moduli of cells, (M,); InputError unless all are above 0."""
     bad = np.flatnonzero(~(np.isfinite(young) & (young > 0.0)))
     if len(bad):
@@ -370,7 +368,7 @@ def check_young(young: NDArray[np.float64]) -> NDArray[np.float64]:
     return young
 
 
-def _check_table(mapping: ArrayLike) -> NDArray[np.float64]:
+def _check_table(mapping: ArrayLike) -> Floats:
     """Return the (K, 2) table as float64; InputError unless finite and increasing."""
     try:
         table = np.asarray(mapping, dtype=np.float64)

@@ -16,6 +16,7 @@ from tetopt.energy.sampling import ranges_of
 from tetopt.errors import InputError, Remark, warn
 from tetopt.model.label_names import label_words, labels_named
 from tetopt.model.mappings import ByLabel, check_young
+from tetopt.system.arrays import Floats, Ints
 
 # Poisson's ratio of soft tissue that linear cells still represent: they lock closer to 0.5
 DEFAULT_NU = 0.45
@@ -72,11 +73,11 @@ class Materials(NamedTuple):
     ([2.1, 6.1, 9.5], (1200,), '6.8%')
     """
 
-    young: NDArray[np.float64]
-    nu: NDArray[np.float64]
-    of_cell: NDArray[np.int64]
+    young: Floats
+    nu: Floats
+    of_cell: Ints
     binning: BinningError | None = None
-    density: NDArray[np.float64] | None = None
+    density: Floats | None = None
 
 
 def materials(
@@ -114,7 +115,7 @@ def materials(
     return Materials(values[0], values[1], of_cell.ravel().astype(np.int64), density=masses)
 
 
-def _check_density(density: NDArray[np.float64]) -> NDArray[np.float64]:
+def _check_density(density: Floats) -> Floats:
     bad = np.flatnonzero(~(np.isfinite(density) & (density > 0.0)))
     if len(bad):
         raise InputError(
@@ -130,7 +131,7 @@ def without_moduli(table: Materials) -> Materials:
     return materials(1.0, table.nu[table.of_cell], len(table.of_cell), density)
 
 
-def density_of(table: Materials | None) -> NDArray[np.float64]:
+def density_of(table: Materials | None) -> Floats:
     """Return the density of each material, (K,) kg/m3; InputError if there is none, because
     gravity needs it.
     """
@@ -141,7 +142,7 @@ def density_of(table: Materials | None) -> NDArray[np.float64]:
     return table.density
 
 
-def _of_cells(name: str, values: ArrayLike, n_cells: int) -> NDArray[np.float64]:
+def _of_cells(name: str, values: ArrayLike, n_cells: int) -> Floats:
     array = np.asarray(values, dtype=np.float64)
     if array.ndim == 0:
         return np.full(n_cells, float(array))
@@ -152,7 +153,7 @@ def _of_cells(name: str, values: ArrayLike, n_cells: int) -> NDArray[np.float64]
     return array
 
 
-def cells_of(table: Materials) -> list[NDArray[np.int64]]:
+def cells_of(table: Materials) -> list[Ints]:
     """Return the cells of each material, ascending."""
     ends = np.cumsum(np.bincount(table.of_cell, minlength=len(table.young)))
     return np.split(np.argsort(table.of_cell, kind="stable"), ends[:-1])
@@ -160,7 +161,7 @@ def cells_of(table: Materials) -> list[NDArray[np.int64]]:
 
 def by_label(
     mapping: ByLabel, labels: NDArray[np.integer] | None, names: Mapping[int, str] | None = None
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return the value of each cell by its label, (M,) float64.
 
     Parameters
@@ -208,7 +209,7 @@ def by_label(
 
 
 def bin_moduli(
-    exact: Materials, volumes: NDArray[np.float64], count: int, spacing: Spacing = "equal"
+    exact: Materials, volumes: Floats, count: int, spacing: Spacing = "equal"
 ) -> Materials:
     """Group moduli into at most `count` bins.
 
@@ -248,9 +249,7 @@ def bin_moduli(
     return materials(fewer, ratios, len(young), density)._replace(binning=error)
 
 
-def _bin_means(
-    values: NDArray[np.float64], volumes: NDArray[np.float64], count: int, spacing: Spacing
-) -> NDArray[np.float64]:
+def _bin_means(values: Floats, volumes: Floats, count: int, spacing: Spacing) -> Floats:
     """Replace each value by the mean of its bin; up to `count` distinct values are unchanged."""
     if len(np.unique(values)) <= count:
         return values

@@ -25,6 +25,7 @@ from tetopt.model.loads import FACET_FORCES, SHOWN_LOAD_DIGITS, Load, facet_forc
 from tetopt.model.materials import Materials
 from tetopt.model.sets import Sets, facet_triples
 from tetopt.model.skfem import skfem_mesh
+from tetopt.system.arrays import Floats, Ints
 
 if TYPE_CHECKING:
     import meshio
@@ -116,8 +117,8 @@ class Model(NamedTuple):
     order: int = 1
     units: str = "kPa"
     space: str = "ras"
-    node_young: NDArray[np.float64] | None = None
-    gauss_young: NDArray[np.float64] | None = None
+    node_young: Floats | None = None
+    gauss_young: Floats | None = None
     is_nonlinear: bool = False
     about: dict[str, Any] = {}  # noqa: RUF012 - never changed
     point_data: dict[str, NDArray] = {}  # noqa: RUF012 - never changed
@@ -260,7 +261,7 @@ def in_space(model: Model, space: str) -> Model:
     )
 
 
-def half_turn(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+def half_turn(vectors: Floats) -> Floats:
     """Turn vectors (..., 3) about z, from RAS+ to LPS+ or back."""
     return vectors * HALF_TURN + 0.0  # + 0.0: no -0
 
@@ -383,12 +384,12 @@ def header_lines(model: Model) -> list[str]:
     return [" ".join(line.split()) for line in lines]
 
 
-def elements(model: Model) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def elements(model: Model) -> tuple[Floats, Ints]:
     """Return points and cells of the model's order: the mesh's own, or those of `quadratic`."""
     return of_order(model.mesh.points, model.mesh.cells, model.order, model.mesh.midpoints)
 
 
-def traction_forces(model: Model, loads: Iterable[Load]) -> NDArray[np.float64]:
+def traction_forces(model: Model, loads: Iterable[Load]) -> Floats:
     """Return the nodal forces of the tractions among some loads, (N, n)."""
     total = np.zeros_like(elements(model)[0])
     for load in loads:
@@ -398,7 +399,7 @@ def traction_forces(model: Model, loads: Iterable[Load]) -> NDArray[np.float64]:
     return total
 
 
-def mass_densities(model: Model) -> NDArray[np.float64]:
+def mass_densities(model: Model) -> Floats:
     """Return the density of each material, (K,), in the model's units of mass and length;
     water's if there is none.
     """
@@ -440,7 +441,7 @@ def grid_fields(model: Model) -> tuple[dict[str, NDArray], dict[str, NDArray]]:
     return on_cells, on_nodes
 
 
-def element_facets(cells: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
+def element_facets(cells: Ints, rows: Ints) -> Ints:
     """Return the nodes of facets (K, 2) for either order: `facet_triples` or
     `quadratic_facet_nodes`.
     """

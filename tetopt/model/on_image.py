@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from tetopt.energy.sampling import cell_of_voxel, nearest_voxels, overlap_of
 from tetopt.errors import InputError
@@ -15,7 +15,7 @@ from tetopt.geometry.quadratic import edge_ends, of_order, shape_slopes, shape_v
 from tetopt.geometry.simplex import volume_gradients, volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.system.arrays import plain_array
+from tetopt.system.arrays import Floats, Ints, plain_array
 from tetopt.system.slabs import over_slabs
 
 # whose nodes' values are gathered: 30 numbers each for a vector field of order 2
@@ -30,7 +30,7 @@ At = Literal["cells", "nodes"]
 
 def field_on_image(
     mesh: Mesh, values: ArrayLike, image: Image, *, at: At | None = None, outside: float = np.nan
-) -> NDArray[np.float64]:
+) -> Floats:
     """Evaluate a field of a mesh, such as a displacement, at the voxel centres of an image.
 
     Each voxel belongs to one cell, exactly as in sampling (`cell_of_voxel`). It gets the value of
@@ -133,9 +133,7 @@ def _order_of(mesh: Mesh, n_rows: int, at: At | None) -> int:
     return orders[0]
 
 
-def places_in_cells(
-    mesh: Mesh, own: NDArray[np.int64], world: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def places_in_cells(mesh: Mesh, own: Ints, world: Floats) -> Floats:
     """Return the barycentric places (K, n+1) of points (K, n), mm, in their straight cells (K,)."""
     corners = mesh.cells[own]
     slopes = volume_gradients(mesh.points, corners) / volumes(mesh.points, corners)[:, None, None]
@@ -147,10 +145,10 @@ def places_in_cells(
 
 def _places(
     mesh: Mesh,
-    own: NDArray[np.int64],
-    world: NDArray[np.float64],
-    around: NDArray[np.float64] | None,
-) -> NDArray[np.float64]:
+    own: Ints,
+    world: Floats,
+    around: Floats | None,
+) -> Floats:
     """Return `places_in_cells`, of cells with nodes (K, A, n) if curved."""
     places = places_in_cells(mesh, own, world)
     if around is None or len(own) == 0:

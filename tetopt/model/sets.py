@@ -22,6 +22,7 @@ from tetopt.geometry.simplex import area_normals, outward_facet_nodes
 from tetopt.geometry.topology import connected_sets, facets, largest_component
 from tetopt.image import Image, transform_vectors
 from tetopt.mesh import Mesh
+from tetopt.system.arrays import Bools, Floats, Ints
 
 BOUNDARY_SET = "boundary"  # all facets that belong to only one cell
 MASK_SURFACE_SET = "mask_surface"  # boundary facets that are not on the faces of the image's box
@@ -65,8 +66,8 @@ class Sets(NamedTuple):
     (50, 2)
     """
 
-    facets: dict[str, NDArray[np.int64]]
-    cells: dict[str, NDArray[np.int64]]
+    facets: dict[str, Ints]
+    cells: dict[str, Ints]
 
 
 class Box(NamedTuple):
@@ -89,7 +90,7 @@ class Box(NamedTuple):
     """
 
     shape: tuple[int, ...]
-    affine: NDArray[np.float64]
+    affine: Floats
 
 
 def standard_names(ndim: int) -> set[str]:
@@ -97,7 +98,7 @@ def standard_names(ndim: int) -> set[str]:
     return {BOUNDARY_SET, MASK_SURFACE_SET, *(name for pair in FACE_NAMES[ndim] for name in pair)}
 
 
-def facet_triples(cells: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
+def facet_triples(cells: Ints, rows: Ints) -> Ints:
     """Return the nodes of facets (K, 2), (K, n) int64, oriented outwards from their cell.
 
     In 3-D the normal (b - a) x (c - a) of a row (a, b, c) points outwards; in 2-D the right side of
@@ -117,17 +118,17 @@ def is_set(values: NDArray, ends: tuple[int, ...]) -> bool:
     return bool((np.diff(numbers) > 0).all())
 
 
-def area_vectors(mesh: Mesh, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+def area_vectors(mesh: Mesh, rows: Ints) -> Floats:
     """Return the outward area vectors of facets (K, 2), (K, n), mm2 (in 2-D mm)."""
     return area_normals(mesh.points[facet_triples(mesh.cells, rows)])
 
 
-def nodes_of(mesh: Mesh, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+def nodes_of(mesh: Mesh, rows: Ints) -> Ints:
     """Return the nodes of a facet set, (P,) int64, ascending."""
     return np.unique(facet_triples(mesh.cells, rows))
 
 
-def boundary_rows(mesh: Mesh) -> NDArray[np.int64]:
+def boundary_rows(mesh: Mesh) -> Ints:
     """Return all facets that belong to only one cell, (B, 2) int64, ascending."""
     shared = facets(mesh.cells)
     return np.argwhere(shared.n_cells[shared.of_cell] == 1)
@@ -138,7 +139,7 @@ def standard_sets(
     box: Box | None = None,
     labels: NDArray[np.integer] | None = None,
     names: Mapping[int, str] | None = None,
-    own: Mapping[str, NDArray[np.int64]] | None = None,
+    own: Mapping[str, Ints] | None = None,
 ) -> Sets:
     """Return the standard sets of a mesh.
 
@@ -264,9 +265,7 @@ def interface_names(
     }
 
 
-def face_sets(
-    mesh: Mesh, boundary: NDArray[np.int64], box: Box | None
-) -> dict[str, NDArray[np.int64]]:
+def face_sets(mesh: Mesh, boundary: Ints, box: Box | None) -> dict[str, Ints]:
     """Return the boundary facets on each face of the box, and, with a box, those on no face."""
     n = mesh.ndim
     if box is None:
@@ -285,7 +284,7 @@ def face_sets(
         directions = box.affine[list(axes), range(n)]
     # (B, n, 2)
     is_on = facets_on_sides(places, facet_triples(mesh.cells, boundary), faces, tolerance)
-    sets: dict[str, NDArray[np.int64]] = {}
+    sets: dict[str, Ints] = {}
     for name_pair in FACE_NAMES[n]:
         axis = axes.index(FACE_NAMES[n].index(name_pair))
         sides = is_on[:, axis].T if directions[axis] > 0.0 else is_on[:, axis, ::-1].T
@@ -295,7 +294,7 @@ def face_sets(
     )
 
 
-def _extent_sets(mesh: Mesh, boundary: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
+def _extent_sets(mesh: Mesh, boundary: Ints) -> dict[str, Ints]:
     """Return the boundary facets in the outermost tenth of the mesh along each world axis that face
     this direction.
 
@@ -317,7 +316,7 @@ def _extent_sets(mesh: Mesh, boundary: NDArray[np.int64]) -> dict[str, NDArray[n
     return sets
 
 
-def _interfaces(mesh: Mesh, labels: NDArray[np.int64]) -> dict[tuple[int, int], NDArray[np.int64]]:
+def _interfaces(mesh: Mesh, labels: Ints) -> dict[tuple[int, int], Ints]:
     """Return the facets between each pair of labels, as rows of cells with the smaller one,
     which comes first.
     """
@@ -340,7 +339,7 @@ def _interfaces(mesh: Mesh, labels: NDArray[np.int64]) -> dict[tuple[int, int], 
     return dict(zip(kinds, parts, strict=True))
 
 
-def _check_labels(labels: ArrayLike, mesh: Mesh) -> NDArray[np.int64]:
+def _check_labels(labels: ArrayLike, mesh: Mesh) -> Ints:
     array = np.asarray(labels)
     if array.shape != (len(mesh.cells),):
         raise InputError(
@@ -357,9 +356,7 @@ def _check_labels(labels: ArrayLike, mesh: Mesh) -> NDArray[np.int64]:
 # Sets requested by the user
 
 
-def with_requested(
-    mesh: Mesh, sets: Sets, requests: Iterable[str], mean: NDArray[np.float64] | None
-) -> Sets:
+def with_requested(mesh: Mesh, sets: Sets, requests: Iterable[str], mean: Floats | None) -> Sets:
     """Add requested sets to `sets`.
 
     Parameters
@@ -401,7 +398,7 @@ class SetRequest(NamedTuple):
 
     name: str
     kind: str
-    vectors: list[NDArray[np.float64]]  # the numbers between the colons
+    vectors: list[Floats]  # the numbers between the colons
     difference: str = ""  # "A-B-C", of sets of facets
 
     def names(self) -> tuple[str, ...]:
@@ -455,14 +452,14 @@ def parse_set(text: str, ndim: int) -> SetRequest:
     return SetRequest(name, kind, vectors)
 
 
-def enclosing_facets(mesh: Mesh, cells: NDArray[np.int64]) -> NDArray[np.int64]:
+def enclosing_facets(mesh: Mesh, cells: Ints) -> Ints:
     """Return the facets that enclose some cells, as rows of these cells, (K, 2) int64."""
     part = Mesh(mesh.points, mesh.cells[cells])
     rows = boundary_rows(part)
     return np.column_stack([cells[rows[:, 0]], rows[:, 1]])
 
 
-def _of_sets(mesh: Mesh, request: SetRequest, sets: Sets) -> NDArray[np.int64]:
+def _of_sets(mesh: Mesh, request: SetRequest, sets: Sets) -> Ints:
     """Return the facets (K, 2) of a difference of sets, or of its outer or inner parts."""
     first, *others = (_facets_named(mesh, name, request, sets) for name in names_in(request, sets))
     n_local = mesh.ndim + 1
@@ -524,14 +521,14 @@ def _turned_names(name: str) -> list[str]:
     return [f"{INTERFACE_PREFIX}{'_'.join([*parts[k:], *parts[:k]])}" for k in range(1, len(parts))]
 
 
-def _facets_named(mesh: Mesh, name: str, request: SetRequest, sets: Sets) -> NDArray[np.int64]:
+def _facets_named(mesh: Mesh, name: str, request: SetRequest, sets: Sets) -> Ints:
     place = place_of(name, sets)
     assert place is not None, f"{request.name}: {name} is split by known names"
     rows = sets.facets[place[0]]
     return rows_of(mesh, facet_triples(mesh.cells, rows)[:, ::-1]) if place[1] else rows
 
 
-def _is_inner(mesh: Mesh, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
+def _is_inner(mesh: Mesh, rows: Ints) -> Bools:
     """Return which facets (K, 2) belong to an inner part: parts are linked by edges (in 2-D by
     nodes).
 
@@ -568,9 +565,7 @@ def check_free_names(request: SetRequest, sets: Sets) -> None:
             )
 
 
-def _cells_below(
-    mesh: Mesh, request: SetRequest, mean: NDArray[np.float64] | None
-) -> NDArray[np.int64]:
+def _cells_below(mesh: Mesh, request: SetRequest, mean: Floats | None) -> Ints:
     name, threshold = request.name, float(request.vectors[0][0])
     if mean is None:
         raise InputError(f"set {name}: the mesh has no cell means; give the image (`image`)")
@@ -582,7 +577,7 @@ def _cells_below(
     return chosen
 
 
-def _facets_within(mesh: Mesh, request: SetRequest) -> NDArray[np.int64]:
+def _facets_within(mesh: Mesh, request: SetRequest) -> Ints:
     """Return the boundary facets with all nodes within the distance of the point or plane."""
     offset = mesh.points - request.vectors[0]
     if request.kind == "point":
@@ -603,14 +598,14 @@ def _facets_within(mesh: Mesh, request: SetRequest) -> NDArray[np.int64]:
     return rows[farthest <= reach]
 
 
-def _numbers(name: str, text: str, count: int) -> NDArray[np.float64]:
+def _numbers(name: str, text: str, count: int) -> Floats:
     numbers = finite_numbers(text)
     if len(numbers) != count:
         raise InputError(f'set {name}: expected {count} number{"s" * (count > 1)}, got "{text}"')
     return numbers
 
 
-def finite_numbers(text: str) -> NDArray[np.float64]:
+def finite_numbers(text: str) -> Floats:
     """Parse comma-separated numbers, float64; empty for any other text, or if one is not finite."""
     try:
         numbers = np.array([float(part) for part in text.split(",")])
@@ -622,7 +617,7 @@ def finite_numbers(text: str) -> NDArray[np.float64]:
 # Sets that come with a mesh
 
 
-def rows_of(mesh: Mesh, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
+def rows_of(mesh: Mesh, nodes: Ints) -> Ints:
     """Return the rows (cell, k), ascending, of facets given by their nodes (K, n); others are
     ignored.
 
@@ -638,7 +633,7 @@ def rows_of(mesh: Mesh, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
     number, listed = np.unique(place[which.ravel()[len(shared.nodes) :]], return_index=True)
     number, listed = number[number >= 0], nodes[listed[number >= 0]]
 
-    def held_by(cell: NDArray[np.int64]) -> NDArray[np.int64]:
+    def held_by(cell: Ints) -> Ints:
         return np.column_stack([cell, (shared.of_cell[cell] == number[:, None]).argmax(axis=1)])
 
     first, second = shared.cells[number].T
@@ -690,7 +685,7 @@ def merged_sets(standard: Sets, own: Sets) -> tuple[Sets, dict[str, str]]:
 
     An own set that equals the standard set of the same name is merged with it.
     """
-    parts: tuple[dict[str, NDArray[np.int64]], ...] = (dict(standard.facets), dict(standard.cells))
+    parts: tuple[dict[str, Ints], ...] = (dict(standard.facets), dict(standard.cells))
     renamed = {}
     for kind, members_by_name in enumerate((own.facets, own.cells)):
         for name, members in members_by_name.items():

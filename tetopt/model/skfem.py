@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from tetopt.mesh import Mesh
 from tetopt.model.sets import Sets
+from tetopt.system.arrays import Ints
 
 if TYPE_CHECKING:
     import skfem
@@ -46,9 +47,7 @@ def skfem_mesh(mesh: Mesh, sets: Sets) -> skfem.Mesh:
     return bare.with_boundaries(boundaries).with_subdomains(subdomains)
 
 
-def _boundary(
-    mesh: skfem.Mesh, cells: NDArray[np.int64], rows: NDArray[np.int64]
-) -> NDArray[np.integer]:
+def _boundary(mesh: skfem.Mesh, cells: Ints, rows: Ints) -> NDArray[np.integer]:
     """Return scikit-fem's numbers of the facets (K, 2)."""
     from skfem.generic_utils import OrientedBoundary
 

@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.contents.labels import LARGEST_LABEL, check_labels
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.model.label_names import labels_named
 from tetopt.model.mappings import named_file
+from tetopt.system.arrays import Ints
 from tetopt.system.incoming import rows_of, toml_of
 
 REST = "*"  # all labels in no other group, except 0
@@ -200,7 +200,7 @@ def _check_groups(rows: list[tuple[str | None, str, tuple[str, ...]]]) -> list[L
 
 
 def _members(
-    groups: list[LabelGroup], names: Mapping[int, str], present: NDArray[np.int64]
+    groups: list[LabelGroup], names: Mapping[int, str], present: Ints
 ) -> tuple[dict[int, int], int | None]:
     """Return the number of the group of each label, in ranges of those present, and that of all
     other labels.
@@ -222,7 +222,7 @@ def _members(
     return owner, rest
 
 
-def _labels_of(word: str, names: Mapping[int, str], present: NDArray[np.int64]) -> list[int]:
+def _labels_of(word: str, names: Mapping[int, str], present: Ints) -> list[int]:
     """Return the labels that a number, a range or a name refers to."""
     if (match := RANGE.fullmatch(word)) is None:
         try:

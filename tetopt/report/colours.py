@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 
 from tetopt.contents.labels import colours_by_number
 from tetopt.io.text import plain
+from tetopt.system.arrays import Floats, Ints
 
 UNCOVERED_COLOUR = "#cfe3f5"  # where a mesh leaves the image uncovered
 LISTED_LABELS = 12  # labels in a legend: more could not be distinguished by colour alone
 
 
 def label_colours(
-    labels: NDArray[np.int64], own: Mapping[int, tuple[float, float, float]] | None = None
-) -> NDArray[np.float64]:
+    labels: Ints, own: Mapping[int, tuple[float, float, float]] | None = None
+) -> Floats:
     """Return the colour of each label.
 
     A label has the same colour in all pictures: its `own`, e.g. from
@@ -59,8 +60,8 @@ def grey_limits(values: Sequence[NDArray], brightest: float = 99.5) -> tuple[flo
 
 
 def legend_patches(
-    labels: NDArray[np.int64],
-    colours: NDArray[np.float64],
+    labels: Ints,
+    colours: Floats,
     shown: NDArray[np.integer],
     names: Mapping[int, str] | None = None,
 ) -> list[Patch]:

@@ -16,6 +16,7 @@ from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
 from tetopt.model.label_names import LABEL_FIELD, NO_TABLE, LabelTable, table_of_labels
 from tetopt.report.colours import grey_limits, label_colours
+from tetopt.system.arrays import Floats
 
 COLOUR_MAP = "viridis"  # perceptually even
 # whole numbers with more values are a quantity: a longer list of colours is unreadable
@@ -72,7 +73,7 @@ class Exhibit(NamedTuple):
     image: Image | None  # 3-D
     title: str
     sets: dict[str, NDArray]  # (K, 3) integer: the nodes of facets, by name
-    displacements: dict[int, NDArray[np.float64]]  # (N, 3) mm by step; a single one under 0
+    displacements: dict[int, Floats]  # (N, 3) mm by step; a single one under 0
     n_nodes: int  # includes the mid-edge nodes of order 2, which are not drawn
     # by the same steps and by set: its reaction, (3,) mN
     reactions: dict[int, dict[str, list[float]]]
@@ -220,12 +221,12 @@ def first_axis(shown: Exhibit) -> int:
 
 def _nodal(
     mesh: Mesh, point_data: dict[str, NDArray]
-) -> tuple[dict[str, NDArray], dict[int, NDArray[np.float64]], list[str]]:
+) -> tuple[dict[str, NDArray], dict[int, Floats], list[str]]:
     """Return numbers by name, lengths of displacements first; displacements by step; and the
     names of other data.
     """
     numbers: dict[str, NDArray] = {}
-    displacements: dict[int, NDArray[np.float64]] = {}
+    displacements: dict[int, Floats] = {}
     others = []
     for name, rows in point_data.items():
         values = np.asarray(rows)[: len(mesh.points)]
@@ -247,7 +248,7 @@ def _nodal(
     return numbers, dict(sorted(displacements.items())), others
 
 
-def _by_step(fields: list[Field], displacements: dict[int, NDArray[np.float64]]) -> list[Field]:
+def _by_step(fields: list[Field], displacements: dict[int, Floats]) -> list[Field]:
     """Assign steps to fields, and remove the step number from their names."""
     if len(displacements) < 2:
         return fields
@@ -290,7 +291,7 @@ def _single(values: NDArray) -> NDArray[np.float32]:
     return np.where(np.isfinite(values), values, np.nan).astype(np.float32)
 
 
-def _categories(values: NDArray[np.float64], table: LabelTable) -> list[tuple[int, str]]:
+def _categories(values: Floats, table: LabelTable) -> list[tuple[int, str]]:
     """Return labels and their colours; none if values are negative, not whole, or too many for a
     list of colours.
     """

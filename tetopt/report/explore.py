@@ -35,6 +35,7 @@ from tetopt.report.page import (
     render_page,
     script_html,
 )
+from tetopt.system.arrays import Floats
 from tetopt.system.files import save_text
 
 PAGE_IMAGE_VOXELS = 2**24  # 16 MB, one byte each: larger images are averaged
@@ -106,7 +107,7 @@ def _packed_field(field: Field) -> dict[str, Any]:
     return {**field._asdict(), "values": encode_numbers(field.values, "<f4"), "nodes": nodes}
 
 
-def _packed_image(image: Image, centre: NDArray[np.float64]) -> dict[str, Any]:
+def _packed_image(image: Image, centre: Floats) -> dict[str, Any]:
     """Pack the image as bytes, the first axis fastest, with the map from places relative to
     `centre` to indices.
     """

@@ -12,7 +12,6 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
-from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, uniform_filter
 
 from tetopt.contents.domain import INSIDE_FRACTION
@@ -37,6 +36,7 @@ from tetopt.report.colours import (
     legend_patches,
 )
 from tetopt.report.tables import nodes_in_words
+from tetopt.system.arrays import Floats, Ints
 from tetopt.system.files import check_suffix, written_whole
 
 matplotlib.use("agg")
@@ -159,7 +159,7 @@ def limits_within(
     return grey_limits(pixels, brightest=99.8)
 
 
-def draw_edges(axes: Axes, polygons: NDArray[np.float64]) -> None:
+def draw_edges(axes: Axes, polygons: Floats) -> None:
     """Draw the edges of a section's polygons over a slice."""
     # Each line belongs to two polygons and is drawn twice. Where there are many, lines of full
     # width (in points) would hide the image.
@@ -171,8 +171,8 @@ def draw_edges(axes: Axes, polygons: NDArray[np.float64]) -> None:
 
 def fill_cells(
     axes: Axes,
-    polygons: NDArray[np.float64],
-    values: NDArray[np.float64],
+    polygons: Floats,
+    values: Floats,
     colours: str,
     limits: tuple[float, float],
 ) -> PolyCollection:
@@ -192,7 +192,7 @@ def fill_cells(
 def label_figure(
     labels: Image,
     mesh: Mesh,
-    of_cell: NDArray[np.int64] | None = None,
+    of_cell: Ints | None = None,
     image: Image | None = None,
     table: LabelTable = NO_TABLE,
     order: int = 1,
@@ -285,8 +285,8 @@ def _draw_interfaces(
     column: Sequence[Axes],
     image: Image,
     mesh: Mesh,
-    of_cell: NDArray[np.int64],
-    colours: NDArray[np.float64],
+    of_cell: Ints,
+    colours: Floats,
 ) -> None:
     """Draw the middle slices of the image, and over them the sections of interfaces between the
     cells' labels.
@@ -308,7 +308,7 @@ def _draw_interfaces(
         view.frame(axes)
 
 
-def _count_rows(arrays: Sequence[NDArray[np.int64]], n: int) -> NDArray[np.int64]:
+def _count_rows(arrays: Sequence[Ints], n: int) -> Ints:
     """Count the rows of labels, 0 to n - 1, in all arrays together."""
     return np.bincount(np.concatenate([array.ravel() for array in arrays]), minlength=n)
 
@@ -316,9 +316,9 @@ def _count_rows(arrays: Sequence[NDArray[np.int64]], n: int) -> NDArray[np.int64
 def _write_numbers(
     axes: Axes,
     view: SliceView,
-    pixels: NDArray[np.int64],
-    values: NDArray[np.int64],
-    colours: NDArray[np.float64],
+    pixels: Ints,
+    values: Ints,
+    colours: Floats,
     room: float,
 ) -> None:
     """Write the number of each label except 0 at its widest place in the slice, if a circle of
@@ -414,7 +414,7 @@ def boundary_figure(
     return figure
 
 
-def _half_level(view: SliceView) -> NDArray[np.float64]:
+def _half_level(view: SliceView) -> Floats:
     """Return the level 1/2 of the pixels as segments (K, 2, 2), picture mm; see
     `half_level_surface`.
     """
@@ -424,9 +424,7 @@ def _half_level(view: SliceView) -> NDArray[np.float64]:
     return outline.points[outline.facets]
 
 
-def _longest_part(
-    outline: NDArray[np.float64], view: SliceView
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _longest_part(outline: Floats, view: SliceView) -> tuple[Floats, Floats]:
     """Return the corners, in picture mm, of the square of `DETAIL_VOXELS` voxels that holds most
     of the outline.
     """
@@ -486,7 +484,7 @@ class SliceView:
             vmax=limits[1],
         )
 
-    def section(self, mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    def section(self, mesh: Mesh) -> tuple[Floats, Ints]:
         """Return the polygons (K, 3 or 4, 2) of the mesh in the slice, in picture mm, and their
         cells (K,).
         """
@@ -498,7 +496,7 @@ class SliceView:
             corners, cells = plane_cut(index, pieces.cells, index[:, self.across] - self.index)
         return self._flat(corners), cells // n_pieces
 
-    def boundary(self, mesh: Mesh) -> NDArray[np.float64]:
+    def boundary(self, mesh: Mesh) -> Floats:
         """Return the mesh's boundary in the slice, off the image's box, as segments (K, 2, 2),
         picture mm.
         """
@@ -511,9 +509,7 @@ class SliceView:
             triangle_cut(index, outer[~is_on_box], index[:, self.across] - self.index)[0]
         )
 
-    def interfaces(
-        self, mesh: Mesh, of_cell: NDArray[np.int64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    def interfaces(self, mesh: Mesh, of_cell: Ints) -> tuple[Floats, Ints]:
         """Return the interfaces between labels as segments (K, 2, 2), picture mm, and their two
         labels (K, 2).
         """
@@ -529,7 +525,7 @@ class SliceView:
         lines, triangles = triangle_cut(index, nodes, index[:, self.across] - self.index)
         return self._flat(lines), sides[triangles]
 
-    def _flat(self, index: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _flat(self, index: Floats) -> Floats:
         """Convert index coordinates (..., n) to positions in the picture (..., 2), mm."""
         flat = (index[..., self.axes] + 0.5) * self.steps
         return np.where(self.flip, self.size - flat, flat)

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pyvista
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from tetopt.errors import InputError
@@ -18,6 +17,7 @@ from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.report.colours import grey_limits
 from tetopt.report.figures import FIGURE_SUFFIXES, MESH_LINE
+from tetopt.system.arrays import Bools, Floats, Ints
 from tetopt.system.files import check_suffix, written_whole
 
 STRUCTURE_COLOUR = "#d95f02"  # orange, which stands out from the grey slices behind it
@@ -30,14 +30,12 @@ class View(NamedTuple):
     """A triangle surface to view."""
 
     title: str
-    points: NDArray[np.float64]  # (N, 3) world mm
-    triangles: NDArray[np.int64]  # (K, 3), normals pointing out
-    values: NDArray[np.float64]  # (K,) of each triangle's cell, drawn in grey
+    points: Floats  # (N, 3) world mm
+    triangles: Ints  # (K, 3), normals pointing out
+    values: Floats  # (K,) of each triangle's cell, drawn in grey
 
 
-def view_of(
-    mesh: Mesh, means: NDArray[np.float64], title: str, centre: NDArray[np.float64] | None = None
-) -> View:
+def view_of(mesh: Mesh, means: Floats, title: str, centre: Floats | None = None) -> View:
     """Return the surface of a mesh without its right, front, upper octant, which shows the inside.
 
     Parameters
@@ -119,7 +117,7 @@ def put_scene(plotter: pyvista.Plotter, draw: Draw) -> None:
     plotter.camera.zoom(SCENE_ZOOM)
 
 
-def structure_before_slices(image: Image, mesh: Mesh, chosen: NDArray[np.int64]) -> Draw:
+def structure_before_slices(image: Image, mesh: Mesh, chosen: Ints) -> Draw:
     """Return a scene of the boundary of chosen cells in front of the volume's middle slices, on
     the box's far sides.
     """
@@ -178,7 +176,7 @@ def cutaway(view: View, limits: tuple[float, float]) -> Draw:
     )
 
 
-def dark_structure_surface(image: Image, below: float, near: NDArray[np.bool_]) -> pyvista.PolyData:
+def dark_structure_surface(image: Image, below: float, near: Bools) -> pyvista.PolyData:
     """Return the surface at level `below` of the dark structures within the mask `near`, world mm.
 
     Voxels below the level are eroded by one voxel, which separates the ventricles from the sulci.

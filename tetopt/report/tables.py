@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
@@ -19,6 +18,7 @@ from tetopt.measure.quality import Quality
 from tetopt.measure.thin import TOLERATED_CONTACT, LabelContact
 from tetopt.mesh import Mesh
 from tetopt.start.sizes import LONG_EDGE, SHORT_EDGE_FRACTION, EdgeRatios
+from tetopt.system.arrays import Floats
 
 CHANGED_FRACTION = 0.2  # of a label's size: larger changes get a line of text
 WORST_ROWS = 5  # thin labels and pairs shown; run.json has all
@@ -62,7 +62,7 @@ def size_text(number: float, decimals: int) -> str:
     return f"{number:.3g}" if 0.0 < abs(number) < 10.0 ** (2 - decimals) else digits
 
 
-def range_words(numbers: NDArray[np.float64]) -> str:
+def range_words(numbers: Floats) -> str:
     """Format the range of numbers, or the one number that all are."""
     low, high = numbers.min(), numbers.max()
     return f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"

@@ -17,7 +17,6 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from tetopt.contents.domain import INSIDE_FRACTION
@@ -30,6 +29,7 @@ from tetopt.mesh import Mesh
 from tetopt.model.label_names import NO_TABLE, LabelTable
 from tetopt.report.colours import grey_limits, label_colours
 from tetopt.report.figures import MASK_LINE, MESH_LINE
+from tetopt.system.arrays import Floats, Ints
 
 SIDE_PIXELS = 128  # of a view: enough for a head, where a page has 500 of them
 SAMPLES_PER_PIXEL = 2  # along each side: fine stripes would cause aliasing with single samples
@@ -53,7 +53,7 @@ def thumbnail_png(
     mesh: Mesh,
     mask: Image | None = None,
     labels: Image | None = None,
-    of_cell: NDArray[np.int64] | None = None,
+    of_cell: Ints | None = None,
     table: LabelTable = NO_TABLE,
 ) -> bytes:
     """Return slices of an image with its mesh as a PNG; the same inputs give the same bytes.
@@ -110,7 +110,7 @@ def thumbnail_png(
 class _View(NamedTuple):
     """A square around a place, along two world axes."""
 
-    place: NDArray[np.float64]
+    place: Floats
     axes: tuple[int, int]  # horizontal and vertical
     half: float  # mm, of its side
 
@@ -146,7 +146,7 @@ def _limits(
     mesh: Mesh,
     mask: Image | None,
     views: Sequence[_View],
-    pixels: Sequence[NDArray[np.float64]],
+    pixels: Sequence[Floats],
 ) -> tuple[float, float]:
     """Return the values drawn black and white: of the pixels in the mesh and its mask."""
     inside = cell_of_voxel(image, mesh) >= 0
@@ -196,7 +196,7 @@ def _fullest(mesh: Mesh, axis: int) -> float:
     return float(ends[slab : slab + 2].mean())
 
 
-def _sample_view(image: Image, view: _View) -> NDArray[np.float64]:
+def _sample_view(image: Image, view: _View) -> Floats:
     """Sample the image in the pixels of a view; NaN outside the image."""
     n, place, (across, up) = SIDE_PIXELS * SAMPLES_PER_PIXEL, view.place, view.axes
     steps = (np.arange(n) + 0.5) / n * 2.0 * view.half - view.half
@@ -209,11 +209,11 @@ def _sample_view(image: Image, view: _View) -> NDArray[np.float64]:
     values = map_coordinates(image.data, index, output=np.float64, order=1, mode="nearest")
     values[~is_in] = np.nan
     fine = values.reshape(SIDE_PIXELS, SAMPLES_PER_PIXEL, SIDE_PIXELS, SAMPLES_PER_PIXEL)
-    averaged: NDArray[np.float64] = fine.mean(axis=(1, 3))
+    averaged: Floats = fine.mean(axis=(1, 3))
     return averaged
 
 
-def _draw_mesh(panel: Axes, mesh: Mesh, view: _View, colours: NDArray[np.float64] | None) -> None:
+def _draw_mesh(panel: Axes, mesh: Mesh, view: _View, colours: Floats | None) -> None:
     """Draw the cells that the plane of a view cuts, in their colours (M, 3) if any, and
     the mesh's boundary.
     """

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from tetopt.contents.domain import Region
 from tetopt.contents.memberships import Memberships
@@ -17,6 +16,7 @@ from tetopt.geometry.simplex import centroids, volumes
 from tetopt.geometry.topology import compact, components
 from tetopt.image import Image
 from tetopt.mesh import Mesh
+from tetopt.system.arrays import Bools, Floats, Ints
 
 # of the largest component of cells within a component of voxels: smaller ones are dropped. A larger
 # one is a part of the mask that cells do not join to the rest, which is better told (requirement
@@ -27,7 +27,7 @@ DROPPED_FRACTION = 0.01
 class Carved(NamedTuple):
     """The cells that stay."""
 
-    is_kept: NDArray[np.bool_]  # (M,)
+    is_kept: Bools  # (M,)
     n_dropped: int  # dropped connected components
     volumes: dict[int, float]  # mm^n of these, by label; all of label 0 without labels
 
@@ -76,7 +76,7 @@ def carve_mesh(
     )
 
 
-def _weld_cells(mesh: Mesh) -> NDArray[np.int64]:
+def _weld_cells(mesh: Mesh) -> Ints:
     """The cells with one number for coincident nodes, where parts of a boundary may touch
     without sharing a node.
     """
@@ -87,7 +87,7 @@ def _weld_cells(mesh: Mesh) -> NDArray[np.int64]:
     return first[mesh.cells]
 
 
-def part_of(mesh: Mesh, is_kept: NDArray[np.bool_]) -> Mesh:
+def part_of(mesh: Mesh, is_kept: Bools) -> Mesh:
     """The mesh of the cells that stay, (M,), without unused nodes."""
     if is_kept.all():
         return mesh
@@ -96,11 +96,11 @@ def part_of(mesh: Mesh, is_kept: NDArray[np.bool_]) -> Mesh:
 
 
 def _home(
-    voxel: tuple[NDArray[np.int64], ...],
-    number: NDArray[np.int64],
-    size: NDArray[np.float64],
+    voxel: tuple[Ints, ...],
+    number: Ints,
+    size: Floats,
     region: Region,
-) -> NDArray[np.int64]:
+) -> Ints:
     """The component of voxels, from 1, that contains most of each component of cells, (C,); 0 for
     none.
 

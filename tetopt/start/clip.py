@@ -18,6 +18,7 @@ from tetopt.geometry.topology import boundary_facets, compact
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice_mesh
+from tetopt.system.arrays import Bools, Floats, Ints
 
 SNAP_FRACTION = 0.3  # of an edge: a node this near to the surface along it moves onto the surface
 # of an edge: a node this near to the surface counts as on it, even if it cannot move there
@@ -94,9 +95,7 @@ def lost_fraction(mesh: Mesh, image: Image, region: Region) -> float:
     return float(1.0 - covered / region.inside.sum())
 
 
-def _volume_outside(
-    region: Region, corners: NDArray[np.float64], volume: NDArray[np.float64]
-) -> float:
+def _volume_outside(region: Region, corners: Floats, volume: Floats) -> float:
     """Volume of the cells' parts outside a region, by points spread evenly over the volume of
     the cells, (M,).
     """
@@ -110,9 +109,7 @@ def _volume_outside(
     return float(ends[-1] * np.mean(levels(region.level, points) > 0.0))
 
 
-def _sides(
-    level: NDArray[np.float64], cells: NDArray[np.int64]
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _sides(level: Floats, cells: Ints) -> tuple[Bools, Bools]:
     """Masks of the cells with a node inside, and of those with a node outside, (M,) each."""
     of_cells = level[cells]
     return np.asarray(of_cells.min(axis=1) < 0.0), np.asarray(of_cells.max(axis=1) > 0.0)
@@ -147,12 +144,12 @@ def lattice_within(
 
 
 def _snap_nodes(
-    index: NDArray[np.float64],
-    level: NDArray[np.float64],
-    cells: NDArray[np.int64],
+    index: Floats,
+    level: Floats,
+    cells: Ints,
     image: Image,
     region: Region,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Floats, Floats]:
     """Move nodes that are near to the surface along an edge onto it, unless that flattens a
     cell.
     """
@@ -195,7 +192,7 @@ def _snap_nodes(
     return moved, level
 
 
-def _fullness(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.float64]:
+def _fullness(points: Floats, cells: Ints) -> Floats:
     """Volume relative to the regular cell with the same sum of squared edges, (M,): 0 to 1,
     negative if inverted.
     """
@@ -206,9 +203,7 @@ def _fullness(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[
     )
 
 
-def onto_surface(
-    index: NDArray[np.float64], image: Image, region: Region
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def onto_surface(index: Floats, image: Image, region: Region) -> tuple[Floats, Bools]:
     """Move points (K, n) to the surface, nearly the shortest way in mm; also return a mask of those
     that arrive, (K,).
 
@@ -229,7 +224,7 @@ def onto_surface(
     return at, np.abs(levels(region.level, at)) < ON_SURFACE_VOXELS
 
 
-def _slopes(level: NDArray[np.float32], index: NDArray[np.float64]) -> NDArray[np.float64]:
+def _slopes(level: NDArray[np.float32], index: Floats) -> Floats:
     """Derivatives of the level function along the axes at index coordinates (K, n), (K, n)."""
     off = 0.25 * np.eye(index.shape[1])
     return np.stack(
@@ -238,12 +233,12 @@ def _slopes(level: NDArray[np.float32], index: NDArray[np.float64]) -> NDArray[n
 
 
 def _cut(
-    index: NDArray[np.float64],
-    level: NDArray[np.float64],
-    cells: NDArray[np.int64],
-    near: NDArray[np.int64],
+    index: Floats,
+    level: Floats,
+    cells: Ints,
+    near: Ints,
     region: Region,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+) -> tuple[Floats, Floats, Ints]:
     """Split every edge that crosses the surface there; `near` numbers the cells. Return nodes,
     their levels and cells.
 
@@ -277,9 +272,7 @@ def _cut(
     return index, level, np.concatenate(done)
 
 
-def _crossings(
-    a: NDArray[np.float64], b: NDArray[np.float64], region: Region
-) -> NDArray[np.float64]:
+def _crossings(a: Floats, b: Floats, region: Region) -> Floats:
     """Fractions of the way from a to b (K, n) at which the surface crosses these edges, (K,), by
     bisection.
     """

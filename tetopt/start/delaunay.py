@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from tetopt.geometry.simplex import orient_cells
 from tetopt.image import transform_vectors
+from tetopt.system.arrays import Floats, Ints
 
 TIE_BREAK = 1e-7  # of the squared typical edge
 
 
-def delaunay(index: NDArray[np.float64], affine: NDArray[np.float64]) -> NDArray[np.int64] | None:
+def delaunay(index: Floats, affine: Floats) -> Ints | None:
     """Delaunay cells of nodes in index space, with cospherical ties broken so that no cell is flat.
 
     The Delaunay tessellation is the lower hull of the nodes lifted to (x, |x|^2) (Brown 1979). The

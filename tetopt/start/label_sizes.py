@@ -21,6 +21,7 @@ from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.start.octree import nodes_of_sizes
 from tetopt.start.sizes import LONGEST_IN_BLOCK, NO_BOUND_MM, USUAL_IN_BLOCK, Sizes
+from tetopt.system.arrays import Floats
 
 EVERY_LABEL = "*"  # all labels without their own size
 SIZE_FORM = re.compile(
@@ -58,7 +59,7 @@ class LabelSize(NamedTuple):
     least: float = 0.0
     most: float = np.inf
 
-    def at(self, thickness: NDArray) -> NDArray[np.float64]:
+    def at(self, thickness: NDArray) -> Floats:
         """Return the size of cells at a given thickness of the label.
 
         Parameters
@@ -347,7 +348,7 @@ def _targets(
     rules: dict[int, LabelSize],
     thickness: NDArray[np.float32],
     largest: float,
-) -> NDArray[np.float64]:
+) -> Floats:
     """The smallest requested target at each voxel, mm."""
     assert content.memberships is not None
     target = np.minimum(sizes.on_voxels(content.image), largest).astype(np.float64)

@@ -20,12 +20,12 @@ from operator import index
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import orient_cells
 from tetopt.image import Image
 from tetopt.mesh import Mesh
+from tetopt.system.arrays import Floats, Ints
 from tetopt.system.budget import at_most, check_memory
 
 Kind = Literal["bcc", "five-tet", "criss-cross"]
@@ -129,13 +129,13 @@ def _node_count(kind: str, blocks: tuple[int, ...]) -> int:
     return corners if kind == "five-tet" else corners + int(np.prod(blocks, dtype=object))
 
 
-def _blocks_for_spacing(lengths: NDArray[np.float64], spacing: float) -> tuple[int, ...]:
+def _blocks_for_spacing(lengths: Floats, spacing: float) -> tuple[int, ...]:
     if not (np.isfinite(spacing) and spacing > 1e-300):
         raise InputError(f"lattice: expected a spacing above 0 mm, got {spacing}")
     return tuple(max(1, round(min(length / spacing, MAX_NODES))) for length in lengths)
 
 
-def near_cubes(kind: str, lengths: NDArray[np.float64], nodes: int) -> tuple[int, ...]:
+def near_cubes(kind: str, lengths: Floats, nodes: int) -> tuple[int, ...]:
     """The most cubic blocks whose node count is within 3 % of `nodes`; else those with the nearest
     count.
 
@@ -160,24 +160,24 @@ def near_cubes(kind: str, lengths: NDArray[np.float64], nodes: int) -> tuple[int
     return min(candidates, key=merit)
 
 
-def _corner_number(blocks: tuple[int, ...]) -> NDArray[np.int64]:
+def _corner_number(blocks: tuple[int, ...]) -> Ints:
     """Node numbers of the blocks' corners, an array of shape blocks + 1."""
     shape = tuple(b + 1 for b in blocks)
     return np.arange(np.prod(shape)).reshape(shape)
 
 
-def _grid_points(blocks: tuple[int, ...]) -> NDArray[np.float64]:
+def _grid_points(blocks: tuple[int, ...]) -> Floats:
     """Integer coordinates of the blocks' corners, in the order of their numbers."""
     axes = [np.arange(b + 1.0) for b in blocks]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(blocks))
 
 
-def _centre_points(blocks: tuple[int, ...]) -> NDArray[np.float64]:
+def _centre_points(blocks: tuple[int, ...]) -> Floats:
     axes = [np.arange(b) + 0.5 for b in blocks]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(blocks))
 
 
-def _criss_cross(blocks: tuple[int, ...]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _criss_cross(blocks: tuple[int, ...]) -> tuple[Floats, Ints]:
     corner = _corner_number(blocks)
     centre = corner.size + np.arange(np.prod(blocks)).reshape(blocks)
     a, b, c, d = corner[:-1, :-1], corner[1:, :-1], corner[1:, 1:], corner[:-1, 1:]
@@ -192,7 +192,7 @@ _FIVE_EVEN = np.array([[0, 3, 5, 6], [1, 0, 3, 5], [2, 0, 3, 6], [4, 0, 5, 6], [
 _FIVE_ODD = np.array([[1, 2, 4, 7], [0, 1, 2, 4], [3, 1, 2, 7], [5, 1, 4, 7], [6, 2, 4, 7]])
 
 
-def _five_tet(blocks: tuple[int, ...]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _five_tet(blocks: tuple[int, ...]) -> tuple[Floats, Ints]:
     corner = _corner_number(blocks)
     b0, b1, b2 = blocks
     local = np.stack(
@@ -205,7 +205,7 @@ def _five_tet(blocks: tuple[int, ...]) -> tuple[NDArray[np.float64], NDArray[np.
     return _grid_points(blocks), cells.reshape(-1, 4)
 
 
-def _bcc(blocks: tuple[int, ...]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _bcc(blocks: tuple[int, ...]) -> tuple[Floats, Ints]:
     corner = _corner_number(blocks)
     centre = corner.size + np.arange(np.prod(blocks)).reshape(blocks)
     cells = [part for axis in range(3) for part in _bcc_across(corner, centre, axis)]
@@ -213,9 +213,7 @@ def _bcc(blocks: tuple[int, ...]) -> tuple[NDArray[np.float64], NDArray[np.int64
     return points, np.concatenate(cells)
 
 
-def _bcc_across(
-    corner: NDArray[np.int64], centre: NDArray[np.int64], axis: int
-) -> list[NDArray[np.int64]]:
+def _bcc_across(corner: Ints, centre: Ints, axis: int) -> list[Ints]:
     """Cells at the block faces normal to `axis`: between two centres inside, half pyramids on
     the box.
     """
@@ -235,9 +233,7 @@ def _bcc_across(
     )
 
 
-def _half_pyramids(
-    square: list[NDArray[np.int64]], apex: NDArray[np.int64]
-) -> list[NDArray[np.int64]]:
+def _half_pyramids(square: list[Ints], apex: Ints) -> list[Ints]:
     """The pyramids over the box's squares, cut in two along alternating diagonals."""
     a, b, c, d = square
     is_odd = np.indices(apex.shape).sum(axis=0) % 2 == 1

@@ -22,9 +22,9 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.geometry.simplex import orient_cells
+from tetopt.system.arrays import Bools, Floats, Ints
 
 # Around a square, in halves of its edge: corners, alternating with the middles of its edges.
 FACE_RING = np.array([[0, 0], [1, 0], [2, 0], [2, 1], [2, 2], [1, 2], [0, 2], [0, 1]])
@@ -39,11 +39,11 @@ class LeafNodes(NamedTuple):
     number.
     """
 
-    codes: NDArray[np.int64]  # (N,) sorted
-    steps: NDArray[np.int64]  # (n,) change of the code by one step along each axis
+    codes: Ints  # (N,) sorted
+    steps: Ints  # (n,) change of the code by one step along each axis
     depth: int  # depth of the smallest leaves
 
-    def places(self) -> NDArray[np.float64]:
+    def places(self) -> Floats:
         """Places of the nodes, (N, n), in units of an undivided block."""
         along_axes, rest = [], self.codes
         for step in self.steps:
@@ -51,15 +51,13 @@ class LeafNodes(NamedTuple):
             along_axes.append(along)
         return np.stack(along_axes, axis=1) / 2.0 ** (self.depth + 1)
 
-    def at(self, codes: NDArray[np.int64]) -> NDArray[np.int64]:
+    def at(self, codes: Ints) -> Ints:
         """The nodes with these codes, -1 where there is none."""
         node = np.minimum(np.searchsorted(self.codes, codes), len(self.codes) - 1)
         return np.where(self.codes[node] == codes, node, -1)
 
 
-def leaves_by_depth(
-    divided: list[NDArray[np.bool_]], roots: tuple[int, ...]
-) -> Iterator[NDArray[np.int64]]:
+def leaves_by_depth(divided: list[Bools], roots: tuple[int, ...]) -> Iterator[Ints]:
     """Places of the leaves of each depth, (K, n), the coarsest first."""
     blocks = np.argwhere(np.ones(roots, dtype=bool))
     half = np.argwhere(np.ones((2,) * len(roots), dtype=bool))
@@ -70,9 +68,9 @@ def leaves_by_depth(
 
 
 def leaf_nodes(
-    divided: list[NDArray[np.bool_]],
+    divided: list[Bools],
     roots: tuple[int, ...],
-    regions: Sequence[NDArray[np.bool_]] = (),
+    regions: Sequence[Bools] = (),
 ) -> LeafNodes:
     """Corners and centres of the leaves; with regions, given by depth, leaves outside are
     skipped.
@@ -93,11 +91,11 @@ def leaf_nodes(
 
 
 def leaf_cells(
-    divided: list[NDArray[np.bool_]],
+    divided: list[Bools],
     roots: tuple[int, ...],
     nodes: LeafNodes,
-    points: NDArray[np.float64],
-) -> NDArray[np.int64]:
+    points: Floats,
+) -> Ints:
     """Positively oriented cells that fill the leaves, (M, n+1), sorted by their lowest nodes.
 
     `points` has the nodes' places in the world, (N, n).
@@ -113,16 +111,14 @@ def leaf_cells(
     return joined[np.argsort(joined.min(axis=1), kind="stable")]
 
 
-def _cells_in_plane(
-    leaves: NDArray[np.int64], nodes: LeafNodes, depth: int
-) -> Iterator[NDArray[np.int64]]:
+def _cells_in_plane(leaves: Ints, nodes: LeafNodes, depth: int) -> Iterator[Ints]:
     shift = nodes.depth - depth
     first = 2 * leaves @ nodes.steps
     ring = np.stack([nodes.at(first + step << shift) for step in FACE_RING @ nodes.steps], axis=1)
     yield _around(ring, nodes.at(first + nodes.steps.sum() << shift)[:, None])
 
 
-def _cells(leaves: NDArray[np.int64], nodes: LeafNodes, depth: int) -> Iterator[NDArray[np.int64]]:
+def _cells(leaves: Ints, nodes: LeafNodes, depth: int) -> Iterator[Ints]:
     """The tetrahedra of leaves of one depth, face by face; the first of two leaves lists those
     between them.
     """
@@ -148,7 +144,7 @@ def _cells(leaves: NDArray[np.int64], nodes: LeafNodes, depth: int) -> Iterator[
             yield from _on_squares(ring, centre, is_odd, ~is_fine & ~is_even)
 
 
-def _between(ring: NDArray[np.int64], ends: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
+def _between(ring: Ints, ends: Ints) -> Iterator[Ints]:
     """Cells between the centres of two leaves, (K, 2), that share a face.
 
     Where a corner of the face lies between two mid-edge nodes, these three are cut off, as in
@@ -163,7 +159,7 @@ def _between(ring: NDArray[np.int64], ends: NDArray[np.int64]) -> Iterator[NDArr
     yield _around(left, ends)
 
 
-def _around(ring: NDArray[np.int64], tips: NDArray[np.int64]) -> NDArray[np.int64]:
+def _around(ring: Ints, tips: Ints) -> Ints:
     """Cells of the tips, (K, t), and any two neighbours in a ring, (K, 8), with -1 for missing
     nodes.
     """
@@ -177,11 +173,11 @@ def _around(ring: NDArray[np.int64], tips: NDArray[np.int64]) -> NDArray[np.int6
 
 
 def _on_squares(
-    ring: NDArray[np.int64],
-    centre: NDArray[np.int64],
-    is_odd: NDArray[np.bool_],
-    chosen: NDArray[np.bool_],
-) -> Iterator[NDArray[np.int64]]:
+    ring: Ints,
+    centre: Ints,
+    is_odd: Bools,
+    chosen: Bools,
+) -> Iterator[Ints]:
     """Cells of the centre and the triangles of the chosen squares.
 
     Diagonals of plain squares join the corners whose coordinates have an even sum: on a larger

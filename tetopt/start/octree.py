@@ -53,6 +53,7 @@ from tetopt.start.sums import (
     channels_of,
     halve_totals,
 )
+from tetopt.system.arrays import Bools, Floats, Ints
 from tetopt.system.budget import MemoryShortage, at_most, check_memory
 
 # Ratios of the undivided blocks' nodes to the requested number, tried in turn, the largest blocks
@@ -422,9 +423,9 @@ def _octree_of_box(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
 class _Blocks(NamedTuple):
     """The blocks of one depth."""
 
-    error: NDArray[np.float64]  # sums of squared deviations minus the noise's, plus the spread
-    is_too_large: NDArray[np.bool_]  # must be divided
-    is_in_region: NDArray[np.bool_] | None  # at least in part; None without a mask
+    error: Floats  # sums of squared deviations minus the noise's, plus the spread
+    is_too_large: Bools  # must be divided
+    is_in_region: Bools | None  # at least in part; None without a mask
 
 
 def _blocks_by_depth(
@@ -469,7 +470,7 @@ def _blocks_by_depth(
     return blocks[::-1]
 
 
-def _errors(sums: BlockSums, channels: Channels, spread: float) -> NDArray[np.float64]:
+def _errors(sums: BlockSums, channels: Channels, spread: float) -> Floats:
     """Error of each block: its sum of squared deviations minus the noise's, plus the spread;
     layer by layer.
     """
@@ -492,14 +493,14 @@ def _errors(sums: BlockSums, channels: Channels, spread: float) -> NDArray[np.fl
     return errors
 
 
-def _may_be_divided(edge: NDArray[np.float64], depth: int, limits: _BlockLimits) -> bool:
+def _may_be_divided(edge: Floats, depth: int, limits: _BlockLimits) -> bool:
     """True if halves of blocks of this depth are long enough; `edge` (n,) are the roots' edges,
     mm.
     """
     return bool(edge.min() / 2 ** (depth + 1) >= limits.smallest)
 
 
-def _is_too_large(edge: NDArray[np.float64], depth: int, limits: _BlockLimits) -> bool:
+def _is_too_large(edge: Floats, depth: int, limits: _BlockLimits) -> bool:
     """True if all blocks of this depth must be divided."""
     return bool(limits.largest * (1.0 + 1e-9) < edge.max() / 2**depth) and _may_be_divided(
         edge, depth, limits
@@ -507,9 +508,9 @@ def _is_too_large(edge: NDArray[np.float64], depth: int, limits: _BlockLimits) -
 
 
 def _depths(
-    edge: NDArray[np.float64],
+    edge: Floats,
     roots: tuple[int, ...],
-    spacing: NDArray[np.float64],
+    spacing: Floats,
     limits: _BlockLimits,
 ) -> tuple[int, int]:
     """Largest depths to which roots with edges (n,), mm, may be divided at all, and for their
@@ -545,7 +546,7 @@ def _least_edge(limits: _BlockLimits, n: int) -> float:
     )
 
 
-def _divided_for(target: NDArray, edge: float) -> NDArray[np.bool_]:
+def _divided_for(target: NDArray, edge: float) -> Bools:
     """Mask of the blocks with this edge to divide for their targets for the usual edge of cells,
     mm.
 
@@ -560,7 +561,7 @@ def _divided_for(target: NDArray, edge: float) -> NDArray[np.bool_]:
     return np.asarray(more > np.maximum((2**n - 1) * fraction, TARGET_SLACK))
 
 
-def _uneven_factors(*index: NDArray[np.int64]) -> NDArray[np.float64]:
+def _uneven_factors(*index: Ints) -> Floats:
     """Distinct factors from 1 to 1 + `TIE_SPREAD`, so that blocks that are alike are not all
     divided at once.
 
@@ -571,7 +572,7 @@ def _uneven_factors(*index: NDArray[np.int64]) -> NDArray[np.float64]:
     return 1.0 + TIE_SPREAD * np.mod(place, 1.0)
 
 
-def _least_targets(data: NDArray, counts: NDArray[np.int64]) -> NDArray:
+def _least_targets(data: NDArray, counts: Ints) -> NDArray:
     """Minima over equal blocks: a voxel belongs to the block of its centre; a block without
     centres has no target.
     """
@@ -593,7 +594,7 @@ def _least_targets(data: NDArray, counts: NDArray[np.int64]) -> NDArray:
 
 def _best_division(
     content: Content, nodes: int, limits: _BlockLimits
-) -> tuple[tuple[int, ...], list[NDArray[np.bool_]]]:
+) -> tuple[tuple[int, ...], list[Bools]]:
     """Numbers of roots along each axis, and the divided blocks, of the octree with the nearest
     number of nodes.
 
@@ -601,7 +602,7 @@ def _best_division(
     from one size of undivided blocks. Then other sizes are tried, finally the lattice that has the
     number undivided.
     """
-    best: tuple[int, tuple[int, ...], list[NDArray[np.bool_]]] | None = None
+    best: tuple[int, tuple[int, ...], list[Bools]] | None = None
     image, channels = content.image, channels_of(content)
     for roots, _ in _fitting_roots(content, nodes, limits):
         if (np.array(image.shape) / roots).max() < LEAF_VOXELS and best is not None:
@@ -678,7 +679,7 @@ def _root_counts(content: Content, nodes: int, limits: _BlockLimits) -> Iterator
 
 def _division(
     blocks: list[_Blocks], roots: tuple[int, ...], nodes: int, n_rings: int
-) -> tuple[int, list[NDArray[np.bool_]]]:
+) -> tuple[int, list[Bools]]:
     """The number of nodes nearest to `nodes`, and the divided blocks, whose error exceeds a
     threshold.
 
@@ -713,9 +714,7 @@ def _division(
     return len(leaf_nodes(best, roots).codes) if is_bound else best_count, best
 
 
-def _divide_blocks(
-    blocks: list[_Blocks], threshold: float, n_rings: int
-) -> list[NDArray[np.bool_]]:
+def _divide_blocks(blocks: list[_Blocks], threshold: float, n_rings: int) -> list[Bools]:
     """Masks of the blocks to divide at each depth, if those above the threshold or too large are
     divided.
 

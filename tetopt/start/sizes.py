@@ -14,6 +14,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides
 from tetopt.image import Image
 from tetopt.start.lattice import MAX_NODES, near_cubes
+from tetopt.system.arrays import Bools, Floats
 from tetopt.system.kernel_cache import njit
 
 # Default ratio of a graded mesh's longest edge to that of a uniform mesh with as many nodes
@@ -258,7 +259,7 @@ class Sizes(NamedTuple):
             np.clip(np.where(by_place > 0.0, by_place, NO_BOUND_MM), smallest, largest)
         )
 
-    def at(self, points: NDArray) -> NDArray[np.float64]:
+    def at(self, points: NDArray) -> Floats:
         """The target at points.
 
         Parameters
@@ -295,7 +296,7 @@ class Sizes(NamedTuple):
             )
         return np.maximum(target, self.smallest)
 
-    def around(self, points: NDArray, cells: NDArray) -> NDArray[np.float64]:
+    def around(self, points: NDArray, cells: NDArray) -> Floats:
         """The target at nodes; without one, the size that grows from other targets.
 
         Parameters
@@ -333,7 +334,7 @@ class Sizes(NamedTuple):
         own: NDArray,
         target: NDArray,
         volume: float | None = None,
-    ) -> NDArray[np.float64]:
+    ) -> Floats:
         """Longest edge allowed for a cell at each node.
 
         Parameters
@@ -370,9 +371,7 @@ class Sizes(NamedTuple):
         return np.minimum(bound, UNEVEN_RATIO * _around(own, points, cells, self.slope))
 
 
-def equilateral_nodes(
-    target: NDArray, image: Image, inside: NDArray[np.bool_] | None = None
-) -> float:
+def equilateral_nodes(target: NDArray, image: Image, inside: Bools | None = None) -> float:
     """Number of nodes of a mesh of equilateral cells whose edges are the targets at voxels, mm.
 
     `target` has the image's shape and counts up to `NO_BOUND_MM`; `inside` is the mask of the

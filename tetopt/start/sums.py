@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from tetopt.contents.content import Content, undivide_voxels
 from tetopt.contents.noise import NoiseSample, noise_planes, noise_sample, sampled_noise
 from tetopt.errors import InputError
+from tetopt.system.arrays import Bools, Floats, Ints
 from tetopt.system.kernel_cache import njit
 
 # processed at a time: half a megabyte per field, which fits into a processor's cache
@@ -32,7 +33,7 @@ class Channels(NamedTuple):
     noise: float  # variance
     step: float  # squared difference between the two sides of the mask's surface
 
-    def scaled(self, values: NDArray, channel: int, inside: NDArray | None) -> NDArray[np.float64]:
+    def scaled(self, values: NDArray, channel: int, inside: NDArray | None) -> Floats:
         """The channel's values minus their mean, scaled to at most 1; 0 outside the mask."""
         deviations = np.subtract(values, self.means[channel], dtype=np.float64, order="C")
         deviations /= self.scale
@@ -86,12 +87,12 @@ class BlockSums(NamedTuple):
     """Sums over equal blocks, each in the blocks' shape."""
 
     # voxels along each axis, for the blocks at each position on it
-    lengths: list[NDArray[np.float64]]
-    inside: NDArray[np.float64] | None  # voxels inside the mask; None without a mask
-    second: NDArray[np.float64]  # sums of all channels' squares
-    firsts: list[NDArray[np.float64]]  # sums of each channel
+    lengths: list[Floats]
+    inside: Floats | None  # voxels inside the mask; None without a mask
+    second: Floats  # sums of all channels' squares
+    firsts: list[Floats]  # sums of each channel
 
-    def voxels(self, layers: slice) -> NDArray[np.float64]:
+    def voxels(self, layers: slice) -> Floats:
         """Number of voxels of the blocks in these layers along the first axis."""
         product = self.lengths[0][layers]
         for length in self.lengths[1:]:
@@ -116,7 +117,7 @@ def halve_totals(totals: NDArray, total_of: np.ufunc) -> NDArray:
     return totals
 
 
-def block_starts(size: int, count: int) -> NDArray[np.int64]:
+def block_starts(size: int, count: int) -> Ints:
     """The first voxel of each of `count` equal blocks along an axis; a voxel belongs to the block
     of its centre.
 
@@ -126,7 +127,7 @@ def block_starts(size: int, count: int) -> NDArray[np.int64]:
     return np.ceil(np.arange(count) * (size / count) - 0.5).astype(np.int64)
 
 
-def block_sums(content: Content, channels: Channels, counts: NDArray[np.int64]) -> BlockSums:
+def block_sums(content: Content, channels: Channels, counts: Ints) -> BlockSums:
     """Sums over `counts` equal blocks along the axes, from one pass over the voxels."""
     shape = content.image.shape
     starts = [block_starts(size, count) for size, count in zip(shape, counts, strict=True)]
@@ -159,7 +160,7 @@ def block_sums(content: Content, channels: Channels, counts: NDArray[np.int64]) 
     return BlockSums(lengths, inside, totals[0], firsts)
 
 
-def _slabs_of(content: Content) -> Iterator[tuple[slice, NDArray, NDArray[np.bool_] | None]]:
+def _slabs_of(content: Content) -> Iterator[tuple[slice, NDArray, Bools | None]]:
     """Planes of a volume, with their voxels (C, P, R, K) and the mask of those inside (P, R, K); a
     2-D image is one plane.
     """
@@ -174,8 +175,8 @@ def _slabs_of(content: Content) -> Iterator[tuple[slice, NDArray, NDArray[np.boo
 
 
 def _fields(
-    values: NDArray, inside: NDArray[np.bool_] | None, channels: Channels, rows: slice
-) -> Iterator[NDArray[np.float64]]:
+    values: NDArray, inside: Bools | None, channels: Channels, rows: slice
+) -> Iterator[Floats]:
     """The fields to sum over rows of a slab: squares, each channel, and with a mask 1 inside it."""
     within = None if inside is None else inside[:, rows]
     scaled = [channels.scaled(each[:, rows], number, within) for number, each in enumerate(values)]

@@ -45,6 +45,7 @@ from tetopt.study.compare_report import Measurement, Report, Settings
 from tetopt.study.pipeline_process import Outcome, run_in_child
 from tetopt.study.pipelines import PIPELINES, UNTIMED_STEPS, Pipeline, PipelineInput
 from tetopt.study.program import pipelines_with
+from tetopt.system.arrays import Ints
 
 DEFAULT_REFERENCE_DOFS = 300_000  # 1.4 GB, and 2.5 minutes for both of `Settings.nus`
 
@@ -66,7 +67,7 @@ class MadeMesh(NamedTuple):
     """The mesh of a pipeline's median run."""
 
     mesh: Mesh
-    labels: NDArray[np.int64] | None  # (M,) its own, if it sets any
+    labels: Ints | None  # (M,) its own, if it sets any
 
 
 class Standard(NamedTuple):
@@ -130,7 +131,7 @@ def measure_mesh(
     mesh: Mesh,
     percent: float,
     order: int = 1,
-    own: NDArray[np.int64] | None = None,
+    own: Ints | None = None,
 ) -> Measurement:
     """Measure everything that is compared of a mesh with cells of this order, compressed by
     `percent` of its height.

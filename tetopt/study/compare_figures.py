@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from tetopt.energy.discretization import cell_E_D
 from tetopt.geometry.simplex import volumes
@@ -22,6 +21,7 @@ from tetopt.report.figures import SliceView, draw_edges, fill_cells
 from tetopt.report.scene import cutaway, save_scenes, view_of
 from tetopt.study.compare_report import PipelineResult, PipelineRun, Report
 from tetopt.study.pipelines import UNTIMED_STEPS
+from tetopt.system.arrays import Floats
 
 # Okabe and Ito's palette, safe for colour blindness, without its yellow, which is invisible on
 # white.
@@ -32,7 +32,7 @@ BAR_HATCHES = ("", "//", "..", "xx", "\\\\", "oo", "--")
 
 
 def slices_figure(
-    image: Image, meshes: Sequence[tuple[str, Mesh]], means: Sequence[NDArray[np.float64]]
+    image: Image, meshes: Sequence[tuple[str, Mesh]], means: Sequence[Floats]
 ) -> Figure:
     """The image's middle axial slice and, next to it, each mesh in that slice: its edges, its
     means, its E_D.
@@ -88,9 +88,7 @@ def slices_figure(
     return figure
 
 
-def cutaways(
-    meshes: Sequence[tuple[str, Mesh]], means: Sequence[NDArray[np.float64]], path: str | Path
-) -> None:
+def cutaways(meshes: Sequence[tuple[str, Mesh]], means: Sequence[Floats], path: str | Path) -> None:
     """Write a PNG of every mesh without its right, front, upper octant, with edges, cells in the
     grey of their means.
 

@@ -19,6 +19,7 @@ from scipy.ndimage import gaussian_filter
 from tetopt.contents.otsu import class_thresholds
 from tetopt.geometry.box import box_sides
 from tetopt.image import Image
+from tetopt.system.arrays import Floats, Ints
 
 # of the segmentation without labels: fewer lose interfaces (see `tetopt.study.tetwild`)
 OTSU_CLASSES = 4
@@ -39,11 +40,11 @@ class Surfaces(NamedTuple):
     own 12 triangles.
     """
 
-    points: NDArray[np.float64]  # (P, 3) mm
-    triangles: NDArray[np.int64]  # (T, 3), the box's last
+    points: Floats  # (P, 3) mm
+    triangles: Ints  # (T, 3), the box's last
     n_box: int  # number of the box's triangles
-    low: NDArray[np.float64]  # (3,) mm, the box's corner at index -0.5
-    high: NDArray[np.float64]  # (3,) mm, at index shape - 0.5
+    low: Floats  # (3,) mm, the box's corner at index -0.5
+    high: Floats  # (3,) mm, at index shape - 0.5
     notes: list[str]  # dropped parts
 
 
@@ -112,7 +113,7 @@ def class_labels(image: Image, classes: int) -> Image:
 
 def _classes(
     image: Image, classes: int, smoothing: float = 1.0
-) -> tuple[NDArray[np.floating], NDArray[np.float64]]:
+) -> tuple[NDArray[np.floating], Floats]:
     """Return the smoothed volume and the thresholds between its classes."""
     smooth = gaussian_filter(image.data, smoothing * SIGMA_VOXELS, mode="nearest")
     return smooth, class_thresholds(smooth.ravel(), classes)
@@ -141,7 +142,7 @@ def _isosurfaces(
 
 
 def _label_surface(
-    data: NDArray[np.floating], spacing: NDArray[np.float64], size: float, smoothing: float
+    data: NDArray[np.floating], spacing: Floats, size: float, smoothing: float
 ) -> tuple[list[pyvista.PolyData], list[str]]:
     values, numbered = np.unique(data, return_inverse=True)
     if len(values) == 1:
@@ -166,7 +167,7 @@ def _label_surface(
     return ([_smooth_surface(large, smoothing)] if large.n_cells else []), notes
 
 
-def _padded_grid(volume: NDArray, spacing: NDArray[np.float64], size: float) -> pyvista.ImageData:
+def _padded_grid(volume: NDArray, spacing: Floats, size: float) -> pyvista.ImageData:
     """Return the volume on its voxel centres, continued by its border values beyond the box's
     faces.
     """
@@ -210,9 +211,7 @@ def _decimate_surface(surface: pyvista.PolyData, size: float) -> pyvista.PolyDat
     return bare.decimate(reduction, volume_preservation=True) if reduction > 0.0 else bare
 
 
-def _cut_by_box(
-    surface: pyvista.PolyData, low: NDArray[np.float64], high: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _cut_by_box(surface: pyvista.PolyData, low: Floats, high: Floats) -> tuple[Floats, Ints]:
     """Return the part of a surface inside the box; its rim lies exactly on the box's faces."""
     surface = pyvista.PolyData.from_regular_faces(
         np.asarray(surface.points, dtype=np.float64), surface.regular_faces
@@ -233,9 +232,7 @@ def _cut_by_box(
     return points, triangles
 
 
-def _box(
-    low: NDArray[np.float64], high: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _box(low: Floats, high: Floats) -> tuple[Floats, Ints]:
     box = pyvista.Box(np.stack([low, high], axis=1).ravel(), quads=False)
     corners, triangles = np.unique(
         np.asarray(box.points, dtype=np.float64), axis=0, return_inverse=True
@@ -247,8 +244,8 @@ def _box(
 
 
 def _stack_parts(
-    parts: list[tuple[NDArray[np.float64], NDArray[np.int64]]],
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    parts: list[tuple[Floats, Ints]],
+) -> tuple[Floats, Ints]:
     offsets = np.cumsum([0] + [len(points) for points, _ in parts])
     points = np.vstack([points for points, _ in parts])
     return points, np.vstack(
@@ -256,7 +253,7 @@ def _stack_parts(
     )
 
 
-def compact_points(points: NDArray, cells: NDArray) -> tuple[NDArray, NDArray[np.int64]]:
+def compact_points(points: NDArray, cells: NDArray) -> tuple[NDArray, Ints]:
     """Remove the points that no cell (or triangle) uses; the others keep their order."""
     used, compact = np.unique(cells, return_inverse=True)
     return points[used], compact.reshape(cells.shape).astype(np.int64)

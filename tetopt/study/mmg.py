@@ -8,7 +8,6 @@ interfaces within a Hausdorff distance and coarsens the cells, which keep their 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides
@@ -21,6 +20,7 @@ from tetopt.start.lattice import lattice_mesh
 from tetopt.study.endings import import_peer
 from tetopt.study.search import Response, corners_for, is_near, tries
 from tetopt.study.tetwild import Filled, node_spacing
+from tetopt.system.arrays import Floats, Ints
 
 LATTICE_EDGE = 0.6  # edge of the lattice's cubes over that of regular cells
 # distance of the interfaces from the lattice's, over the edge of regular cells
@@ -33,7 +33,7 @@ MMG_RESPONSE = Response(-2.5, -4.0, -1.0, step=1.5, after_failure=0.83)
 
 def remesh_image(
     image: Image, labels: Image, nodes: int, order: int = 1, smoothing: float = 1.0
-) -> tuple[Filled, NDArray[np.int64]]:
+) -> tuple[Filled, Ints]:
     """Fill the image's box with about `nodes` nodes, and with cells that keep labels.
 
     One factor scales the lattice, the edges and the Hausdorff distance. It is searched, by secants,
@@ -64,7 +64,7 @@ def remesh_image(
     mmgpy = import_peer("mmgpy")
     spacing = node_spacing(image, corners_for(nodes, order))
 
-    def run(factor: float) -> tuple[Mesh, NDArray[np.int64]]:
+    def run(factor: float) -> tuple[Mesh, Ints]:
         edge = factor * spacing
         lattice = lattice_mesh(image, spacing=edge * LATTICE_EDGE)
         values, rows = np.unique(cell_labels(labels, lattice), return_inverse=True)
@@ -105,7 +105,7 @@ def remesh_image(
     ), best.result[1]
 
 
-def _on_box(image: Image, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _on_box(image: Image, points: Floats) -> Floats:
     """Put the nodes of the box's faces onto them, to the last bit."""
     index = image.to_index(points)
     for side in box_sides(image.shape).T:

@@ -19,15 +19,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from tetopt.errors import InputError
 from tetopt.io.text import last_line
 from tetopt.job.events import note
 from tetopt.mesh import Mesh
 from tetopt.study.endings import AFTER_CRASHES, Crashed
 from tetopt.study.pipelines import PipelineInput, Produced
+from tetopt.system.arrays import Ints
 from tetopt.system.budget import family_peak_bytes
 from tetopt.system.child import POLL_SECONDS, family_bytes, signal_words, start_child, watch_child
 from tetopt.system.interpreter import python_command, python_environment
@@ -44,7 +42,7 @@ class Outcome(NamedTuple):
     notes: list[str]
     failure: str | None  # one line; None without a failure
     is_crash: bool = False  # a failure that another run may not have
-    labels: NDArray[np.int64] | None = None  # of each cell, if the pipeline sets labels
+    labels: Ints | None = None  # of each cell, if the pipeline sets labels
 
 
 def run_in_child(

@@ -12,7 +12,6 @@ from importlib.util import find_spec
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.contents.content import Content, content
 from tetopt.engine.aim import Mode
@@ -28,6 +27,7 @@ from tetopt.study.isosurfaces import OTSU_CLASSES, interfaces
 from tetopt.study.mmg import remesh_image
 from tetopt.study.search import LEAST_REQUEST, REQUEST_RESPONSE, corners_for, tries
 from tetopt.study.tetwild import Filled, fill_image, node_spacing
+from tetopt.system.arrays import Ints
 from tetopt.system.extras import install_hint
 
 # of the search for a lattice of order 2, at most; few are so coarse, and a run takes milliseconds
@@ -55,7 +55,7 @@ class Produced(NamedTuple):
     seconds: dict[str, float]  # by step, in their order
     notes: list[str]
     # (M,) of each cell, from the job's; -1, or None: those of most voxels
-    labels: NDArray[np.int64] | None = None
+    labels: Ints | None = None
 
 
 UNTIMED_STEPS = {  # steps that a run's total leaves out, and why

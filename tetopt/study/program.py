@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides, is_on_sides
@@ -37,6 +36,7 @@ from tetopt.study.isosurfaces import class_labels
 from tetopt.study.pipelines import PIPELINES, Pipeline, PipelineInput, Produced
 from tetopt.study.search import LEAST_REQUEST, REQUEST_RESPONSE, corners_for, is_near, tries
 from tetopt.study.tetwild import node_spacing, put_on_box
+from tetopt.system.arrays import Ints
 from tetopt.system.child import signal_words
 from tetopt.system.interpreter import others_environment
 
@@ -192,9 +192,7 @@ def _fill_argument(word: str, values: dict[str, str]) -> str:
     return re.sub(r"\{(\w+)\}", lambda match: values[match[1]], word)
 
 
-def _own_labels(
-    loaded: MeshFile, kept: NDArray[np.int64], job: PipelineInput
-) -> tuple[NDArray[np.int64] | None, list[str]]:
+def _own_labels(loaded: MeshFile, kept: Ints, job: PipelineInput) -> tuple[Ints | None, list[str]]:
     """Return the labels of the kept cells from the field "label" of a program's file; -1 for labels
     not in the image.
 
@@ -236,7 +234,7 @@ def _run(name: str, command: list[str], output: Path) -> MeshFile:
     return loaded
 
 
-def put_on_sides(image: Image, mesh: Mesh) -> tuple[Mesh, NDArray[np.int64], list[str]]:
+def put_on_sides(image: Image, mesh: Mesh) -> tuple[Mesh, Ints, list[str]]:
     """Move a mesh's boundary onto the sides of the image's box if close; return the mesh, its
     cells, and notes.
 

@@ -36,6 +36,7 @@ from tetopt.start.lattice import lattice_mesh
 from tetopt.study.endings import import_peer
 from tetopt.study.isosurfaces import Surfaces, compact_points
 from tetopt.study.search import Response, corners_for, is_near, tries
+from tetopt.system.arrays import Bools, Floats, Ints
 
 TETWILD_RUNS = 6  # of one search, at most; each takes about as long as the result's
 # measured slopes are -3 to -9
@@ -103,7 +104,7 @@ def fill_image(image: Image, surfaces: Surfaces, nodes: int, order: int = 1) -> 
     tetrahedralize = import_peer("pytetwild").tetrahedralize
     spacing = node_spacing(image, corners_for(nodes, order))
 
-    def run(factor: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    def run(factor: float) -> tuple[Floats, Ints]:
         envelope = ENVELOPE_FRACTION * spacing * factor**ENVELOPE_EXPONENT
         return _run(tetrahedralize, surfaces, factor * spacing, envelope)
 
@@ -133,7 +134,7 @@ def _run(
     surfaces: Surfaces,
     edge: float,
     envelope: float,
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+) -> tuple[Floats, Ints]:
     """Run fTetWild once, in the box frame; return the cells inside the box and their nodes."""
     diagonal = float(np.linalg.norm(surfaces.high - surfaces.low))
     field = _sizing_field(surfaces, edge)
@@ -158,11 +159,11 @@ def _run(
 
 
 def inside_box(
-    points: NDArray[np.float64],
+    points: Floats,
     cells: NDArray[np.integer],
-    low: NDArray[np.float64],
-    high: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    low: Floats,
+    high: Floats,
+) -> tuple[Floats, Ints]:
     """Return the cells with their centroid in the box, and their nodes."""
     middles = points[cells].mean(axis=1)
     return compact_points(points, cells[((middles > low) & (middles < high)).all(axis=1)])
@@ -189,11 +190,11 @@ def _sizing_field(surfaces: Surfaces, edge: float) -> tuple[NDArray, NDArray, ND
 
 
 def put_on_box(
-    points: NDArray[np.float64],
-    cells: NDArray[np.int64],
-    low: NDArray[np.float64],
-    high: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+    points: Floats,
+    cells: Ints,
+    low: Floats,
+    high: Floats,
+) -> tuple[Floats, Ints, Ints]:
     """Move a mesh's boundary, which runs along the box's faces within the envelope, exactly onto
     them.
 
@@ -243,9 +244,7 @@ def put_on_box(
     return points, cells, kept
 
 
-def _box_faces_of_nodes(
-    points: NDArray[np.float64], cells: NDArray[np.int64], faces: NDArray[np.float64]
-) -> NDArray[np.bool_]:
+def _box_faces_of_nodes(points: Floats, cells: Ints, faces: Floats) -> Bools:
     """Mark the faces of the box that each node belongs on, (N, 2, 3) bool: the nearest to its
     boundary facets.
     """
@@ -257,9 +256,7 @@ def _box_faces_of_nodes(
     return is_on.reshape(-1, 2, 3)
 
 
-def _untangle(
-    points: NDArray[np.float64], cells: NDArray[np.int64], is_fixed: NDArray[np.bool_]
-) -> NDArray[np.float64]:
+def _untangle(points: Floats, cells: Ints, is_fixed: Bools) -> Floats:
     """Move nodes of inverted and nearly flat cells until all volumes are positive, for at most
     `UNTANGLING_ROUNDS`.
 
@@ -285,9 +282,7 @@ def _untangle(
     return points
 
 
-def _improve(
-    points: NDArray[np.float64], star: NDArray[np.int64], node: int, is_free: NDArray[np.bool_]
-) -> bool:
+def _improve(points: Floats, star: Ints, node: int, is_free: Bools) -> bool:
     """Move one node to the best of a few nearby places; return whether it moved."""
     corners = points[star]
     is_node = star == node
@@ -313,7 +308,7 @@ def _improve(
     return best is not start
 
 
-def _relative_volumes(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+def _relative_volumes(corners: Floats) -> Floats:
     """Return volume over the cube of the longest edge, (M,), for corners (M, 4, 3); negative if
     inverted.
     """

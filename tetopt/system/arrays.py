@@ -7,6 +7,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from tetopt.errors import InputError
 
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
 
 def plain_array(what: str, values: ArrayLike) -> NDArray:
     """Return values as an array; InputError for masked ones, whose hidden numbers numpy would
@@ -24,7 +28,7 @@ def plain_array(what: str, values: ArrayLike) -> NDArray:
 
 def simplex_arrays(
     what: str, points: ArrayLike, cells: ArrayLike, n_corners: int | None = None
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+) -> tuple[Floats, Ints]:
     """Return copies of points (N, n) and of the cells between them, (M, n+1) or (M, n_corners).
 
     Raises

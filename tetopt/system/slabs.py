@@ -14,6 +14,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from tetopt.system.arrays import Ints
 from tetopt.system.kernel_cache import njit
 
 SLABS_PER_THREAD = 16  # as some take longer than others, and temporaries are as large as a slab
@@ -50,8 +51,8 @@ def over_slabs(
 
 
 def sum_over_slabs(
-    count: Callable[[int, int], NDArray[np.int64]], n: int, n_elements: int, n_counts: int
-) -> NDArray[np.int64]:
+    count: Callable[[int, int], Ints], n: int, n_elements: int, n_counts: int
+) -> Ints:
     """Sum the `n_counts` whole numbers that a function counts in each of some slabs; arguments as
     for `over_slabs`.
 
