@@ -29,7 +29,7 @@ from tetopt.energy.discretization import combine_energies
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.geometry.quadratic import quadratic
 from tetopt.geometry.simplex import dihedral_angles, orient_cells, rho
-from tetopt.measure.quality import bad_kinds
+from tetopt.measure.quality import cell_kinds
 from tetopt.report.figures import CURVE_COLOURS, MESH_LINE, save_figure
 from tetopt.system.files import check_output, save_bytes
 
@@ -288,7 +288,7 @@ def shapes_figure() -> Figure:
     for number, (name, corners) in enumerate(cells.items()):
         points = np.array(corners)
         mesh = tetopt.Mesh(points, orient_cells(points, np.array([[0, 1, 2, 3]])))
-        kind = bad_kinds(mesh.points, mesh.cells, rho(mesh.points, mesh.cells))[0]
+        kind = cell_kinds(mesh.points, mesh.cells, rho(mesh.points, mesh.cells))[0]
         assert kind == name, f"the drawn {name} is none"
         angles = dihedral_angles(mesh.points, mesh.cells)
         title = (

@@ -98,27 +98,27 @@ def test_histogram_is_fractions_over_0_to_1_over_n():
 # Kinds
 
 
-def bad_kinds(points, cells):
-    return measure.bad_kinds(points, cells, rho(points, cells))
+def cell_kinds(points, cells):
+    return measure.cell_kinds(points, cells, rho(points, cells))
 
 
 @pytest.mark.parametrize("kind", BAD_TETS)
 @pytest.mark.parametrize("t", [0.1, 0.03, 1e-3, 1e-6])
 def test_kind_of_each_archetype(kind, t):
-    assert bad_kinds(*single(BAD_TETS[kind](t))).tolist() == [kind]
+    assert cell_kinds(*single(BAD_TETS[kind](t))).tolist() == [kind]
 
 
 @pytest.mark.parametrize(
     "mesh", [*SINGLE[2], *SINGLE[3][:2], TWO_TETS, FIVE_TET_CUBE, TWO_TRIANGLES]
 )
 def test_good_cells_are_good(mesh):
-    assert set(bad_kinds(*mesh)) == {"good"}
+    assert set(cell_kinds(*mesh)) == {"good"}
 
 
 def test_kinds_of_triangles():
     points = np.array([[0.0, 0], [1, 0], [0.5, 0.05], [1, 0.1], [0.5, 0.5]])
     cells = np.array([[0, 1, 2], [0, 1, 3], [0, 1, 4]])
-    assert bad_kinds(points, cells).tolist() == ["cap", "needle", "good"]
+    assert cell_kinds(points, cells).tolist() == ["cap", "needle", "good"]
 
 
 @given(seeds, st.sampled_from(sorted(BAD_TETS)))
@@ -127,19 +127,19 @@ def test_kind_does_not_change_with_rotation_scale_reflection_or_order(seed, kind
     shape = BAD_TETS[kind](np.exp(rng.uniform(np.log(1e-4), np.log(0.1))))
     shape = shape + rng.normal(scale=1e-6, size=(4, 3))
     points, cells = single(shape)
-    assert bad_kinds(points, cells).tolist() == [kind]
+    assert cell_kinds(points, cells).tolist() == [kind]
     moved = np.exp(rng.uniform(-5, 5)) * (
         rng.choice([-1, 1]) * points @ random_rotation(rng, 3).T
     ) + rng.normal(size=3)
-    assert bad_kinds(moved, rng.permuted(cells, axis=1)).tolist() == [kind]
+    assert cell_kinds(moved, rng.permuted(cells, axis=1)).tolist() == [kind]
 
 
 def test_flat_cells_have_a_kind():
     flat = np.array([[0, 1, 2, 3]])
     assert {
-        kind: bad_kinds(BAD_TETS[kind](0.0), flat)[0] for kind in ("sliver", "cap", "spade")
+        kind: cell_kinds(BAD_TETS[kind](0.0), flat)[0] for kind in ("sliver", "cap", "spade")
     } == {kind: kind for kind in ("sliver", "cap", "spade")}
-    assert bad_kinds(np.array([[0.0, 0, 0], [1, 1, 1], [2, 2, 2], [3, 3, 3]]), flat)[0] == "needle"
+    assert cell_kinds(np.array([[0.0, 0, 0], [1, 1, 1], [2, 2, 2], [3, 3, 3]]), flat)[0] == "needle"
 
 
 # Angles of the archetypes in closed form
@@ -190,7 +190,7 @@ def test_kinds_are_named_by_dimension(mesh):
         else {"needle", "wedge", "cap", "spade", "sliver"}
     )
     assert set(measured.kinds) == names
-    assert sum(measured.kinds.values()) == (bad_kinds(*mesh) != "good").sum()
+    assert sum(measured.kinds.values()) == (cell_kinds(*mesh) != "good").sum()
 
 
 def test_quality_by_blocks_of_cells_is_that_of_all(monkeypatch):

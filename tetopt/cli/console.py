@@ -111,7 +111,8 @@ class _Console(Console):
     def file(self) -> IO[str]:
         """The stream, whose failures end nothing."""
         stream: Any = super().file
-        return stream if isinstance(stream, _Stream) else _Stream(stream)  # type: ignore[return-value]
+        is_ours = isinstance(stream, _Stream)
+        return stream if is_ours else _Stream(stream)  # type: ignore[return-value]
 
     @file.setter
     def file(self, new_file: IO[str]) -> None:
@@ -141,7 +142,8 @@ def open_streams() -> None:
             os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115, as long as the process
+            # as long as the process
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
 
 
 def settle_streams() -> str | None:

@@ -53,7 +53,8 @@ class Judgement(NamedTuple):
     source: Source | None = None  # the image, mask and labels it was measured on
     fit: ImageFit | None = None
     violated: Mapping[str, str] = MappingProxyType({})  # requirements of the run
-    measured: dict[str, Any] = {}  # noqa: RUF012 - fit to mask, labels and contrasts; never modified
+    # fit to mask, labels and contrasts; never modified
+    measured: dict[str, Any] = {}  # noqa: RUF012
     is_compared: bool = True  # with the mask; the mesh's file does not contain the fractions of one
 
     @property

@@ -73,7 +73,7 @@ from tetopt.system.budget import at_most, check_memory
 # an optimisation ready to start; takes further options of `optimize`
 Optimisation = Callable[..., MeshingResult]
 # makes a run with an optimisation, its initial mesh, the aim and the runs before
-Attempt = Callable[[Optimisation, Mesh, Aim, list[SearchRun]], MeshingResult]
+Conduct = Callable[[Optimisation, Mesh, Aim, list[SearchRun]], MeshingResult]
 
 
 class ModeDefaults(NamedTuple):
@@ -237,7 +237,7 @@ def mesh_image(
 def search_mesh(
     image: Image | Content,
     aim: Aim,
-    attempt: Attempt = lambda optimisation, *_: optimisation(),
+    attempt: Conduct = lambda optimisation, *_: optimisation(),
     required: Requirements = Requirements(),  # noqa: B008 - a tuple
     **options: Any,
 ) -> MeshingResult:

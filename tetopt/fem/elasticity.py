@@ -719,7 +719,8 @@ def multigrid(system: System) -> LinearOperator:
     with aggregation of all nodes of order 2; with 1 : 10^4 38 and 14 s instead of 292 and 144 s; at
     nu 0.45 41 and 14 s instead of 45 and 25 s, and 66 and 21 s instead of 83 and 44 s.
     """
-    from pyamg import smoothed_aggregation_solver  # type: ignore[import-untyped]  # half a second: only when needed
+    # half a second: only when needed
+    from pyamg import smoothed_aggregation_solver  # type: ignore[import-untyped]
     from pyamg.multilevel import MultilevelSolver  # type: ignore[import-untyped]
     from pyamg.relaxation.smoothing import change_smoothers  # type: ignore[import-untyped]
 

@@ -50,7 +50,7 @@ def element_stiffness(jacobian: Floats, nu: float) -> Floats:
 
 
 def shape_gradients(at: Floats, corners: Ints) -> Floats:
-    """Gradients of the n-linear hat functions at a point of the unit cube, (2^n, n), per unit of
+    """Slopes of the n-linear hat functions at a point of the unit cube, (2^n, n), per unit of
     index.
     """
     factors = np.where(corners == 1, at, 1.0 - at)

@@ -270,7 +270,8 @@ def _task(model: Model, loads: tuple[Load, ...]) -> _Task:
             task.outside.forces[nodes] += forces
         elif load.kind == "gravity":
             table = model.materials
-            density = density_of(table)[table.of_cell]  # type: ignore[union-attr]  # or it was rejected
+            # or it was rejected
+            density = density_of(table)[table.of_cell]  # type: ignore[union-attr]
             task.outside.forces[:] += weight_forces(model.mesh, density, load.numbers, model.order)
         else:
             raise InputError(

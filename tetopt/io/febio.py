@@ -123,7 +123,8 @@ def febio(model: Model) -> bytes:
     parts = _parts(model)
     sections = [
         _head(model),
-        "<Globals>\n<Constants>\n<T>0</T>\n<P>0</P>\n<R>0</R>\n<Fc>0</Fc>\n</Constants>\n</Globals>\n",
+        "<Globals>\n<Constants>\n<T>0</T>\n<P>0</P>\n<R>0</R>\n"
+        "<Fc>0</Fc>\n</Constants>\n</Globals>\n",
         CONTROL_SECTION if model.loads else "",
         _materials(parts),
         *_mesh(model, parts),

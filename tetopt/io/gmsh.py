@@ -85,7 +85,8 @@ class OwnComments(NamedTuple):
     cells: dict[str, list[int]]  # entities of each of these materials and of each cell set
     facets: dict[str, list[int]]  # entities of each facet set
     zero: int | None = None  # the group of label 0, if groups are labels
-    labels: dict[int, int] = {}  # noqa: RUF012 - by group, if labels are too large for groups; never modified
+    # by group, if labels are too large for groups; never modified
+    labels: dict[int, int] = {}  # noqa: RUF012
 
 
 def own_comments(lines: list[str]) -> OwnComments | None:

@@ -82,7 +82,8 @@ def arrays_of(path: str) -> tuple[str, str, dict[str, Any]]:
             "Fields",
         ):
             getattr(reader, f"ReadAll{kind}On")()
-    reader.SetFileName(os.fsencode(path))  # type: ignore[arg-type]  # bytes, for names that are not UTF-8
+    # bytes, for names that are not UTF-8
+    reader.SetFileName(os.fsencode(path))  # type: ignore[arg-type]
     reader.Update()
     grid = reader.GetOutput()
     errors = _first_error(window.GetOutput())

@@ -213,7 +213,8 @@ def _from_vtk(path: Path) -> Any:
     from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
 
     reader = (vtkXMLPolyDataReader if path.suffix.lower() == ".vtp" else vtkPolyDataReader)()
-    reader.SetFileName(os.fsencode(path))  # type: ignore[arg-type]  # bytes, for names that are not UTF-8
+    # bytes, for names that are not UTF-8
+    reader.SetFileName(os.fsencode(path))  # type: ignore[arg-type]
     reader.Update()
     grid = pyvista.wrap(reader.GetOutput())
     return trimesh.Trimesh(np.asarray(grid.points, dtype=np.float64), grid.regular_faces)

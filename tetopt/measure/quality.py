@@ -76,7 +76,7 @@ def rho_histogram(points: Points, cells: Cells, bins: int = 40) -> tuple[Floats,
     return counts / len(cells), edges
 
 
-def bad_kinds(points: Points, cells: Cells, shape: Floats) -> NDArray[np.str_]:
+def cell_kinds(points: Points, cells: Cells, shape: Floats) -> NDArray[np.str_]:
     """The kind of each cell of these `rho`, (M,) str: "good" if n rho >= 0.3, else the kind of bad
     shape.
 
@@ -215,7 +215,7 @@ def quality(points: Points, cells: Cells, midpoints: Points | None = None) -> Qu
 
     For rho and the four errors see Section 2.1 of the paper
     (`tetopt.measure.quality.quality_errors`), for the kinds of bad cells
-    `tetopt.measure.quality.bad_kinds`, for angles `tetopt.geometry.simplex.dihedral_angles`.
+    `tetopt.measure.quality.cell_kinds`, for angles `tetopt.geometry.simplex.dihedral_angles`.
 
     Parameters
     ----------
@@ -265,7 +265,7 @@ def quality(points: Points, cells: Cells, midpoints: Points | None = None) -> Qu
         else curved_volumes(*quadratic(points, np.asarray(cells, dtype=np.int64), midpoints))
     )
     names = ("needle", "wedge", "cap", "spade", "sliver") if n == 3 else ("needle", "cap")
-    kinds = bad_kinds(points, cells, shape)
+    kinds = cell_kinds(points, cells, shape)
     return Quality(
         ndim=n,
         n_nodes=len(points),

@@ -53,7 +53,8 @@ class LabelSource(NamedTuple):
 
     name: str
     sha256: str
-    names: dict[int, str] = {}  # noqa: RUF012 - never modified; of the labels in the image that have one
+    # never modified; of the labels in the image that have one
+    names: dict[int, str] = {}  # noqa: RUF012
 
     def words(self, label: int) -> str:
         """Return a label with its name, if it has one."""
