@@ -103,6 +103,21 @@ def test_shape_without_voxels(tmp_path, name, monkeypatch):
             images.file_shape(path)
 
 
+@pytest.mark.parametrize(
+    "axes",
+    [
+        "kinds: list domain domain domain\nspace directions: none (1,0,0) (0,1,0) (0,0,1)",
+        "kinds: vector space space space",
+        "space directions: none (1,0,0) (0,1,0) (0,0,1)",
+    ],
+)
+def test_axes_of_space_come_first_in_the_shape(tmp_path, axes):
+    """Segments in layers and components stand first in an NRRD, and last in an image."""
+    head = f"NRRD0004\ntype: uchar\ndimension: 4\nsizes: 2 5 4 3\nencoding: raw\n{axes}\n\n"
+    (tmp_path / "a.nrrd").write_bytes(head.encode() + bytes(120))
+    assert file_shape(tmp_path / "a.nrrd") == (5, 4, 3, 2)
+
+
 PAIRS = {  # names of the two files as nibabel writes them, and renamed
     "plain": ("a.hdr", "a.img", "a.hdr", "a.img"),
     "packed": ("a.hdr.gz", "a.img.gz", "a.hdr.gz", "a.img.gz"),

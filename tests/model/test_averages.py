@@ -265,7 +265,7 @@ def test_a_model_has_moduli_at_gauss_points():
     image = noise((8, 9, 10))
     mesh = lattice_mesh(image, blocks=(2, 2, 2))
     mapping = [(0.0, 1.0), (200.0, 10.0)]
-    model = build_model(mesh, image, young=mapping, average="gauss", order=2, loads=["compress:1%"])
+    model = build_model(mesh, image, young=mapping, average="gauss", order=2, loads="compress:1%")
     assert_array_equal(gauss_moduli(model), element_young(image, mesh, mapping, "gauss", 2))
     assert_array_equal(gauss_moduli(in_units(model, "MPa")), gauss_moduli(model) * 1e-3)
     of_cells = model.materials.young[model.materials.of_cell]

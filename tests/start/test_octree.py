@@ -166,7 +166,7 @@ def test_noise_level(shape, sigma):
 def test_impossible_numbers_of_nodes(shape, nodes, words):
     with pytest.raises(tetopt.InputError, match=words):
         octree_mesh(ball(*shape), nodes)
-    with pytest.raises(TypeError):
+    with pytest.raises(TypeError, match="nodes: expected a whole number, got"):
         octree_mesh(ball(*shape), nodes + 0.5)
 
 

@@ -15,7 +15,6 @@ from collections.abc import Callable
 from difflib import get_close_matches
 from functools import partial
 from math import ceil, prod
-from operator import index
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -68,6 +67,7 @@ from tetopt.start.label_sizes import SizesByLabel, sizes_by_label
 from tetopt.start.memory import LABEL_BYTES, PROCESS_BYTES, READ_BYTES, REGION_BYTES, bytes_of
 from tetopt.start.octree import is_near, nearest_octree, nodes_of_sizes, octree_mesh
 from tetopt.start.sizes import Sizes
+from tetopt.system.arrays import whole_number
 from tetopt.system.budget import at_most, check_memory
 
 # an optimisation ready to start; takes further options of `optimize`
@@ -220,7 +220,7 @@ def mesh_image(
     >>> result.history[-1].E < 1
     True
     """
-    nodes = None if nodes is None else index(nodes)
+    nodes = None if nodes is None else whole_number("nodes", nodes)
     if labels is not None or mask is not None:
         if isinstance(image, Content):
             raise InputError(

@@ -80,6 +80,9 @@ METAIMAGE_NAMES = Names(
 )
 
 
+SPACE_KINDS = ("domain", "space", "???", "none")  # of NRRD's axes; others are components or time
+
+
 class VoxelHeader(NamedTuple):
     """The contents of a header."""
 
@@ -164,10 +167,19 @@ def _data_files(path: Path, header: VoxelHeader) -> list[Path]:
 
 
 def header_sizes(path: Path) -> tuple[int, ...]:
-    """Return the lengths of the axes in the header; InputError for the reasons of
-    `check_header` in the header.
+    """Return the lengths of the axes in the header, those of space first, as images have them;
+    InputError for the reasons of `check_header` in the header.
     """
-    return tuple(read_header(path).sizes)
+    header = read_header(path)
+    fields, n_axes = header.fields, len(header.sizes)
+    kinds = fields.get("kinds", "").lower().split()
+    directions = re.findall(r"none|\(", fields.get("spacedirections", "").lower())
+    is_other = [
+        (len(kinds) == n_axes and kinds[k] not in SPACE_KINDS)
+        or (len(directions) == n_axes and directions[k] == "none")
+        for k in range(n_axes)
+    ]
+    return tuple(header.sizes[k] for k in sorted(range(n_axes), key=is_other.__getitem__))
 
 
 def read_header(path: Path) -> VoxelHeader:

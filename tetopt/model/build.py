@@ -179,7 +179,7 @@ def build_model(
     >>> tetopt.build_model(mesh, young="1=10,*=2", cell_data=data).materials.young.tolist()
     [2.0, 10.0]
     """
-    choices = Choices(young, nu, density, average, tuple(sets), tuple(loads), bins, spacing)
+    choices = Choices(young, nu, density, average, _texts(sets), _texts(loads), bins, spacing)
     if isinstance(mesh, MeshingResult):
         mesh, image, order, cell_data = _of_result(mesh, image, order, cell_data)
     image, whole, about = _voxels(image, mesh, about or {})
@@ -210,6 +210,10 @@ def build_model(
     return model_of_file(
         loaded._replace(cell_data=cell_data), image, choices, about, box, known_sets
     )
+
+
+def _texts(words: str | Iterable[str]) -> tuple[str, ...]:
+    return (words,) if isinstance(words, str) else tuple(words)
 
 
 class Choices(NamedTuple):

@@ -16,7 +16,6 @@ near to cubes (squares) as the box allows:
 from __future__ import annotations
 
 from itertools import product
-from operator import index
 from typing import Literal
 
 import numpy as np
@@ -25,7 +24,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.simplex import orient_cells
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.system.arrays import Floats, Ints
+from tetopt.system.arrays import Floats, Ints, whole_number
 from tetopt.system.budget import at_most, check_memory
 
 Kind = Literal["bcc", "five-tet", "criss-cross"]
@@ -93,7 +92,7 @@ def lattice_mesh(
         raise InputError("lattice: give exactly one of nodes, spacing and blocks")
     lengths = image.spacing * image.shape
     if nodes is not None:
-        blocks = near_cubes(kind, lengths, index(nodes))
+        blocks = near_cubes(kind, lengths, whole_number("nodes", nodes))
     elif spacing is not None:
         blocks = _blocks_for_spacing(lengths, spacing)
     blocks = _check_blocks(kind, blocks, n)
@@ -106,7 +105,7 @@ def lattice_mesh(
 
 def _check_blocks(kind: str, counts: tuple[int, ...] | None, n: int) -> tuple[int, ...]:
     try:
-        blocks = tuple(index(b) for b in (() if counts is None else counts))
+        blocks = tuple(whole_number("blocks", b) for b in (() if counts is None else counts))
     except TypeError:
         blocks = ()
     if len(blocks) != n or min(blocks) < 1:

@@ -21,7 +21,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from math import prod
-from operator import index
 from typing import NamedTuple
 
 import numpy as np
@@ -53,7 +52,7 @@ from tetopt.start.sums import (
     channels_of,
     halve_totals,
 )
-from tetopt.system.arrays import Bools, Floats, Ints
+from tetopt.system.arrays import Bools, Floats, Ints, whole_number
 from tetopt.system.budget import MemoryShortage, at_most, check_memory
 
 # Ratios of the undivided blocks' nodes to the requested number, tried in turn, the largest blocks
@@ -148,7 +147,7 @@ def octree_mesh(image: Image | Content, nodes: int, sizes: Sizes | None = None) 
     >>> numbers.n_nodes, round(numbers.max_edge / numbers.min_edge, 1)
     (303, 3.3)
     """
-    content, nodes = plain(image), index(nodes)
+    content, nodes = plain(image), whole_number("nodes", nodes)
     limits = _block_limits(content, nodes, sizes)
     _check_enough(content, nodes, sizes, limits)
     mesh = _octree_within(content, nodes, limits)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from operator import index
+from typing import SupportsIndex
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -24,6 +27,14 @@ def plain_array(what: str, values: ArrayLike) -> NDArray:
             "array.filled(0)"
         )
     return np.asarray(values)
+
+
+def whole_number(what: str, value: SupportsIndex) -> int:
+    """Return a value as int; TypeError if it is none."""
+    try:
+        return index(value)
+    except TypeError as error:
+        raise TypeError(f"{what}: expected a whole number, got {value!r}") from error
 
 
 def simplex_arrays(
