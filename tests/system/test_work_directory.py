@@ -54,9 +54,9 @@ def test_what_is_none_is_one_line_and_stays(tmp_path, kind):
 def test_a_lock_says_whose_it_is_and_ends_with_its_process(work):
     code = (
         "import sys, time; from pathlib import Path; from tetopt.system.work_directory "
-        "import locked\n"
+        "import lock_directory\n"
     )
-    code += "with locked(Path(sys.argv[1])): print(); sys.stdout.flush(); time.sleep(600)"
+    code += "with lock_directory(Path(sys.argv[1])): print(); sys.stdout.flush(); time.sleep(600)"
     with subprocess.Popen([sys.executable, "-c", code, work], stdout=subprocess.PIPE) as other:
         other.stdout.readline()
         words = rf"^{work}: another run is writing there \(process {other.pid} on .*\); wait until"
