@@ -194,8 +194,8 @@ import numpy as np
 import some_kernels as k
 from tetopt.system import kernels
 os.cpu_count = lambda: 2
-started, start = [], kernels.started
-kernels.started = lambda *words: started.append(1) or start(*words)
+started, start = [], kernels.start_child
+kernels.start_child = lambda *words: started.append(1) or start(*words)
 kernels.link([k.step_7])
 kernels.link([k.step_7])  # compiles nothing again
 cached = [f.was_cached for f in (k.step_0, k.step_3, k.step_7)]

@@ -49,7 +49,7 @@ print(f"openCARP: {len(points)} nodes over {extent_mm} mm, {counts.tolist()} cel
 
 # %%
 # SOFA takes a scene of objects.
-#  A model has points in mm, cells, facet sets as rows (cell, node opposite), materials and loads.
+# A model has points in mm, cells, facet sets as rows (cell, node opposite), materials and loads.
 # `repr` writes a number without losing a digit. Each load becomes one SOFA object; anything that a
 # scene cannot represent is rejected.
 
