@@ -27,7 +27,7 @@ from tetopt.mesh import Mesh
 from tetopt.model.mappings import ModulusMapping, mapped_values, young_from
 from tetopt.system.arrays import Bools, Floats, Ints
 
-DEFAULT_AVERAGE = "gauss"  # of moduli (docs/understand/moduli.md); `tetopt paper` keeps Eq. (2)
+DEFAULT_AVERAGE = "gauss"  # of moduli (docs/understand/moduli.md); the paper's figures keep Eq. (2)
 POWER_WORDS = {"mean": 1.0, "geometric": 0.0, "harmonic": -1.0}
 # in absolute value; beyond it a power mean is almost the largest or the smallest value
 LARGEST_POWER = 10.0
