@@ -54,6 +54,18 @@ def wide_lines(monkeypatch):
     monkeypatch.setattr("tetopt.cli.console.LINE_WIDTH", 1000)
 
 
+@pytest.fixture(params=[2, 3])
+def n(request):
+    """The number of dimensions, one after the other."""
+    return request.param
+
+
+@pytest.fixture(params=[1, 2])
+def order(request):
+    """The order of cells, one after the other."""
+    return request.param
+
+
 @pytest.fixture
 def here(tmp_path):
     """The folder that a test works in, so that its files have names as users type them."""

@@ -5,12 +5,13 @@ labels, an oblique box.
 from functools import cache
 
 import numpy as np
+from meshes import with_bent_edges
 from scipy.sparse import diags_array
 from scipy.sparse.linalg import spsolve
 from shapes import grid
 
 import tetopt
-from tetopt.fem.elasticity import compression, lame_constants, stiffness, strains
+from tetopt.fem.elasticity import lame_constants, stiffness, strains
 from tetopt.geometry.quadratic import cell_edges, quadratic
 from tetopt.geometry.simplex import volumes
 from tetopt.model.label_names import TABLE_TEXT, LabelTable, table_words
@@ -21,7 +22,6 @@ from tetopt.model.sets import (
     Sets,
     box_of,
     enclosing_facets,
-    nodes_of,
     standard_sets,
     with_requested,
 )
@@ -114,6 +114,12 @@ def quadratic_model(n=3, bins=3):
     return model._replace(order=2, point_data=fields)
 
 
+def curved_model(n=3):
+    """`quadratic_model` with curved edges."""
+    model = quadratic_model(n)
+    return model._replace(mesh=with_bent_edges(model.mesh, 0.05))
+
+
 def all_nodes(values, mesh):
     """A field of the corners with the mean of an edge's ends at its middle, as the docstrings
     say it.
@@ -154,6 +160,8 @@ SAMPLES = {
     "LPS, MPa": lambda: in_units(in_space(sample_model(), "lps"), "MPa"),
     "quadratic": lambda: with_two_sides(quadratic_model()),
     "quadratic, 2-D": lambda: with_two_sides(quadratic_model(2)),
+    "curved": lambda: curved_model(),
+    "curved, 2-D": lambda: curved_model(2),
     "label sets only": lambda: sample_model()._replace(
         sets=standard_sets(sample_model().mesh, labels=sample_model().cell_data["label"]), loads=()
     ),
@@ -161,15 +169,6 @@ SAMPLES = {
         cell_data={}, sets=Sets({}, {}), materials=None, loads=(), about={}
     ),
 }
-
-
-def our_compression(model, nu):
-    """What `tetopt.fem` makes of the model's two loads, the first of which holds."""
-    fixed, pushed = (nodes_of(model.mesh, model.sets.facets[load.set_name]) for load in model.loads)
-    push = model.loads[1].numbers
-    return compression(
-        model.mesh, young_of(model), nu, fixed_nodes=fixed, pushed_nodes=pushed, displacement=push
-    )
 
 
 def cell_energies(mesh, young, nu, u):

@@ -4,9 +4,10 @@ scale.
 
 import numpy as np
 import pytest
+from refusals import refusal
 from scipy.sparse import diags_array
 
-from tetopt import Image, InputError, lattice_mesh
+from tetopt import Image, lattice_mesh
 from tetopt.fem.conditioning import cg_iterations, conditioning, lambda_max, lambda_min
 from tetopt.fem.elasticity import box_faces, compression
 
@@ -119,9 +120,9 @@ def test_what_has_no_condition():
     low, high = box_faces(image, mesh)
     held = {"fixed_nodes": high, "pushed_nodes": low, "displacement": [0.0, 0.0, 0.1]}
     pressed = compression(mesh, 1.0, 0.3, **held)
-    with pytest.raises(InputError, match="conditioning: every node is fixed or pushed"):
+    with refusal("conditioning: every node is fixed or pushed"):
         conditioning(pressed.system)
-    with pytest.raises(InputError, match="method: expected auto"):
+    with refusal("method: expected auto"):
         conditioning(system(2, (2, 2)), method="lu")
 
 

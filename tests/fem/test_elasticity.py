@@ -2,7 +2,8 @@
 solved.
 """
 
-import warnings
+import re
+from contextlib import nullcontext
 from itertools import combinations
 
 import numpy as np
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from meshes import random_affine, random_rotation, split_box
 from models import cell_energies
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import refusal
 
 from tetopt import Image, InputError, Mesh, lattice_mesh
 from tetopt.fem import elasticity
@@ -32,7 +34,6 @@ from tetopt.model.sets import boundary_rows
 
 seeds = st.integers(0, 2**32 - 1)
 dimensions = st.sampled_from([2, 3])
-BOTH = [(n, order) for n in (2, 3) for order in (1, 2)]
 
 
 def block(sides, blocks, kind=None):
@@ -100,7 +101,6 @@ def test_stiffness_is_symmetric_and_rigid_motions_are_its_null_space(seed, n, nu
 # Patch test
 
 
-@pytest.mark.parametrize(("n", "order"), BOTH)
 def test_patch(n, order):
     """A linear displacement of the boundary is that of every inner node; all cells have its
     strain, no node a force.
@@ -136,19 +136,13 @@ def test_uniform_block_between_smooth_plates(sides, nu, method):
     """
     n = len(sides)
     image, mesh = block(sides, (3,) * n)
-    pressed = squeezed(
-        distorted(mesh, np.random.default_rng(0)), image, 4.0, nu, is_bonded=False, method=method
-    )
+    mesh = distorted(mesh, np.random.default_rng(0))
+    pressed = squeezed(mesh, image, 4.0, nu, is_bonded=False, method=method)
     assert pressed.strain_energy == pytest.approx(0.5 * 4.0 * 0.01**2 * np.prod(sides), rel=1e-9)
-    expected = np.zeros(n)
-    expected[-1] = 4.0 * 0.01 * np.prod(sides[:-1])
-    assert_allclose(pressed.reaction, expected, atol=1e-8 * expected[-1])
+    force = 4.0 * 0.01 * np.prod(sides[:-1])
+    assert_allclose(pressed.reaction, force * np.eye(n)[-1], atol=1e-8 * force)
     along = np.diag([nu * 0.01] * (n - 1) + [-0.01])
-    assert_allclose(
-        strains(distorted(mesh, np.random.default_rng(0)), pressed.u),
-        np.broadcast_to(along, (len(mesh.cells), n, n)),
-        atol=1e-10,
-    )
+    assert_allclose(strains(mesh, pressed.u), np.tile(along, (len(mesh.cells), 1, 1)), atol=1e-10)
 
 
 # Laws of the compression
@@ -199,18 +193,14 @@ def test_rotated(seed, n, is_bonded):
     image, mesh = block(tuple(rng.uniform(1.0, 5.0, n)), (2,) * n)
     young = rng.uniform(1.0, 9.0, len(mesh.cells))
     low, high = box_faces(image, mesh)
-    turn = random_rotation(rng, n)
-    push = rng.normal(size=n)
-    options = {"fixed_nodes": high, "pushed_nodes": low, "is_bonded": is_bonded}
-    plain = compression(mesh, young, 0.3, displacement=push, **options)
-    turned = Mesh(mesh.points @ turn.T + 3.0, mesh.cells)
-    other = compression(turned, young, 0.3, displacement=turn @ push, **options)
-    assert_allclose(other.u @ turn, plain.u, atol=1e-9 * np.abs(plain.u).max())
-    assert other.strain_energy == pytest.approx(plain.strain_energy, rel=1e-10)
-    assert_allclose(other.reaction @ turn, plain.reaction, atol=1e-9 * np.abs(plain.reaction).max())
-
-
-# Refinement
+    push, pressed = rng.normal(size=n), []
+    for turn, shift in ((np.eye(n), 0.0), (random_rotation(rng, n), 3.0)):
+        turned = Mesh(mesh.points @ turn.T + shift, mesh.cells)
+        options = {"fixed_nodes": high, "pushed_nodes": low, "displacement": turn @ push}
+        found = compression(turned, young, 0.3, is_bonded=is_bonded, **options)
+        pressed.append((found.u @ turn, found.reaction @ turn, found.strain_energy))
+    for one, other in zip(*pressed, strict=True):
+        assert_allclose(other, one, rtol=1e-10, atol=1e-9 * np.abs(one).max())
 
 
 # Solvers
@@ -250,29 +240,24 @@ def test_a_multigrid_cycle_is_symmetric_and_positive(is_bonded, order):
 
 def test_auto_takes_multigrid_for_large_meshes(monkeypatch):
     image, mesh = block((2.0, 1.0, 3.0), (3, 3, 3))
-    direct = squeezed(mesh, image, 2.0, 0.4)
-    called = []
+    direct, called = squeezed(mesh, image, 2.0, 0.4), []
     monkeypatch.setattr(
         elasticity, "multigrid", lambda system: called.append(1) or multigrid(system)
     )
-    monkeypatch.setattr(elasticity, "DIRECT_DOFS", {2: 0, 3: len(direct.system.free)})
-    squeezed(mesh, image, 2.0, 0.4)
-    assert called == []
-    monkeypatch.setattr(elasticity, "DIRECT_DOFS", {2: 0, 3: len(direct.system.free) - 1})
-    assert_allclose(squeezed(mesh, image, 2.0, 0.4).u, direct.u, atol=1e-10)
-    assert called == [1]
+    for spare in (0, 1):
+        dofs = {2: 0, 3: len(direct.system.free) - spare}
+        monkeypatch.setattr(elasticity, "DIRECT_DOFS", dofs)
+        assert_allclose(squeezed(mesh, image, 2.0, 0.4).u, direct.u, atol=1e-10)
+        assert len(called) == spare
 
 
 @pytest.mark.parametrize("method", ["direct", "amg"])
+@pytest.mark.filterwarnings("ignore")
 def test_an_unsolved_system_is_an_error(method, monkeypatch):
     image, mesh = block((2.0, 1.0, 3.0), (3, 3, 3))
     monkeypatch.setattr(elasticity, "RESIDUAL_FRACTION", 1e-30)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with pytest.raises(
-            RuntimeError, match=r"^elasticity: not solved: the residual .* mN exceeds .* mN$"
-        ):
-            squeezed(mesh, image, 2.0, 0.4, method=method)
+    with pytest.raises(RuntimeError, match=r"not solved: the residual .* mN exceeds .* mN$"):
+        squeezed(mesh, image, 2.0, 0.4, method=method)
 
 
 # The box's faces
@@ -287,18 +272,14 @@ def test_faces_of_any_affine(seed, n):
     image = Image(np.zeros(rng.integers(2, 9, n)), random_affine(rng, n))
     blocks = tuple(int(b) for b in rng.integers(1, 4, n))
     mesh = lattice_mesh(image, blocks=blocks)
-    index = image.to_index(mesh.points)
-    directions = image.affine[:n, :n] / image.spacing
-    axis = int(np.argmax(np.abs(directions[-1])))
+    axis = int(np.argmax(np.abs(image.affine[n - 1, :n] / image.spacing)))
+    along, length = image.to_index(mesh.points)[:, axis], image.shape[axis]
     low, high = box_faces(image, mesh)
-    ends = [
-        np.flatnonzero(index[:, axis] < -0.499),
-        np.flatnonzero(index[:, axis] > image.shape[axis] - 0.501),
-    ]
+    ends = [np.flatnonzero(along < -0.499), np.flatnonzero(along > length - 0.501)]
     assert sorted([low.tolist(), high.tolist()]) == sorted(e.tolist() for e in ends)
     assert len(low) == len(high) == np.prod([b + 1 for k, b in enumerate(blocks) if k != axis])
     shift = mesh.points[high].mean(axis=0) - mesh.points[low].mean(axis=0)
-    assert_allclose(np.abs(shift), np.abs(image.affine[:n, axis]) * image.shape[axis], rtol=1e-9)
+    assert_allclose(np.abs(shift), np.abs(image.affine[:n, axis]) * length, rtol=1e-9)
     assert shift[-1] > 0.0
 
 
@@ -329,22 +310,16 @@ def test_check_held_knows_every_singular_matrix(seed, n):
     rng = np.random.default_rng(seed)
     _, mesh = block((1.0,) * n, (2,) * n, None if n == 2 else "five-tet")
     cells = mesh.cells[rng.random(len(mesh.cells)) < rng.uniform(0.2, 0.9)]
-    if len(cells) == 0:
-        return
     used, cells = np.unique(cells, return_inverse=True)
-    mesh = Mesh(
-        mesh.points[used] + rng.normal(size=(len(used), n)) * 0.02, cells.reshape(-1, n + 1)
-    )
-    is_prescribed = rng.random(mesh.points.shape) < rng.choice([0.1, 0.3, 0.6])
+    points = mesh.points[used] + rng.normal(size=(len(used), n)) * 0.02
+    is_prescribed = rng.random(points.shape) < rng.choice([0.1, 0.3, 0.6])
     free = np.flatnonzero(~is_prescribed.ravel())
-    if len(free) == 0:
+    if len(free) == 0:  # or no cells
         return
+    mesh = Mesh(points, cells.reshape(-1, n + 1))
     values = np.linalg.eigvalsh(stiffness(mesh, 1.0, 0.3).toarray()[np.ix_(free, free)])
-    is_singular = bool(values[0] < 1e-10 * values[-1])
-    if is_singular:
-        with pytest.raises(InputError):
-            check_held(mesh.points, mesh.cells, is_prescribed)
-    else:
+    is_singular = values[0] < 1e-10 * values[-1]
+    with pytest.raises(InputError) if is_singular else nullcontext():
         check_held(mesh.points, mesh.cells, is_prescribed)
 
 
@@ -360,22 +335,11 @@ def test_the_loose_one_among_many_is_named(n_triangles):
     is_prescribed[cells[:, :2]] = True
     check_held(points, cells, is_prescribed)
     is_prescribed[cells[7, 1]] = False
-    with pytest.raises(InputError) as error:
+    with refusal(r"^mesh: 1 cells around cell 7 \(node 21\) can still rotate or slide as a whole"):
         check_held(points, cells, is_prescribed)
-    assert str(error.value) == (
-        "mesh: 1 cells around cell 7 (node 21) can still rotate or slide as a whole, as too few "
-        "nodes connect them; "
-        "fix more nodes or keep the largest facet-connected set"
-    )
 
 
 # Messages
-
-
-def message_of(call, *arguments):
-    with pytest.raises(InputError) as error:
-        call(*arguments)
-    return str(error.value)
 
 
 PLATE = Mesh([[0.0, 0.0], [1.0, 0.0], [1.0, 2.0], [0.0, 2.0]], [[0, 1, 2], [0, 2, 3]])
@@ -433,31 +397,35 @@ def test_messages_of_compression(changes, message):
         "young": [1.0, 2.0],
         "nu": 0.3,
     }
-    options |= changes
-    young, nu = options.pop("young"), options.pop("nu")
-    assert message in message_of(lambda: compression(PLATE, young, nu, **options))
+    with refusal(re.escape(message)):
+        compression(PLATE, **options | changes)
 
 
 def test_messages_of_meshes_that_are_not_held():
     points = np.vstack([PLATE.points, PLATE.points + 10.0, PLATE.points + 20.0])
     pieces = Mesh(points, np.vstack([PLATE.cells, PLATE.cells + 4, PLATE.cells + 8]))
     options = {"fixed_nodes": [2, 3], "pushed_nodes": [0, 1], "displacement": [0.0, 0.1]}
-    words = message_of(lambda: compression(pieces, 1.0, 0.3, **options))
-    assert words.startswith(
-        "mesh: 2 components have no node that is fixed, displaced or on a spring; the first has "
-        "2 cells"
-    )
-    words = message_of(lambda: compression(Mesh(points, PLATE.cells), 1.0, 0.3, **options))
-    assert words.startswith("mesh: 8 nodes belong to no cell, the first [4, 5, 6, 7, 8]")
-    nothing = np.zeros((4, 2))
-    assert "it can move freely" in message_of(
-        lambda: constrain_nodes(PLATE, 1.0, 0.3, nothing > 1, nothing)
-    )
     # One fixed and one pushed node, smooth plates: it turns until they are apart by the way.
-    options |= {"fixed_nodes": [2], "pushed_nodes": [1], "is_bonded": False}
-    assert "can still rotate or slide as a whole" in message_of(
-        lambda: compression(PLATE, 1.0, 0.3, **options)
-    )
+    turning = options | {"fixed_nodes": [2], "pushed_nodes": [1], "is_bonded": False}
+    for mesh, held, words in (
+        (
+            pieces,
+            options,
+            "^mesh: 2 components have no node that is fixed, displaced or on a spring; the first "
+            "has 2 cells",
+        ),
+        (
+            Mesh(points, PLATE.cells),
+            options,
+            r"^mesh: 8 nodes belong to no cell, the first \[4, 5, 6, 7, 8\]",
+        ),
+        (PLATE, turning, "can still rotate or slide as a whole"),
+    ):
+        with refusal(words):
+            compression(mesh, 1.0, 0.3, **held)
+    nothing = np.zeros((4, 2))
+    with refusal("it can move freely"):
+        constrain_nodes(PLATE, 1.0, 0.3, nothing > 1, nothing)
 
 
 def test_messages_of_constrained():
@@ -466,21 +434,22 @@ def test_messages_of_constrained():
     values[3] = np.nan  # not prescribed, so it does not count
     constrain_nodes(PLATE, 1.0, 0.3, is_held, values)
     values[1, 0] = np.inf
-    for chosen, prescribed, words in (
+    for chosen, given_values, words in (
         (is_held, values, "prescribed: displacements must be finite, but node 1 has [inf, 0.0]"),
         (is_held[:, 0], values, "is_prescribed: expected shape (4, 2), one row per node, got (4,)"),
         (is_held, values[:3], "prescribed: expected shape (4, 2), one row per node, got (3, 2)"),
     ):
-        assert words in message_of(
-            lambda *given: constrain_nodes(PLATE, 1.0, 0.3, *given), chosen, prescribed
-        )
+        with refusal(re.escape(words)):
+            constrain_nodes(PLATE, 1.0, 0.3, chosen, given_values)
 
 
 def test_messages_of_box_faces():
     image, mesh = block((1.0, 1.0, 1.0), (2, 2, 2))
-    assert "same dimension, got a 2-D mesh and a 3-D image" in message_of(box_faces, image, PLATE)
-    words = message_of(box_faces, image, Mesh(0.5 * mesh.points, mesh.cells))
-    assert words.startswith(
-        "mesh: no node lies on the image's face at index 0.5 of axis 2; the mesh extends from "
-        "-0.5 to 0"
-    )
+    half = Mesh(0.5 * mesh.points, mesh.cells)
+    off = "mesh: no node lies on the image's face at index 0.5 of axis 2; the mesh extends from "
+    for each, words in (
+        (PLATE, "same dimension, got a 2-D mesh and a 3-D image"),
+        (half, f"{off}-0.5 to 0"),
+    ):
+        with refusal(words):
+            box_faces(image, each)

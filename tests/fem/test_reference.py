@@ -10,6 +10,7 @@ import pytest
 import skfem
 from meshes import random_affine
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import refusal
 from shapes import grid
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
@@ -58,7 +59,6 @@ def test_element_against_scikit_fem(nu):
 
 
 @pytest.mark.parametrize("flip", [1.0, -1.0])
-@pytest.mark.parametrize("n", [2, 3])
 def test_bar_without_sideways_strain(n, flip):
     """nu = 0: u is linear along the push, E_strain = 1/2 E strain^2 V; the top rests, whichever
     way the axis runs.
@@ -105,7 +105,6 @@ def test_errors_of_a_known_field():
     assert compare(exact, mesh, u, 2.0, np.zeros(image.shape)).interface_strain is None
 
 
-@pytest.mark.parametrize("n", [2, 3])
 def test_errors_of_quadratic_cells(n):
     """A quadratic field is that of cells of order 2: its error against itself is what the voxels
     leave out of it.
@@ -290,5 +289,5 @@ def test_work_is_done_in_pieces(monkeypatch):
 
 def test_refuses_a_modulus_of_0():
     image = tetopt.Image(np.where(np.arange(8).reshape(2, 2, 2) == 3, 0.0, 1.0))
-    with pytest.raises(tetopt.InputError, match="above 0 kPa"):
+    with refusal("above 0 kPa"):
         reference(image, 0.3)

@@ -10,6 +10,7 @@ import nibabel
 import numpy as np
 import pytest
 from commands import exit_code
+from numpy.testing import assert_allclose
 from results import CASES, FOLDER, input_file, solved_model
 
 import tetopt
@@ -35,24 +36,22 @@ def test_the_files_that_reading_is_tested_with_are_what_it_writes(order, tmp_pat
     )
     assert list(anew.point_data) == list(kept.point_data)
     for name, values in kept.point_data.items():
-        np.testing.assert_allclose(
-            anew.point_data[name], values, rtol=0.0, atol=1e-5 * np.abs(values).max()
-        )
+        assert_allclose(anew.point_data[name], values, rtol=0.0, atol=1e-5 * np.abs(values).max())
 
 
 @pytest.mark.parametrize("units", ["MPa", "Pa"])
-def test_from_image_to_solver_and_back(tmp_path, units):
+def test_from_image_to_solver_and_back(here, units):
     """By the commands, in other units and LPS there: the displacements are those of `tetopt
     fem`.
     """
     image = tetopt.load_phantom("two_spheres").image(voxel_mm=4.0)
-    tetopt.save_image(tmp_path / "a.nii.gz", image)
+    tetopt.save_image("a.nii.gz", image)
     mapping = ["--young", "0.5+h/7", "--nu", "0.3"]
     mesh = [
         "mesh",
-        tmp_path / "a.nii.gz",
+        here / "a.nii.gz",
         "-o",
-        tmp_path / "a.vtu",
+        here / "a.vtu",
         "--spacing",
         "12",
         "--iterations",
@@ -61,35 +60,30 @@ def test_from_image_to_solver_and_back(tmp_path, units):
     assert exit_code(*mesh) == 0
     inp = [
         "convert",
-        tmp_path / "a.vtu",
-        tmp_path / "a.inp",
+        here / "a.vtu",
+        here / "a.inp",
         "--image",
-        tmp_path / "a.nii.gz",
+        here / "a.nii.gz",
         *mapping,
     ]
     assert exit_code(*inp, "--load", "compress:3%", "--units", units, "--space", "lps") == 0
-    run(tmp_path, "a")
-    assert (
-        exit_code(
-            "convert", tmp_path / "a.vtu", tmp_path / "b.vtu", "--results", tmp_path / "a.frd"
-        )
-        == 0
-    )
+    run(here, "a")
+    assert exit_code("convert", "a.vtu", "b.vtu", "--results", "a.frd") == 0
     fem = [
         "fem",
-        tmp_path / "a.nii.gz",
-        tmp_path / "a.vtu",
+        here / "a.nii.gz",
+        here / "a.vtu",
         *mapping,
         "--compress",
         "3",
         "-o",
-        tmp_path / "c.vtu",
+        here / "c.vtu",
     ]
     assert exit_code(*fem) == 0
     theirs, ours = (
-        tetopt.load_mesh(tmp_path / name).point_data["displacement"] for name in ("b.vtu", "c.vtu")
+        tetopt.load_mesh(name).point_data["displacement"] for name in ("b.vtu", "c.vtu")
     )
-    np.testing.assert_allclose(theirs, ours, rtol=0.0, atol=1e-5 * np.abs(ours).max())
+    assert_allclose(theirs, ours, rtol=0.0, atol=1e-5 * np.abs(ours).max())
     assert np.abs(ours).max() > 1.5
 
 
@@ -117,7 +111,7 @@ def test_an_organ_is_pressed_and_its_displacement_is_on_the_voxels(tmp_path, mon
             assert exit_code(*words[1:]) == 0
     u = nibabel.load("u.nii.gz")
     values, inside = u.get_fdata()[:, :, :, 0], np.isfinite(u.get_fdata()[:, :, :, 0, 0])
-    np.testing.assert_allclose(u.affine, affine)
+    assert_allclose(u.affine, affine)
     assert (inside == (seg == 5)).mean() > 0.995
     z = affine[2, 3] + affine[2, 2] * place[2][inside]
     height = z.max() - z.min()

@@ -9,6 +9,7 @@ import subprocess
 import numpy as np
 import pytest
 from models import quadratic_model, with_one_ratio, with_two_sides
+from numpy.testing import assert_allclose
 from scipy.spatial import KDTree
 from test_dolfinx import BEFORE, environment, python_with_dolfinx, same_rows, snippet
 
@@ -81,7 +82,6 @@ def pressed_model(n):
     return model._replace(point_data={"warmth": model.point_data["warmth"]})
 
 
-@pytest.mark.parametrize("n", [3, 2])
 def test_dolfinx(n, tmp_path):
     """Nodes to the last bit, sets by name, and the energy: measured within 4e-14 of ours. Its
     own file is read, too.
@@ -114,13 +114,10 @@ def test_dolfinx(n, tmp_path):
     back = quadratic(pressed.mesh.points, pressed.mesh.cells)[0]
     off, node = KDTree(back).query(points)
     assert off.max() < 1e-12
-    np.testing.assert_allclose(
-        pressed.point_data["displacement"][node, :n], ours.u, rtol=0, atol=1e-11
-    )
+    assert_allclose(pressed.point_data["displacement"][node, :n], ours.u, rtol=0, atol=1e-11)
 
 
 @pytest.mark.parametrize("suffix", ["vtu", "vtk"])
-@pytest.mark.parametrize("n", [3, 2])
 def test_scikit_fem_through_meshio(n, suffix, tmp_path):
     """Its quadratic mesh of meshio's cells, sets from the file's point data: displacement and
     energy are ours.
@@ -158,4 +155,4 @@ def test_scikit_fem_through_meshio(n, suffix, tmp_path):
             prescribed.append(on_set)
     u = skfem.solve(*skfem.condense(K, x=u, D=np.concatenate(prescribed)))
     assert 0.5 * float(u @ K @ u) == pytest.approx(ours.strain_energy, rel=1e-11)
-    np.testing.assert_allclose(u[np.array(of_node)].T, ours.u, rtol=0, atol=1e-11)
+    assert_allclose(u[np.array(of_node)].T, ours.u, rtol=0, atol=1e-11)
