@@ -20,15 +20,13 @@ OBLIQUE = np.array(
 
 def test_sizes_of_a_flipped_and_turned_image():
     image = Image(np.zeros((4, 5, 6)), OBLIQUE)
-    assert (image.ndim, image.shape) == (3, (4, 5, 6))
-    assert image.spacing.tolist() == [3, 2, 5]
-    assert image.voxel_volume == pytest.approx(30, rel=1e-15)
-    assert image.volume == pytest.approx(30 * 120, rel=1e-15)
+    assert (image.ndim, image.shape, image.spacing.tolist()) == (3, (4, 5, 6), [3, 2, 5])
+    sizes = image.voxel_volume, image.volume
+    assert sizes == pytest.approx((30, 30 * 120), rel=1e-15)
 
 
 def test_sheared_voxels_have_the_parallelepiped_s_volume():
-    affine = np.array([[2.0, 1.0, 0], [0, 3.0, 0], [0, 0, 1]])
-    image = Image(np.zeros((2, 2)), affine)
+    image = Image(np.zeros((2, 2)), [[2.0, 1.0, 0], [0, 3.0, 0], [0, 0, 1]])
     assert image.voxel_volume == pytest.approx(6)
     assert image.spacing == pytest.approx([2, np.sqrt(10)])
 
@@ -44,8 +42,9 @@ def test_to_world_by_hand():
     image = Image(np.zeros((4, 5, 6)), OBLIQUE)
     assert image.to_world([1, 2, 3]).tolist() == [10 - 4, -20 + 3, 30 - 15]
     assert image.to_index([6, -17, 15]).tolist() == [1, 2, 3]
-    assert image.to_world(np.zeros((2, 7, 3))).shape == (2, 7, 3)
-    assert image.to_index(np.zeros((0, 3))).shape == (0, 3)
+    for shape in ((2, 7, 3), (0, 3)):
+        assert image.to_world(np.zeros(shape)).shape == image.to_index(np.zeros(shape)).shape
+        assert image.to_world(np.zeros(shape)).shape == shape
 
 
 @given(seeds, dimensions)
@@ -75,25 +74,26 @@ def test_transformed_is_a_matrix_product_row_by_row(seed, n):
 
 
 @pytest.mark.parametrize(
-    ("data", "dtype"),
+    ("kind", "values", "kept"),
     [
-        (np.array([[0, 255]], dtype=np.uint8), np.float32),
-        (np.array([[-32768, 32767]], dtype=np.int16), np.float32),
-        (np.array([[True, False]]), np.float32),
-        (np.array([[0.5, 3e38]], dtype=np.float64), np.float64),  # 3e38 is not a float32
-        (np.array([[0.5, 2.0**120]], dtype=np.float64), np.float32),
-        (np.array([[2**24, 2**24 + 1]], dtype=np.int32), np.float64),
-        (np.array([[0.1, 0.2]], dtype=np.float64), np.float64),
-        (np.array([[0.1, 0.2]], dtype=np.float32), np.float32),
-        (np.array([[1e147, 0.0]], dtype=np.float64), np.float64),
-        (np.array([[0.5, 65504]], dtype=np.float16), np.float32),
-        (np.array([[1.0, 2.0]], dtype=">f4"), np.float32),
-        ([[1, 2], [3, 4]], np.float32),
+        ("u1", [0, 255], "f4"),
+        ("i2", [-32768, 32767], "f4"),
+        ("?", [True, False], "f4"),
+        ("f8", [0.5, 3e38], "f8"),  # 3e38 is not a float32
+        ("f8", [0.5, 2.0**120], "f4"),
+        ("i4", [2**24, 2**24 + 1], "f8"),
+        ("f8", [0.1, 0.2], "f8"),
+        ("f4", [0.1, 0.2], "f4"),
+        ("f8", [1e147, 0.0], "f8"),
+        ("f2", [0.5, 65504], "f4"),
+        (">f4", [1.0, 2.0], "f4"),
+        (None, [1, 2], "f4"),
     ],
 )
-def test_values_are_kept_as_float32_where_that_loses_nothing(data, dtype):
+def test_values_are_kept_as_float32_where_that_loses_nothing(kind, values, kept):
+    data = [values] if kind is None else np.array([values], dtype=kind)
     image = Image(data)
-    assert image.data.dtype == dtype
+    assert image.data.dtype == np.dtype(kept)
     assert image.data.dtype.isnative
     assert_array_equal(image.data, np.asarray(data))
     assert image.data.flags.c_contiguous
@@ -102,23 +102,20 @@ def test_values_are_kept_as_float32_where_that_loses_nothing(data, dtype):
 def test_arrays_are_copied_and_read_only():
     data, affine = np.zeros((3, 3), dtype=np.float32), np.eye(3)
     image = Image(data, affine)
-    data[:] = 7
-    affine[:] = 7
+    data[:] = affine[:] = 7
     assert (image.data == 0).all()
     assert_array_equal(image.affine, np.eye(3))
-    with pytest.raises(ValueError, match="read-only"):
-        image.data[0, 0] = 1
-    with pytest.raises(ValueError, match="read-only"):
-        image.affine[0, 0] = 1
+    for array in (image.data, image.affine):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0, 0] = 1
     with pytest.raises(AttributeError):
         image.data = data
 
 
 def test_fortran_order_and_negative_strides_are_read_right():
     data = np.arange(24.0).reshape(2, 3, 4)
-    assert_array_equal(Image(np.asfortranarray(data)).data, data)
-    assert_array_equal(Image(data[::-1, :, ::-1]).data, data[::-1, :, ::-1])
-    assert_array_equal(Image(data.T).data, data.T)
+    for view in (np.asfortranarray(data), data[::-1, :, ::-1], data.T):
+        assert_array_equal(Image(view).data, view)
 
 
 # Messages
@@ -160,10 +157,10 @@ def test_the_first_voxel_that_is_not_finite_is_named(value):
         (np.eye(2), r"expected shape \(3, 3\)"),
         (np.diag([1.0, np.nan, 1.0]), "finite"),
         (np.diag([1.0, 2.0, 2.0]), "last row"),
-        (np.array([[1.0, 0, 0], [0, 1, 0], [0.1, 0, 1]]), "last row"),
+        ([[1, 0, 0], [0, 1, 0], [0.1, 0, 1]], "last row"),
         (np.diag([1.0, 0.0, 1.0]), "singular"),
-        (np.array([[1.0, 2, 0], [2, 4, 0], [0, 0, 1]]), "singular"),
-        (np.array([[1.0, 1, 0], [1, 1 + 1e-7, 0], [0, 0, 1]]), "singular"),
+        ([[1, 2, 0], [2, 4, 0], [0, 0, 1]], "singular"),
+        ([[1, 1, 0], [1, 1 + 1e-7, 0], [0, 0, 1]], "singular"),
         ("affine", "array of numbers"),
         ([[1, 2], [3]], "array of numbers"),
     ],
@@ -173,11 +170,12 @@ def test_an_affine_that_places_nothing_is_refused(affine, message):
         Image(np.zeros((2, 2)), affine)
 
 
-def test_tiny_voxels_are_not_singular():
-    """Micrometres in metres: 1e-6 along every axis."""
-    assert Image(
-        np.zeros((2, 2, 2)), np.diag([1e-6, 1e-6, 1e-6, 1.0])
-    ).voxel_volume == pytest.approx(1e-18)
+@pytest.mark.parametrize("sizes", [(1e-6, 1e-6, 1e-6), (0.1, 0.1, 10.0)])
+def test_real_extremes_of_voxels(sizes):
+    """Micrometres in metres, which are not singular; slices of 10 mm with pixels of 0.1 mm."""
+    image = Image(np.zeros((2, 2, 2)), np.diag([*sizes, 1.0]))
+    assert image.spacing.tolist() == list(sizes)
+    assert image.voxel_volume == pytest.approx(np.prod(sizes))
 
 
 @pytest.mark.parametrize("factor", [1e-151, 1e147])
@@ -195,43 +193,26 @@ def test_intensities_whose_squares_cannot_be_summed(values):
         Image(np.array([values]))
 
 
-SHEARED = np.array(
-    [[1.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1e-4, 0.0], [0.0, 0.0, 0.0, 1.0]]
-)
+SHEARED, FAR = np.eye(4), np.eye(4)
+SHEARED[:3, 2] = 1.0, 0.0, 1e-4
+FAR[0, 3] = 1e12
+FLAT = "at most 1000 times as long as thick, got"
 
 
 @pytest.mark.parametrize(
     ("affine", "message"),
     [
-        (
-            np.diag([1.0, 1.0, 1e6, 1.0]),
-            r"at most 1000 times as long as thick, got 1e\+06 mm by 1 mm",
-        ),
-        (
-            np.diag([1.0, 1.0, 1e-6, 1.0]),
-            "at most 1000 times as long as thick, got 1 mm by 1e-06 mm",
-        ),
+        (np.diag([1.0, 1.0, 1e6, 1.0]), rf"{FLAT} 1e\+06 mm by 1 mm"),
+        (np.diag([1.0, 1.0, 1e-6, 1.0]), f"{FLAT} 1 mm by 1e-06 mm"),
         (np.diag([1.0, 1.0, 1e20, 1.0]), r"voxels of up to 1e\+09 mm"),
         (np.diag([1.0, 1.0, 1e300, 1.0]), r"voxels of up to 1e\+09 mm"),
         (np.diag([1e-30, 1e-30, 1e-30, 1.0]), "expected voxels of 1e-09 to"),
         (np.diag([5e-324, 1.0, 1.0, 1.0]), "expected voxels of 1e-09 to|singular"),
-        (SHEARED, "at most 1000 times as long as thick, got 1.414 mm by 7.071e-05 mm"),
-        (
-            np.array([[1.0, 0, 0, 1e12], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]),
-            "within 1e.09 voxels of the world",
-        ),
+        (SHEARED, f"{FLAT} 1.414 mm by 7.071e-05 mm"),
+        (FAR, "within 1e.09 voxels of the world"),
     ],
 )
 def test_voxels_that_cannot_be_computed_with(affine, message):
     with pytest.raises(InputError, match=message) as caught:
         Image(np.zeros((2, 2, 2)), affine)
     assert "\n" not in str(caught.value)
-
-
-def test_real_extremes_of_voxels():
-    """Slices of 10 mm with pixels of 0.1 mm, and a tilted gantry."""
-    assert Image(np.zeros((2, 2, 2)), np.diag([0.1, 0.1, 10.0, 1.0])).spacing.tolist() == [
-        0.1,
-        0.1,
-        10.0,
-    ]

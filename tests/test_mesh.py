@@ -36,20 +36,16 @@ def test_lists_and_small_types_become_float64_and_int64():
 
 
 def test_arrays_are_copied_contiguous_and_read_only():
-    points, cells = np.asfortranarray(SQUARE[0]), np.asfortranarray(SQUARE[1])
-    mesh = Mesh(points, cells)
-    points[:] = 0
-    cells[:] = 0
-    assert_array_equal(mesh.points, SQUARE[0])
-    assert_array_equal(mesh.cells, SQUARE[1])
-    assert mesh.points.flags.c_contiguous
-    assert mesh.cells.flags.c_contiguous
-    with pytest.raises(ValueError, match="read-only"):
-        mesh.points[0, 0] = 1
-    with pytest.raises(ValueError, match="read-only"):
-        mesh.cells[0, 0] = 1
+    given = [np.asfortranarray(array) for array in SQUARE]
+    mesh = Mesh(*given)
+    for array, kept, expected in zip(given, (mesh.points, mesh.cells), SQUARE, strict=True):
+        array[:] = 0
+        assert_array_equal(kept, expected)
+        assert kept.flags.c_contiguous
+        with pytest.raises(ValueError, match="read-only"):
+            kept[0, 0] = 1
     with pytest.raises(AttributeError):
-        mesh.points = points
+        mesh.points = given[0]
 
 
 @pytest.mark.parametrize(
@@ -77,22 +73,25 @@ def test_an_unpickled_mesh_is_checked():
         kind(points, cells + 1, None)
 
 
-def test_masked_values_are_refused():
+def hide(array, value):
+    return np.ma.masked_equal(np.array(array, dtype=float), value)
+
+
+@pytest.mark.parametrize(
+    ("call", "arrays", "words"),
+    [
+        (Image, [hide(np.eye(3), 0.0)], "image data: got 6 masked values; .*filled"),
+        (Image, [np.zeros((2, 2)), hide(np.diag([2, 3, 1]), 3)], "affine: got 1 masked values"),
+        (Mesh, [hide(TRIANGLE, 1), [[0, 1, 2]]], "mesh points: got 2 masked values"),
+        (Mesh, [TRIANGLE, np.ma.masked_equal([[0, 1, 2]], 1)], "mesh cells: got 1 masked values"),
+        (tetopt.quality, [hide(TRIANGLE, 1), [[0, 1, 2]]], "quality: points: got 2 masked values"),
+    ],
+)
+def test_masked_values_are_refused(call, arrays, words):
     """Numpy would take the numbers behind the mask; a mask that hides nothing is fine."""
-    hidden = np.ma.masked_equal(np.arange(24.0).reshape(2, 3, 4), 5.0)
-    with pytest.raises(InputError, match=r"^image data: got 1 masked values; .*filled"):
-        Image(hidden)
-    with pytest.raises(InputError, match=r"^affine: got 1 masked values"):
-        Image(np.zeros((2, 2)), np.ma.masked_equal([[2.0, 0, 0], [0, 3.0, 0], [0, 0, 1.0]], 3.0))
-    with pytest.raises(InputError, match=r"^mesh points: got 2 masked values"):
-        Mesh(np.ma.masked_equal(np.array(TRIANGLE, dtype=float), 1.0), [[0, 1, 2]])
-    with pytest.raises(InputError, match=r"^mesh cells: got 1 masked values"):
-        Mesh(TRIANGLE, np.ma.masked_equal([[0, 1, 2]], 1))
-    with pytest.raises(InputError, match=r"^quality: points: got 2 masked values"):
-        tetopt.quality(
-            np.ma.masked_equal(np.array(TRIANGLE, dtype=float), 1.0), np.array([[0, 1, 2]])
-        )
-    assert Image(np.ma.masked_equal(np.zeros((2, 3)), 1.0)).data.shape == (2, 3)
+    with pytest.raises(InputError, match=f"^{words}"):
+        call(*arrays)
+    assert Image(hide(np.zeros((2, 3)), 1)).data.shape == (2, 3)
 
 
 def test_unused_nodes_are_allowed():

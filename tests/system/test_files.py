@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from attacks import content
 
 from tetopt.errors import InputError
 from tetopt.system.files import (
@@ -32,6 +33,23 @@ VTU = (".vtu",)
 NIFTI = (".nii", ".nii.gz")
 
 
+@pytest.fixture
+def old(tmp_path):
+    """An output that is there."""
+    path = tmp_path / "mesh.vtu"
+    path.write_text("old")
+    return path
+
+
+def failing(*words):
+    """A function that fails as the system does."""
+
+    def fail(*_, **__):
+        raise OSError(*words)
+
+    return fail
+
+
 def assert_refused(path, match, suffixes=VTU, **options):
     """`check_output` says why in one line that starts with the path, and touches nothing."""
     with pytest.raises(InputError, match=match) as caught:
@@ -40,16 +58,11 @@ def assert_refused(path, match, suffixes=VTU, **options):
     assert "\n" not in str(caught.value)
 
 
-def test_a_new_file_may_be_written(tmp_path):
-    path = tmp_path / "mesh.vtu"
-    assert check_output(path, VTU) == path
-    assert check_output(str(path), VTU, force=True) == path
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize("name", ["a.nii", "a.nii.gz", "A.NII.GZ", "v1.2.nii.gz", "Schädel.nii"])
-def test_suffix_of_any_case(tmp_path, name):
-    assert check_output(tmp_path / name, NIFTI) == tmp_path / name
+def test_a_new_file_may_be_written(tmp_path, name):
+    path = tmp_path / name
+    assert check_output(path, NIFTI) == check_output(str(path), NIFTI, force=True) == path
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", ["a", "nii", "a.gz", "a.nii.gz.part"])
@@ -57,32 +70,25 @@ def test_other_suffixes_are_refused(tmp_path, name):
     assert_refused(tmp_path / name, "ending in .nii or .nii.gz", NIFTI, force=True)
 
 
-def test_an_existing_file_is_refused_without_force(tmp_path):
-    path = tmp_path / "mesh.vtu"
-    path.write_text("old")
-    assert_refused(path, "already exists; pass `force`")
-    assert check_output(path, VTU, force=True) == path
-    assert path.read_text() == "old"
+def test_an_existing_file_is_refused_without_force(old):
+    assert_refused(old, "already exists; pass `force`")
+    assert check_output(old, VTU, force=True) == old
+    assert old.read_text() == "old"
 
 
-def test_a_folder_that_is_none_and_a_file_that_is_one_are_refused(tmp_path):
+def test_a_folder_that_is_none_and_a_file_that_is_one_are_refused(old, tmp_path):
     assert_refused(tmp_path / "no" / "mesh.vtu", "folder does not exist", force=True)
-    assert not (tmp_path / "no").exists()
-    (tmp_path / "file").write_text("")
-    assert_refused(tmp_path / "file" / "mesh.vtu", "folder does not exist")
-    (tmp_path / "mesh.vtu").mkdir()
-    assert_refused(tmp_path / "mesh.vtu", "found a folder", force=True)
+    assert_refused(old / "mesh.vtu", "folder does not exist")
+    assert content(tmp_path) == {"mesh.vtu": b"old"}
+    (tmp_path / "b.vtu").mkdir()
+    assert_refused(tmp_path / "b.vtu", "found a folder", force=True)
 
 
 def test_a_folder_that_takes_no_file_is_refused(tmp_path, monkeypatch):
     """Whatever its rights say, a file is made there: root may write everywhere, but not on a
     full disk.
     """
-
-    def refused(*_, **__):
-        raise OSError(errno.EROFS, "Read-only file system")
-
-    monkeypatch.setattr(tempfile, "mkstemp", refused)
+    monkeypatch.setattr(tempfile, "mkstemp", failing(errno.EROFS, "Read-only file system"))
     assert_refused(tmp_path / "mesh.vtu", "folder is not writable: Read-only file system")
 
 
@@ -100,48 +106,44 @@ def test_what_is_no_file_is_not_replaced(tmp_path):
     assert_refused(tmp_path / "a.vtu", "a circular link|Too many levels", force=True)
 
 
-def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
-    (tmp_path / "file").write_text("x")
-    for name in ("a" * 300, "a\0b", "file/b"):
-        with (
-            pytest.raises(InputError, match="cannot create the folder for the results"),
-            outputs_of_command(),
-        ):
-            results_folder(tmp_path / "new" / ".." / name)
-    with pytest.raises(InputError, match="found a file"):
-        results_folder(tmp_path / "file")
-    assert [each.name for each in tmp_path.iterdir()] == ["file"]
+def test_a_folder_that_cannot_be_made_is_refused(old, tmp_path):
+    for name, words in (
+        ("new/../" + "a" * 300, "cannot create the folder for the results"),
+        ("new/../a\0b", "cannot create the folder for the results"),
+        ("new/../mesh.vtu/b", "cannot create the folder for the results"),
+        ("mesh.vtu", "found a file"),
+    ):
+        with pytest.raises(InputError, match=words), outputs_of_command():
+            results_folder(tmp_path / name)
+    assert content(tmp_path) == {"mesh.vtu": b"old"}
 
 
-def test_a_link_is_written_through(tmp_path):
+@pytest.mark.parametrize("is_there", [True, False])
+def test_a_link_is_written_through(tmp_path, is_there):
     """And stays; one whose target is not there yet makes that."""
     (tmp_path / "far").mkdir()
-    for name, old in (("a.vtu", "old"), ("b.vtu", None)):
-        target, link = tmp_path / "far" / name, tmp_path / name
-        link.symlink_to(Path("far") / name)
-        if old is not None:
-            target.write_text(old)
-        assert_refused(link, "already exists; pass `force`")
-        check_output(link, VTU, force=True)
-        save_bytes(link, b"new")
-        assert link.is_symlink()
-        assert not target.is_symlink()
-        assert target.read_text() == "new"
+    target, link = tmp_path / "far" / "a.vtu", tmp_path / "a.vtu"
+    link.symlink_to("far/a.vtu")
+    if is_there:
+        target.write_text("old")
+    assert_refused(link, "already exists; pass `force`")
+    check_output(link, VTU, force=True)
+    save_bytes(link, b"new")
+    assert content(tmp_path)["a.vtu"] == "far/a.vtu"
+    assert content(tmp_path)["far/a.vtu"] == b"new"
     (tmp_path / "c.vtu").symlink_to(tmp_path / "no" / "c.vtu")
     assert_refused(tmp_path / "c.vtu", "a link to .*its folder does not exist", force=True)
 
 
-def test_a_link_that_is_turned_during_the_run_changes_nothing(tmp_path):
-    (tmp_path / "a").write_text("old a")
-    (tmp_path / "b").write_text("old b")
+def test_a_link_that_is_turned_during_the_run_changes_nothing(old, tmp_path):
     link = tmp_path / "l.vtu"
-    link.symlink_to("a")
+    link.symlink_to("mesh.vtu")
     with outputs_of_command():
         check_output(link, VTU, force=True)
         link.unlink()
         link.symlink_to("b")
         save_bytes(link, b"new")
-    assert [(tmp_path / name).read_text() for name in "ab"] == ["new", "old b"]
+    assert content(tmp_path) == {"mesh.vtu": b"new", "l.vtu": "b"}
 
 
 # --------------------------------------------------------------------------------------------------
@@ -200,26 +202,19 @@ def test_the_file_appears_only_at_the_end(tmp_path, name):
     assert list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.parametrize(
-    ("error", "old"), [(OSError, None), (ValueError, "old"), (KeyboardInterrupt, "old")]
-)
-def test_an_ended_block_leaves_what_was_there(tmp_path, error, old):
-    path = tmp_path / "mesh.vtu"
-    if old is not None:
-        path.write_text(old)
-    with pytest.raises(error), written_whole(path) as temporary:  # noqa: PT012
+@pytest.mark.parametrize("error", [OSError, ValueError, KeyboardInterrupt])
+@pytest.mark.parametrize("name", ["mesh.vtu", "new.vtu"])
+def test_an_ended_block_leaves_what_was_there(old, tmp_path, error, name):
+    with pytest.raises(error), written_whole(tmp_path / name) as temporary:  # noqa: PT012
         temporary.write_text("half of the ne")
         raise error
-    assert [p.read_text() for p in tmp_path.iterdir()] == ([] if old is None else [old])
+    assert content(tmp_path) == {"mesh.vtu": b"old"}
 
 
-def test_a_writer_that_removes_its_file_leaves_the_old_one(tmp_path):
-    path = tmp_path / "mesh.vtu"
-    path.write_text("old")
-    with pytest.raises(FileNotFoundError), written_whole(path) as temporary:
+def test_a_writer_that_removes_its_file_leaves_the_old_one(old, tmp_path):
+    with pytest.raises(FileNotFoundError), written_whole(old) as temporary:
         temporary.unlink()
-    assert path.read_text() == "old"
-    assert list(tmp_path.iterdir()) == [path]
+    assert content(tmp_path) == {"mesh.vtu": b"old"}
 
 
 @pytest.mark.parametrize(
@@ -246,7 +241,7 @@ def test_permissions_follow_the_umask(tmp_path, mask, mode):
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no such rights")
 @pytest.mark.parametrize("mode", [0o600, 0o640, 0o444])
-def test_a_replaced_file_keeps_its_rights(tmp_path, mode, monkeypatch):
+def test_a_replaced_file_keeps_its_rights(old, mode, monkeypatch):
     """Patient data that nobody else may read stays so; what nobody may write is replaced by its
     owner, too.
     """
@@ -258,59 +253,44 @@ def test_a_replaced_file_keeps_its_rights(tmp_path, mode, monkeypatch):
         return open_file(file, flags, *rest, **options)
 
     monkeypatch.setattr(os, "open", opened)
-    path = tmp_path / "a.json"
-    path.write_text("old")
-    path.chmod(mode)
-    save_bytes(path, b"new")
-    assert path.read_text() == "new"
-    assert stat.S_IMODE(path.stat().st_mode) == mode
+    old.chmod(mode)
+    save_bytes(old, b"new")
+    assert old.read_text() == "new"
+    assert stat.S_IMODE(old.stat().st_mode) == mode
 
 
 @pytest.mark.skipif(
     not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root has every group"
 )
-def test_a_replaced_file_keeps_its_group(tmp_path, monkeypatch):
-    path = tmp_path / "a.json"
-    path.write_text("old")
-    os.chown(path, -1, 12345)
-    path.chmod(0o660)
-    save_bytes(path, b"new")
-    assert (path.stat().st_gid, stat.S_IMODE(path.stat().st_mode)) == (12345, 0o660)
-
-    def refused(*_):
-        raise PermissionError(errno.EPERM, "Operation not permitted")
-
+def test_a_replaced_file_keeps_its_group(old, monkeypatch):
+    os.chown(old, -1, 12345)
+    old.chmod(0o660)
+    save_bytes(old, b"new")
+    assert (old.stat().st_gid, stat.S_IMODE(old.stat().st_mode)) == (12345, 0o660)
     # another group must not get what that one was allowed
-    monkeypatch.setattr(os, "chown", refused)
-    save_bytes(path, b"newer")
-    assert path.stat().st_gid != 12345
-    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    monkeypatch.setattr(os, "chown", failing(errno.EPERM, "Operation not permitted"))
+    save_bytes(old, b"newer")
+    assert old.stat().st_gid != 12345
+    assert stat.S_IMODE(old.stat().st_mode) == 0o600
 
 
 def test_a_file_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
-    steps = []
-    real_sync, real_replace = os.fsync, os.replace
+    steps, replace = [], os.replace
     monkeypatch.setattr(
         os, "fsync", lambda handle: steps.append(stat.S_IFMT(os.fstat(handle).st_mode))
     )
-    monkeypatch.setattr(os, "replace", lambda *names: (steps.append("name"), real_replace(*names)))
+    monkeypatch.setattr(os, "replace", lambda *names: (steps.append("name"), replace(*names)))
     save_bytes(tmp_path / "a.json", b"new")
     assert steps == [stat.S_IFREG, "name", *([] if os.name == "nt" else [stat.S_IFDIR])]
-    assert real_sync is not os.fsync
 
 
 def test_an_error_names_the_file_and_a_full_disk_the_bytes(tmp_path, monkeypatch):
-    path = tmp_path / "mesh.vtu"
-
-    def full(*_):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(Path, "write_bytes", full)
+    monkeypatch.setattr(Path, "write_bytes", failing(errno.ENOSPC, "No space left on device"))
     words = r"cannot be written: No space left on device; it needs 3 bytes, \d+ are free"
     with pytest.raises(OSError, match=words) as caught:
-        save_bytes(path, b"new")
-    assert caught.value.filename == str(path)
-    assert list(tmp_path.iterdir()) == []
+        save_bytes(tmp_path / "mesh.vtu", b"new")
+    assert caught.value.filename == str(tmp_path / "mesh.vtu")
+    assert content(tmp_path) == {}
 
 
 def test_space_is_asked_for(tmp_path):
@@ -383,10 +363,7 @@ def test_json_keeps_every_bit_of_a_float(tmp_path):
     assert json.loads((tmp_path / "a.json").read_text())["values"] == values.tolist()
 
 
-def test_json_that_cannot_be_written_leaves_the_old_file(tmp_path):
-    path = tmp_path / "a.json"
-    save_json(path, {"old": 1})
+def test_json_that_cannot_be_written_leaves_the_old_file(old, tmp_path):
     with pytest.raises(TypeError):
-        save_json(path, {"new": object()})
-    assert json.loads(path.read_text()) == {"old": 1}
-    assert list(tmp_path.iterdir()) == [path]
+        save_json(old, {"new": object()})
+    assert content(tmp_path) == {"mesh.vtu": b"old"}

@@ -1,8 +1,5 @@
-"""Public names: their types, what nouns and functions refuse, and whom warnings name."""
+"""Public names: what nouns and functions refuse, and whom warnings name."""
 
-import inspect
-import pydoc
-import re
 from pathlib import Path
 
 import nibabel
@@ -13,57 +10,6 @@ import tetopt
 
 IMAGE = tetopt.Image(np.random.default_rng(0).normal(size=(6, 7, 8)))
 MESH = tetopt.Mesh([[0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 4]], [[0, 1, 2, 3]])
-
-
-# Classes in the fields of public records that the package alone looks into: they are handed on as
-# they are.
-INNER = {"Continuation", "Memberships", "Region", "System"}
-INNER |= {"JobOptions", "SmoothLabels", "Source", "Spread"}  # of runs and contents
-
-
-def classes():
-    """The names of all classes of the package."""
-    texts = [
-        path.read_text(encoding="utf-8") for path in Path(tetopt.__file__).parent.rglob("*.py")
-    ]
-    return {name for text in texts for name in re.findall(r"^class (\w+)", text, re.M)}
-
-
-def annotations_of(thing):
-    """What a function takes and returns; what a class's fields are, and its public methods take
-    and return.
-    """
-    if inspect.isfunction(thing):
-        return thing.__annotations__
-    methods = inspect.getmembers(
-        thing, lambda member: inspect.isfunction(member) or isinstance(member, property)
-    )
-    functions = [
-        getattr(member, "fget", member) for name, member in methods if not name.startswith("_")
-    ]
-    return getattr(thing, "__annotations__", {}) | {
-        f"{function.__name__}.{key}": value
-        for function in functions
-        for key, value in function.__annotations__.items()
-    }
-
-
-def listed():
-    """The names on the API page; those of records have their modules."""
-    page = Path(__file__).resolve().parents[2] / "docs" / "reference" / "api" / "index.md"
-    return re.findall(r"^   ~?([\w.]+)$", page.read_text(encoding="utf-8"), re.M)
-
-
-def test_every_type_of_a_public_name_is_documented():
-    """Whatever class an annotation of a public function, record, or method names."""
-    names, missing, public = classes(), set(), listed()
-    known = {name.rpartition(".")[2] for name in public} | INNER
-    for name in public:
-        for what, annotation in annotations_of(pydoc.locate(f"tetopt.{name}")).items():
-            text = getattr(annotation, "__forward_arg__", str(annotation))
-            kinds = set(re.findall(r"[A-Za-z_]\w*", text)) & names
-            missing |= {f"{kind}, of {name}: {what}" for kind in kinds - known}
-    assert missing == set()
 
 
 @pytest.mark.parametrize(
@@ -109,7 +55,6 @@ def test_hidden_numbers_of_masked_arrays_are_not_used():
         return np.ma.masked_array(np.ones(shape), np.ones(shape))
 
     for call in (
-        lambda: tetopt.quality(masked((4, 3)), MESH.cells),
         lambda: tetopt.extract_surface(MESH.points, MESH.cells, masked(1).astype(int)),
         lambda: tetopt.field_on_image(MESH, masked((4, 3)), IMAGE),
         lambda: tetopt.warped_image(MESH, masked((4, 3)), IMAGE),
@@ -152,33 +97,16 @@ def test_a_warning_names_the_line_of_who_called(tmp_path):
 @pytest.mark.parametrize(
     ("points", "cells", "message"),
     [
-        (
-            np.where(MESH.points == 4.0, np.nan, MESH.points),
-            MESH.cells,
-            "points: expected finite coordinates",
-        ),
-        (
-            np.where(MESH.points == 4.0, np.inf, MESH.points),
-            MESH.cells,
-            "points: expected finite coordinates",
-        ),
+        (MESH.points * np.nan, MESH.cells, "points: expected finite coordinates"),
         (MESH.points, MESH.cells + 1, r"cells: expected indices in 0\.\.3, got 1\.\.4"),
-        (MESH.points, MESH.cells - 1, r"cells: expected indices in 0\.\.3, got -1\.\.2"),
-        (MESH.points, MESH.cells.astype(float), "cells: expected integers, got float64"),
-        (MESH.points, MESH.cells == 1, "cells: expected integers, got bool"),
-        (MESH.points, MESH.cells[:0], r"cells: expected shape \(M, 4\) with M > 0, got \(0, 4\)"),
         (MESH.points, MESH.cells[:, :3], r"cells: expected shape \(M, 4\)"),
-        (
-            MESH.points[:, :1],
-            MESH.cells,
-            r"points: expected shape \(N, 2\) or \(N, 3\), got \(4, 1\)",
-        ),
+        (MESH.points[:, :1], MESH.cells, r"points: expected shape .*, got \(4, 1\)"),
         (MESH.points[:0], MESH.cells, r"cells: expected indices in 0\.\.-1"),
     ],
 )
 def test_points_and_cells_that_do_not_fit_are_refused(points, cells, message):
-    for name in ("quality", "E_G", "extract_surface"):
-        chosen = {"chosen": [True]} if name == "extract_surface" else {}
+    """As by `Mesh`, in tests/test_mesh.py."""
+    for name, chosen in (("quality", {}), ("E_G", {}), ("extract_surface", {"chosen": [True]})):
         with pytest.raises(tetopt.InputError, match=f"^{name}: {message}") as caught:
             getattr(tetopt, name)(points=points, cells=cells, **chosen)
         assert "\n" not in str(caught.value)
