@@ -8,10 +8,12 @@ import pytest
 import pyvista
 import skfem
 from models import quadratic_model, sample_model
+from numpy.testing import assert_allclose
+from refusals import refusal
 from vtkmodules.vtkCommonDataModel import vtkUnstructuredGrid
 
 import tetopt
-from tetopt import InputError, Mesh
+from tetopt import Mesh
 from tetopt.geometry.quadratic import quadratic
 from tetopt.geometry.simplex import volumes
 from tetopt.interop.conversions import add_array
@@ -32,7 +34,6 @@ def in_space(points):
     return np.column_stack([points, np.zeros((len(points), 3 - points.shape[1]))])
 
 
-@pytest.mark.parametrize("n", [2, 3])
 @pytest.mark.parametrize("name", THERE_AND_BACK)
 def test_there_and_back_is_the_same_mesh(name, n):
     mesh = sample_model(n).mesh
@@ -44,7 +45,6 @@ def test_there_and_back_is_the_same_mesh(name, n):
         assert back.cells.tobytes() == mesh.cells.tobytes()
 
 
-@pytest.mark.parametrize("n", [2, 3])
 def test_data_go_with_the_mesh(n):
     mesh, rng = sample_model(n).mesh, np.random.default_rng(n)
     on_cells = {
@@ -73,7 +73,7 @@ def test_data_go_with_the_mesh(n):
 
 @pytest.mark.parametrize("convert", ["to_pyvista", "to_meshio"])
 def test_data_that_do_not_fit_are_one_line(convert):
-    mesh = sample_model(3).mesh
+    mesh = sample_model().mesh
     ragged = [[1.0, 2.0]] + [[1.0]] * (len(mesh.cells) - 1)
     for data in (
         [1.0, 2.0],
@@ -83,34 +83,26 @@ def test_data_that_do_not_fit_are_one_line(convert):
         ragged,
         np.zeros((len(mesh.cells), 0)),
     ):
-        with pytest.raises(
-            InputError,
-            match=r"^cell_data: 'a\\nb': expected an array of numbers with \d+ rows, got ",
-        ):
+        with refusal(r"^cell_data: 'a\\nb': expected an array of numbers with \d+ rows, got "):
             getattr(mesh, convert)({"a\nb": data})
-    with pytest.raises(
-        InputError, match=r"^point_data: 'u': expected an array of numbers with \d+ rows"
-    ):
+    with refusal(r"^point_data: 'u': expected an array of numbers with \d+ rows"):
         getattr(mesh, convert)(point_data={"u": np.zeros(len(mesh.cells) + 1)})
-    with pytest.raises(InputError, match=r"^cell_data: expected strings as names, got 3"):
+    with refusal(r"^cell_data: expected strings as names, got 3"):
         getattr(mesh, convert)({3: np.zeros(len(mesh.cells))})
-    with pytest.raises(
-        InputError, match=r"^point_data: expected a dict of arrays by name, got ndarray"
-    ):
+    with refusal(r"^point_data: expected a dict of arrays by name, got ndarray"):
         getattr(mesh, convert)(point_data=np.zeros(len(mesh.points)))
 
 
 @pytest.mark.parametrize("kind", [">f8", ">f4", ">i4", ">u2", "f2", "g"])
-def test_numbers_of_any_bytes_are_the_same_numbers(kind, tmp_path):
+def test_numbers_of_any_bytes_are_the_same_numbers(kind, here):
     """As files of other machines have them; VTK would take their bytes for others."""
-    mesh = sample_model(3).mesh
+    mesh = sample_model().mesh
     values = np.arange(len(mesh.cells)).astype(kind)
     assert mesh.to_pyvista({"a": values}).cell_data["a"].tolist() == values.tolist()
-    tetopt.save_mesh(tmp_path / "a.vtu", mesh, {"a": values})
-    assert tetopt.load_mesh(tmp_path / "a.vtu").cell_data["a"].tolist() == values.tolist()
+    tetopt.save_mesh("a.vtu", mesh, {"a": values})
+    assert tetopt.load_mesh("a.vtu").cell_data["a"].tolist() == values.tolist()
 
 
-@pytest.mark.parametrize("n", [2, 3])
 def test_of_quadratic_cells_the_corners_are_taken(n):
     mesh = sample_model(n).mesh
     points, cells = quadratic(mesh.points, mesh.cells)
@@ -127,7 +119,7 @@ def test_of_quadratic_cells_the_corners_are_taken(n):
 
 
 def test_inverted_cells_are_turned_and_others_left_out():
-    mesh = sample_model(3).mesh
+    mesh = sample_model().mesh
     cells = mesh.cells.copy()
     cells[::2] = cells[::2][:, [1, 0, 2, 3]]
     points = np.vstack([np.full((1, 3), 99.0), mesh.points])  # the first is used by none
@@ -147,9 +139,7 @@ def test_inverted_cells_are_turned_and_others_left_out():
 def test_a_surface_in_the_plane_is_a_mesh():
     sheet = pyvista.Plane(i_resolution=3, j_resolution=2).triangulate()
     assert len(Mesh.from_pyvista(sheet).cells) == 12
-    with pytest.raises(
-        InputError, match="from_pyvista: a triangle mesh must lie in the plane z = 0"
-    ):
+    with refusal("from_pyvista: a triangle mesh must lie in the plane z = 0"):
         Mesh.from_pyvista(pyvista.Sphere())
 
 
@@ -202,22 +192,21 @@ CORNERS = np.vstack([np.zeros(3), np.eye(3), np.ones((6, 3))])
             skfem.MeshTet(np.zeros((3, 4)), np.zeros((4, 0), dtype=int)),
             r"4 integers each.*\(0, 4\)",
         ),
-        ("skfem", sample_model(3).mesh, "got Mesh"),
+        ("skfem", sample_model().mesh, "got Mesh"),
     ],
 )
 def test_what_is_no_mesh_is_refused_in_one_line(convert, other, message):
-    with pytest.raises(InputError, match=rf"^from_{convert}: .*{message}") as caught:
+    with refusal(rf"^from_{convert}: .*{message}"):
         getattr(Mesh, f"from_{convert}")(other)
-    assert "\n" not in str(caught.value)
 
 
 def test_the_boundary_in_trimesh():
-    mesh = sample_model(3).mesh
+    mesh = sample_model().mesh
     boundary = mesh.to_trimesh()
     assert boundary.is_watertight
     assert boundary.is_winding_consistent
-    np.testing.assert_allclose(boundary.volume, volumes(mesh.points, mesh.cells).sum(), rtol=1e-12)
-    with pytest.raises(InputError, match="to_trimesh: expected tetrahedra"):
+    assert_allclose(boundary.volume, volumes(mesh.points, mesh.cells).sum(), rtol=1e-12)
+    with refusal("to_trimesh: expected tetrahedra"):
         sample_model(2).mesh.to_trimesh()
 
 
@@ -232,21 +221,19 @@ def test_the_boundary_in_trimesh():
 )
 def test_a_library_that_is_missing_is_named(monkeypatch, name, package, convert):
     monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(
-        InputError, match=f'{package} is not installed; pip install "{package}[^ ]*"$'
-    ):
-        convert(sample_model(3).mesh)
+    with refusal(f'{package} is not installed; pip install "{package}[^ ]*"$'):
+        convert(sample_model().mesh)
 
 
 @pytest.mark.parametrize(
-    "model", [sample_model(2), sample_model(3), quadratic_model(2), quadratic_model(3)]
+    "model", [sample_model(2), sample_model(), quadratic_model(2), quadratic_model()]
 )
-def test_a_model_has_its_sets_and_materials_with_it(model, tmp_path):
+def test_a_model_has_its_sets_and_materials_with_it(model, here):
     """As a file of ours that is read by the library has them, but sets of cells, which files
     have in words of ours.
     """
-    tetopt.save_model(tmp_path / "a.vtu", model)
-    saved, grid, other = pyvista.read(tmp_path / "a.vtu"), model.to_pyvista(), model.to_meshio()
+    tetopt.save_model("a.vtu", model)
+    saved, grid, other = pyvista.read("a.vtu"), model.to_pyvista(), model.to_meshio()
     assert (grid.points == saved.points).all()
     assert (grid.cells == saved.cells).all()
     assert set(grid.celltypes) == {VTK_NUMBERS[model.mesh.ndim][model.order - 1]}

@@ -33,7 +33,7 @@ def named(model):
     return again._replace(point_data=model.point_data)
 
 
-@pytest.mark.parametrize("model", [sample_model(3), quadratic_model(3)])
+@pytest.mark.parametrize("model", [sample_model(), quadratic_model()])
 def test_what_the_file_has_goes_on(tmp_path, model):
     first = named(model)
     again = tetopt.build_model(saved(tmp_path, first))
@@ -59,7 +59,7 @@ def test_what_the_file_has_goes_on(tmp_path, model):
 
 
 def test_what_is_stated_takes_the_place_of_the_file_s(tmp_path):
-    loaded = saved(tmp_path, named(sample_model(3)))
+    loaded = saved(tmp_path, named(sample_model()))
     by_name = tetopt.build_model(loaded, young="skull=90,white_matter=2", loads=["hold:inferior"])
     assert set(by_name.materials.young.tolist()) == {2.0, 90.0}
     assert by_name.materials.density is None
@@ -76,7 +76,7 @@ def test_what_is_stated_takes_the_place_of_the_file_s(tmp_path):
 
 
 def test_loads_whose_sets_are_gone_are_said_to_be_left_out(tmp_path):
-    loaded = saved(tmp_path, named(sample_model(3)))
+    loaded = saved(tmp_path, named(sample_model()))
     facets = {name: rows for name, rows in loaded.sets.facets.items() if name != "inferior"}
     with pytest.warns(
         UserWarning, match="dropped the file's loads: it no longer has the sets inferior"
@@ -91,7 +91,7 @@ def test_loads_whose_sets_are_gone_are_said_to_be_left_out(tmp_path):
 def test_as_convert_writes_it(tmp_path, monkeypatch):
     """The same file by the command and by the function, but for the version in its head."""
     monkeypatch.chdir(tmp_path)
-    loaded = saved(tmp_path, named(sample_model(3)), "first.vtu")
+    loaded = saved(tmp_path, named(sample_model()), "first.vtu")
     assert main(["convert", "first.vtu", "b.inp", "--nu", "0.35"]) == 0
     tetopt.save_model(
         "ours.inp", tetopt.build_model(loaded, nu=0.35, about={"tetopt": tetopt.__version__})

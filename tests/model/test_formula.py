@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import refusal
 
 import tetopt
 from tetopt.model.formula import parse_formula
@@ -81,9 +82,8 @@ def test_values(text, expected):
     ],
 )
 def test_refuses(text):
-    with pytest.raises(tetopt.InputError, match="formula") as caught:
+    with refusal("formula") as caught:
         parse_formula(text)
-    assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 300
 
 
@@ -102,7 +102,7 @@ def test_any_text_is_a_mapping_or_an_input_error(text):
 
 
 def test_no_value_is_refused_with_the_intensity():
-    with pytest.raises(tetopt.InputError, match="inf at intensity 0"):
+    with refusal("inf at intensity 0"):
         young_from(parse_formula("1/h"), np.array([0.0, 1.0]))
 
 
@@ -115,5 +115,5 @@ def test_mapping_is_a_table_or_a_formula():
     "text", ["h" * 10**6, "+".join("h" * 10**5), "(" * 5000 + "h" + ")" * 5000, "9" * 10_001]
 )
 def test_formulas_without_end(text):
-    with pytest.raises(tetopt.InputError, match="expected at most 10000 characters"):
+    with refusal("expected at most 10000 characters"):
         parse_formula(text)

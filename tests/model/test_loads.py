@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from models import ball_mesh, sample_image, sample_model
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import refusal
 from scipy.spatial.transform import Rotation
 
 import tetopt
-from tetopt.errors import InputError
 from tetopt.fem.elasticity import box_faces, push_of
 from tetopt.geometry.quadratic import quadratic
 from tetopt.geometry.simplex import volumes
@@ -48,7 +48,7 @@ def tilted(degrees):
 
 @pytest.mark.parametrize(
     "affine",
-    [sample_image(2).affine, sample_image(3).affine, SHEARED, tilted(30), tilted(50), tilted(70)],
+    [sample_image(2).affine, sample_image().affine, SHEARED, tilted(30), tilted(50), tilted(70)],
 )
 def test_a_compression_is_that_of_fem(affine):
     """The same nodes, and the same push along the faces' normal."""
@@ -92,12 +92,12 @@ def test_words_in_two_dimensions():
     assert plain(parse_load("move:x_min:1,free", 2))[2][0] == 1.0
     assert plain(parse_load("gravity:0,-9810", 2)) == ("gravity", "", [0.0, -9810.0], 0)
     for text in ("gravity:0,0,-9810", "traction:x_min:1,2,3"):
-        with pytest.raises(InputError, match="2 finite numbers"):
+        with refusal("2 finite numbers"):
             parse_load(text, 2)
 
 
 def test_a_model_may_hold_without_pushing():
-    model = sample_model(3)
+    model = sample_model()
     (load,) = parse_loads(["hold:left"], model.mesh, model.sets)
     assert plain(load) == ("displacement", "left", [0.0, 0.0, 0.0], 0)
     assert len(parse_loads(["gravity:0,0,1"], model.mesh, model.sets)) == 1
@@ -106,7 +106,7 @@ def test_a_model_may_hold_without_pushing():
 
 def test_step_1_may_have_the_loads_of_all_steps_alone():
     """As weight in all, and a pressure from step 2 on."""
-    model = sample_model(3)
+    model = sample_model()
     loads = parse_loads(["hold:left", "2/pressure:right:1"], model.mesh, model.sets)
     assert count_of_steps(loads) == 2
     assert [load.kind for load in in_step(loads, 1)] == ["displacement"]
@@ -117,7 +117,7 @@ def test_components_and_steps_keep_displacements_apart():
     """The same nodes may be held along one axis by one load and along another by the next, or in
     other steps.
     """
-    model = sample_model(3)
+    model = sample_model()
     sliding = ["move:left:0,free,free", "move:superior:free,free,0", "move:inferior:free,0,1"]
     assert len(parse_loads(sliding, model.mesh, model.sets)) == 3
     steps = ["hold:superior", "1/move:inferior:0,0,1", "2/move:inferior:0,1,0"]
@@ -165,13 +165,11 @@ def test_components_and_steps_keep_displacements_apart():
     ],
 )
 def test_loads_that_are_none(texts, match):
-    model = sample_model(3)
-    with pytest.raises(InputError, match=match) as caught:
+    model = sample_model()
+    with refusal(match):
         parse_loads(texts, model.mesh, model.sets)
-    assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("n", [2, 3])
 def test_an_organ_is_pressed_along_the_world_axis(n):
     """Between its own outermost nodes, though the areas of neither side sum up to exactly that
     direction.
@@ -186,7 +184,6 @@ def test_an_organ_is_pressed_along_the_world_axis(n):
     assert_allclose(bottom.numbers, 0.05 * np.ptp(mesh.points, axis=0) * np.eye(n)[-1], rtol=1e-12)
 
 
-@pytest.mark.parametrize("n", [2, 3])
 def test_a_side_where_the_box_cuts_a_stem_is_told(n):
     """The body's upper side is the face of the box, its lower one that of a stem, of one of many
     blocks: too small.
@@ -226,9 +223,7 @@ def test_a_side_where_the_box_cuts_a_stem_is_told(n):
 def test_no_side_to_press():
     """A tetrahedron has a tip and no top; the sets that it has are named."""
     mesh = tetopt.Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2, 3]])
-    with pytest.raises(
-        InputError, match=r"the mesh has no facets superior; .* boundary, left, posterior, inferior"
-    ):
+    with refusal(r"the mesh has no facets superior; .* boundary, left, posterior, inferior"):
         parse_loads(["compress:5%"], mesh, standard_sets(mesh))
 
 
@@ -239,8 +234,6 @@ def nodes_and_cells(mesh, order):
     return (mesh.points, mesh.cells) if order == 1 else quadratic(mesh.points, mesh.cells)
 
 
-@pytest.mark.parametrize("order", [1, 2])
-@pytest.mark.parametrize("n", [2, 3])
 def test_weights_integrate_what_cells_of_the_order_can_be(n, order):
     """Linear functions, and of order 2 quadratic ones, over a closed surface: Gauss's theorem."""
     model = sample_model(n)
@@ -275,8 +268,6 @@ def test_each_order_s_parts_of_a_facet():
     assert quadratic(plate.points, plate.cells)[0][nodes[0, 2]].tolist() == [1.0, 0.0]
 
 
-@pytest.mark.parametrize("order", [1, 2])
-@pytest.mark.parametrize("n", [2, 3])
 def test_forces_add_up_to_stress_times_area(n, order):
     model = sample_model(n)
     mesh, sets = model.mesh, model.sets

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from models import sample_model
 from numpy.testing import assert_array_equal
+from refusals import refusal
 
 from tetopt import InputError
 from tetopt.model.build import build_model
@@ -83,12 +84,12 @@ def test_messages_of_mappings(mapping, message):
     "text", ["1=", "=2", "1=2,1=3", "1=2;2=3", "a=1,a=2", "1.5=2", "1=x", "*=1,*=2"]
 )
 def test_labels_that_are_none(text):
-    with pytest.raises(InputError, match="by label"):
+    with refusal("by label"):
         parse_any_mapping(text)
 
 
 def test_a_mapping_of_the_intensity_alone():
-    with pytest.raises(InputError, match="expected a mapping of the intensity"):
+    with refusal("expected a mapping of the intensity"):
         parse_mapping("1=2")
 
 
@@ -119,7 +120,7 @@ def test_labels_from_a_file(tmp_path):
     assert has_column(str(tmp_path / "b.csv"), "nu")
     assert not has_column(str(tmp_path / "a.csv"), "nu")
     table = build_model(
-        sample_model(3).mesh, young=str(tmp_path / "b.csv"), cell_data={"label": np.full(192, 3)}
+        sample_model().mesh, young=str(tmp_path / "b.csv"), cell_data={"label": np.full(192, 3)}
     ).materials
     assert (table.young.tolist(), table.nu.tolist()) == ([2.5], [0.3])
 
@@ -152,10 +153,9 @@ def test_labels_from_a_file(tmp_path):
 )
 def test_files_that_are_none(tmp_path, name, text, match):
     (tmp_path / name).write_text(text)
-    with pytest.raises(InputError, match=match) as caught:
+    with refusal(match):
         load_mapping(tmp_path / name)
-    assert "\n" not in str(caught.value)
-    with pytest.raises(InputError, match="no such file"):
+    with refusal("no such file"):
         load_mapping(tmp_path / "no.csv")
 
 
@@ -167,15 +167,15 @@ def test_separators_of_csv(tmp_path, separator):
 
 def test_csv_of_another_encoding(tmp_path):
     (tmp_path / "a.csv").write_bytes("name,young\nMäuse,2\n".encode("latin-1"))
-    with pytest.raises(InputError, match=r'expected UTF-8 text, .* in Excel as "CSV UTF-8"'):
+    with refusal(r'expected UTF-8 text, .* in Excel as "CSV UTF-8"'):
         load_mapping(tmp_path / "a.csv")
 
 
 def test_a_table_must_increase():
-    with pytest.raises(InputError, match="must increase, got 5 and then 3"):
+    with refusal("must increase, got 5 and then 3"):
         parse_any_mapping("5:1,3:2")
 
 
 def test_other_names_than_h():
-    with pytest.raises(InputError, match='cannot use "x"'):
+    with refusal('cannot use "x"'):
         parse_any_mapping("1 + x")

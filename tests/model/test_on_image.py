@@ -1,9 +1,9 @@
 """Fields of a mesh on an image's voxels, and an image moved by one, against closed forms."""
 
 import numpy as np
-import pytest
 from models import sample_image
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import refusal
 from scipy.spatial import Delaunay
 
 import tetopt
@@ -31,7 +31,6 @@ def moved_mesh(image, n_nodes=60):
     return tetopt.Mesh(points, mesh.cells)
 
 
-@pytest.mark.parametrize("n", [2, 3])
 def test_a_voxel_has_the_value_of_its_cell_to_the_last_bit(n):
     image = oblique(n)
     mesh = moved_mesh(image)
@@ -48,7 +47,6 @@ def test_a_voxel_has_the_value_of_its_cell_to_the_last_bit(n):
     assert (stacked[~inside] == -1.0).all()
 
 
-@pytest.mark.parametrize("n", [2, 3])
 def test_fields_of_nodes_are_exact_up_to_their_order(n):
     """A linear field of order 1, a quadratic one of order 2, at voxels of a finer grid, too."""
     image = oblique(n)
@@ -66,7 +64,6 @@ def test_fields_of_nodes_are_exact_up_to_their_order(n):
         assert_allclose(curved[inside], expected[inside], rtol=1e-12)
 
 
-@pytest.mark.parametrize("n", [2, 3])
 def test_curved_cells_are_isoparametric(n):
     """Their nodes' coordinates, as a field, give back the voxels' centres; a straight map would
     miss them.
@@ -89,7 +86,7 @@ def test_an_image_moves_with_its_displacement():
     """By whole voxels exactly, by nothing not at all, and the inverse way back; labels stay
     labels.
     """
-    image = sample_image(3)
+    image = sample_image()
     mesh = tetopt.lattice_mesh(image, nodes=100)
     still = tetopt.warped_image(mesh, np.zeros_like(mesh.points), image)
     assert_allclose(still.data, image.data, atol=1e-9)
@@ -121,18 +118,16 @@ def test_other_rows_and_displacements_are_rejected():
     image = oblique(3)
     mesh = moved_mesh(image)
     for rows in (5, len(mesh.points) + 1):
-        with pytest.raises(
-            tetopt.InputError, match=f"values: expected a row for each of .* got {rows}"
-        ):
+        with refusal(f"values: expected a row for each of .* got {rows}"):
             tetopt.field_on_image(mesh, np.zeros(rows), image)
-    with pytest.raises(tetopt.InputError, match="values: expected an array of numbers"):
+    with refusal("values: expected an array of numbers"):
         tetopt.field_on_image(mesh, ["a"] * len(mesh.cells), image)
-    with pytest.raises(tetopt.InputError, match="inverted"):
+    with refusal("inverted"):
         tetopt.warped_image(mesh, -2.0 * mesh.points, image)
-    with pytest.raises(tetopt.InputError, match="3 numbers for each node"):
+    with refusal("3 numbers for each node"):
         tetopt.warped_image(mesh, mesh.points[:, :2], image)
     far = tetopt.Image(np.zeros((3, 3, 3)), np.diag([1.0, 1.0, 1.0, 1.0]) + 1e4 * np.eye(4, k=3))
-    with pytest.raises(tetopt.InputError, match="image: no voxel of it is inside the mesh"):
+    with refusal("image: no voxel of it is inside the mesh"):
         tetopt.warped_image(mesh, np.zeros_like(mesh.points), far, image)
     part = tetopt.Image(
         1.0 + image.data[3:], image.affine @ np.array([[1, 0, 0, 3], *np.eye(4)[1:].tolist()])
@@ -140,17 +135,13 @@ def test_other_rows_and_displacements_are_rejected():
     moved = tetopt.warped_image(mesh, np.zeros_like(mesh.points), part, image, outside=-1.0)
     assert (moved.data[:2] == -1.0).all()  # not the edge of what there is
     assert (moved.data[3:] > 0.0).any()
-    with pytest.raises(
-        tetopt.InputError, match="expected a 3-D image like the mesh, got a 2-D one"
-    ):
+    with refusal("expected a 3-D image like the mesh, got a 2-D one"):
         tetopt.warped_image(mesh, np.zeros_like(mesh.points), oblique(2), image)
     points = np.array([[-4.0, -4], [4, -4], [4, 4], [-4, 4], [-1, 0], [1, 0]])
     mesh = tetopt.Mesh(points, orient_cells(points, Delaunay(points).simplices))
     grid = tetopt.Image(np.zeros((9, 9)), [[1, 0, -4], [0, 1, -4], [0, 0, 1]])
     numbers = np.arange(6.0)
-    with pytest.raises(
-        tetopt.InputError, match='6 cells and as many nodes; pass at="cells" or at="nodes"'
-    ):
+    with refusal('6 cells and as many nodes; pass at="cells" or at="nodes"'):
         tetopt.field_on_image(mesh, numbers, grid)
     of_cells, of_nodes = (
         tetopt.field_on_image(mesh, numbers, grid, at=at) for at in ("cells", "nodes")

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from models import ball_mesh, sample_image, sample_model
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import refusal
 
 import tetopt
-from tetopt.errors import InputError
 from tetopt.geometry.box import world_axes
 from tetopt.geometry.simplex import volumes
 from tetopt.model.file import sets_beside
@@ -86,7 +86,7 @@ def test_faces_are_named_by_the_world(order, signs):
 
 
 def test_an_oblique_box_is_known_by_its_affine_alone():
-    image, mesh = sample_image(3), sample_model(3).mesh
+    image, mesh = sample_image(), sample_model().mesh
     with_box = standard_sets(mesh, box_of(image)).facets
     assert sum(len(with_box[name]) for pair in NAMES for name in pair) == len(with_box["boundary"])
     # turned about z, so that only those two faces lie in planes of the world
@@ -110,7 +110,6 @@ def test_the_surface_of_a_mask_is_the_boundary_off_the_box():
     )
 
 
-@pytest.mark.parametrize("n", [2, 3])
 def test_a_ball_within_the_box_has_sides_by_its_own_extent(n):
     """Caps a tenth of it deep, each a tenth of a ball's surface, which face their side; no facet
     is on two.
@@ -140,7 +139,7 @@ def test_a_ball_within_the_box_has_sides_by_its_own_extent(n):
 
 def test_sides_by_extent_make_way_for_sets_of_the_mesh():
     """A set "superior" that came with an organ keeps its name, and its members."""
-    mesh = ball_mesh(3)
+    mesh = ball_mesh()
     own = Sets({"superior": boundary_rows(mesh)[:5]}, {})
     sets, renamed = sets_beside(mesh, None, {}, own, {})
     assert renamed == {}
@@ -181,8 +180,8 @@ def test_three_labels_have_an_interface_for_each_pair_that_touches():
 
 @pytest.mark.parametrize("labels", [[0.5] * 192, [-1] * 192, [1] * 191])
 def test_labels_that_are_none(labels):
-    with pytest.raises(InputError, match="labels: expected"):
-        standard_sets(sample_model(3).mesh, labels=np.array(labels))
+    with refusal("labels: expected"):
+        standard_sets(sample_model().mesh, labels=np.array(labels))
 
 
 # Asked for in words
@@ -198,7 +197,7 @@ def requested(text, n=3, mean=None):
 
 def test_below_is_the_largest_connected_part_and_its_surface():
     mesh, sets = requested("dark=below:12")
-    mean = sample_model(3).cell_data["mean"]
+    mean = sample_model().cell_data["mean"]
     chosen = tetopt.geometry.topology.largest_component(mesh.cells, mean < 12)
     assert_array_equal(sets.cells["dark"], chosen)
     rows = sets.facets["dark_surface"]
@@ -211,7 +210,7 @@ def test_below_is_the_largest_connected_part_and_its_surface():
 
 
 def test_near_a_point_and_a_plane():
-    model = sample_model(3)
+    model = sample_model()
     mesh, points = model.mesh, model.mesh.points
     every = boundary_rows(mesh)
     here = points[0]
@@ -245,14 +244,13 @@ def test_near_a_point_and_a_plane():
     ],
 )
 def test_words_that_are_refused(text, match):
-    with pytest.raises(InputError, match=match) as caught:
+    with refusal(match):
         requested(text)
-    assert "\n" not in str(caught.value)
 
 
 def test_a_surface_takes_its_name_too():
-    model = sample_model(3)
-    with pytest.raises(InputError, match='"dark_surface" already exists'):
+    model = sample_model()
+    with refusal('"dark_surface" already exists'):
         with_requested(
             model.mesh,
             Sets({"dark_surface": boundary_rows(model.mesh)}, {}),
@@ -262,8 +260,8 @@ def test_a_surface_takes_its_name_too():
 
 
 def test_below_needs_means():
-    mesh = sample_model(3).mesh
-    with pytest.raises(InputError, match="has no cell means"):
+    mesh = sample_model().mesh
+    with refusal("has no cell means"):
         with_requested(mesh, Sets({}, {}), ["dark=below:12"], None)
 
 
@@ -271,7 +269,7 @@ def test_below_needs_means():
 
 
 def test_rows_of_nodes_in_any_order():
-    mesh = sample_model(3).mesh
+    mesh = sample_model().mesh
     rows = boundary_rows(mesh)
     nodes = facet_triples(mesh.cells, rows)[:, [2, 0, 1]]
     assert_array_equal(rows_of(mesh, nodes[::-1]), rows)
@@ -279,8 +277,8 @@ def test_rows_of_nodes_in_any_order():
 
 
 def test_sets_on_the_boundary_are_carried_to_an_improved_mesh():
-    model = sample_model(3)
-    image = sample_image(3)
+    model = sample_model()
+    image = sample_image()
     after = tetopt.optimize(image, model.mesh, boundary="fixed", iterations=3).mesh
     assert (after.points != model.mesh.points).any()
     sets = Sets(
@@ -301,8 +299,8 @@ def test_sets_on_the_boundary_are_carried_to_an_improved_mesh():
 
 
 def test_sets_of_a_mesh_join_the_standard_ones():
-    mesh = sample_model(3).mesh
-    standard = standard_sets(mesh, box_of(sample_image(3)))
+    mesh = sample_model().mesh
+    standard = standard_sets(mesh, box_of(sample_image()))
     some = standard.facets["left"][:3]
     own = Sets(
         {"left": some, "right": standard.facets["right"], "skin": some}, {"Boundary": np.arange(4)}
