@@ -31,6 +31,7 @@ from tetopt.job.options import (
     option_name,
     option_of,
 )
+from tetopt.system.arrays import Json
 from tetopt.system.files import check_output, name_files, save_json
 
 ImageArgument = Annotated[Path, Option("IMAGE", IMAGE_FILES, is_argument=True)]
@@ -60,7 +61,7 @@ class NumberOptions:
         if self.json_path is not None:
             check_output(self.json_path, (".json",), self.force)
 
-    def save(self, numbers: dict[str, Any]) -> None:
+    def save(self, numbers: Json) -> None:
         """Write the file if it was requested."""
         if self.json_path is not None:
             save_json(self.json_path, numbers)
@@ -177,7 +178,7 @@ def _annotation_of(name: str, kind: Any, default: Any, panel: str | None) -> Any
     if not has_option(kind):
         return kind
     own = option_of(kind)
-    about: dict[str, Any] = {"metavar": own.metavar, "help": with_hyphens(own.text)}
+    about: Json = {"metavar": own.metavar, "help": with_hyphens(own.text)}
     if own.is_argument:
         return Annotated[get_args(kind)[0], typer.Argument(**about)]
     long = option_name(name, kind)
@@ -218,7 +219,7 @@ def _converter(name: str, kind: Any, number: Callable[[str], int | float]) -> Ca
     return converted
 
 
-def _of_values(kind: Any, name: str, values: dict[str, Any]) -> Any:
+def _of_values(kind: Any, name: str, values: Json) -> Any:
     """Return a parameter's value: one of `values`, or a record built from them."""
     if not is_dataclass(kind):
         return values[name]

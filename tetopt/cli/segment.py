@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from rich.table import Table
@@ -17,7 +17,7 @@ from tetopt.energy.sampling import overlap_of
 from tetopt.job.mesh_file import read_mesh
 from tetopt.job.options import MaskedPart, Option
 from tetopt.report.tables import new_table
-from tetopt.system.arrays import Bools
+from tetopt.system.arrays import Bools, Json
 from tetopt.system.files import check_output
 
 
@@ -60,7 +60,7 @@ def segment_command(
         float(h[of_class == number].mean()) if fraction else None
         for number, fraction in enumerate(fractions)
     ]
-    report: dict[str, Any] = {
+    report: Json = {
         "image": image_path.name,
         "mesh": mesh_path.name,
         "classes": classes,

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,7 @@ from tetopt.model.label_names import (
     TABLE_TEXT,
     table_words,
 )
+from tetopt.system.arrays import Json
 
 AFFINE_MM = 1e-4  # affines that differ by less are equal: files round them to 32 bits
 
@@ -77,7 +78,7 @@ def check_part(image: Path | None, part: MaskedPart, labels: Path | None = None)
     """Raise InputError for options that select the voxels of an image if there is none; labels
     may have a mask.
     """
-    needs_image: dict[str, Any] = {**stated_part(part), "registered": part.registered or None}
+    needs_image: Json = {**stated_part(part), "registered": part.registered or None}
     needs_image |= {"mask": part.mask, "mask_label": part.mask_label} if labels is None else {}
     if image is None and (
         lost := [name for name, value in needs_image.items() if value is not None]
@@ -186,7 +187,7 @@ def _with_labels(
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     own = table_of_segmentation(path)
-    texts: dict[str, Any] = {TABLE_TEXT: table_words(own)} if own.names else {}
+    texts: Json = {TABLE_TEXT: table_words(own)} if own.names else {}
     inputs = {
         name: each
         for name, each in loaded.table("inputs").items()

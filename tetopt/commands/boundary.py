@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from tetopt.model.file import MeshFile
 from tetopt.model.label_names import LABEL_FIELD, label_words, labels_named
 from tetopt.model.model import SPACES
 from tetopt.model.sets import FACE_NAMES, boundary_rows, face_sets
-from tetopt.system.arrays import Ints
+from tetopt.system.arrays import Ints, Json
 
 MOST_LISTED = 12  # interfaces in the table; the file of numbers has all
 
@@ -63,7 +63,7 @@ class SurfacePart:
 class WrittenSurface(NamedTuple):
     """Description of a surface that was written."""
 
-    numbers: dict[str, Any]  # as `tetopt surface --json` writes them
+    numbers: Json  # as `tetopt surface --json` writes them
     heads: tuple[str, ...]  # of a table
     rows: Sequence[tuple[str, ...]]
     lines: list[str]  # below it

@@ -6,7 +6,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -56,7 +56,7 @@ from tetopt.model.sets import (
     standard_names,
 )
 from tetopt.report.summary import model_summary, versions
-from tetopt.system.arrays import Bools, Ints
+from tetopt.system.arrays import Bools, Ints, Json
 
 
 class Converted(NamedTuple):
@@ -64,7 +64,7 @@ class Converted(NamedTuple):
 
     model: Model
     options: SolverOptions  # with their defaults
-    numbers: dict[str, Any]  # as `tetopt convert --json` writes them
+    numbers: Json  # as `tetopt convert --json` writes them
 
 
 def convert_file(
@@ -219,7 +219,7 @@ def _without_crumbs(mesh: Mesh, labels: Ints, is_kept: Bools) -> Bools:
     return is_kept
 
 
-def _texts_of(loaded: MeshFile, solver: SolverOptions, *, has_new_results: bool) -> dict[str, Any]:
+def _texts_of(loaded: MeshFile, solver: SolverOptions, *, has_new_results: bool) -> Json:
     """Return the texts of the mesh's file to keep; reactions, in RAS+ and mN, only if space and
     units are unchanged.
     """

@@ -40,6 +40,7 @@ from tetopt.measure.quality import Quality, quality
 from tetopt.model.file import MASK_TEXT, MeshFile, words_of_other_box
 from tetopt.model.label_names import LABEL_FIELD
 from tetopt.report.summary import size_summary
+from tetopt.system.arrays import Json
 
 
 class Judgement(NamedTuple):
@@ -48,13 +49,13 @@ class Judgement(NamedTuple):
     path: Path
     loaded: MeshFile
     shape: Quality
-    numbers: dict[str, Any]  # all numbers, as `tetopt quality --json` writes them
+    numbers: Json  # all numbers, as `tetopt quality --json` writes them
     is_checked: bool
     source: Source | None = None  # the image, mask and labels it was measured on
     fit: ImageFit | None = None
     violated: Mapping[str, str] = MappingProxyType({})  # requirements of the run
     # fit to mask, labels and contrasts; never modified
-    measured: dict[str, Any] = {}  # noqa: RUF012
+    measured: Json = {}  # noqa: RUF012
     is_compared: bool = True  # with the mask; the mesh's file does not contain the fractions of one
 
     @property

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from tetopt.model.loads import MOST_COMPRESSION_PERCENT, count_of_steps
 from tetopt.model.model import Model, locking_words
 from tetopt.model.sets import box_of, box_text
 from tetopt.report.summary import model_summary, versions
-from tetopt.system.arrays import Floats
+from tetopt.system.arrays import Floats, Json
 
 if TYPE_CHECKING:
     from tetopt.fem.conditioning import Conditioning
@@ -46,7 +46,7 @@ class SolvedModel(NamedTuple):
     options: ModelOptions  # with their defaults
     solutions: list[Solution]  # of each step
     extremes: Conditioning | None
-    numbers: dict[str, Any]  # all numbers, as `tetopt fem --json` writes them
+    numbers: Json  # all numbers, as `tetopt fem --json` writes them
 
 
 def solve_file(
@@ -225,7 +225,7 @@ def _advise(model: Model, solutions: list[Solution]) -> None:
         warning(large)
 
 
-def _numbers_of(solution: Solution) -> dict[str, Any]:
+def _numbers_of(solution: Solution) -> Json:
     """Return the numbers of a step for the JSON file."""
     from tetopt.fem.elasticity import cell_means
     from tetopt.fem.solution import von_mises
@@ -242,11 +242,9 @@ def _numbers_of(solution: Solution) -> dict[str, Any]:
     }
 
 
-def _numbers(
-    model: Model, solutions: list[Solution], extremes: Conditioning | None
-) -> dict[str, Any]:
+def _numbers(model: Model, solutions: list[Solution], extremes: Conditioning | None) -> Json:
     """Return all numbers for the JSON file; the strain energy is the first step's."""
-    numbers: dict[str, Any] = {
+    numbers: Json = {
         "n_nodes": len(model.mesh.points),
         "n_nodes_in_all": len(solutions[0].u),
         "n_cells": len(model.mesh.cells),

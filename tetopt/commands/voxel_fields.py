@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +21,7 @@ from tetopt.model.fields import half_turned_fields
 from tetopt.model.file import MeshFile, words_of_other_box
 from tetopt.model.on_image import At, field_on_image, warped_image
 from tetopt.report.summary import versions
-from tetopt.system.arrays import Bools
+from tetopt.system.arrays import Bools, Json
 
 
 def is_image_name(path: Path) -> bool:
@@ -39,7 +38,7 @@ def write_on_image(
     results: Path | None = None,
     space: str = "ras",
     is_registered: bool = False,
-) -> dict[str, Any]:
+) -> Json:
     """Write a field of a mesh's file on the voxels of an image or, with `options.warp`, that image
     moved by it.
 
@@ -79,7 +78,7 @@ def write_on_image(
         raise InputError(
             f"{mesh}: {overlap}; remove one cell of each pair, or mesh the image again"
         )
-    numbers: dict[str, Any] = {"mesh": mesh.name, "output": output.name, "field": name, "at": at}
+    numbers: Json = {"mesh": mesh.name, "output": output.name, "field": name, "at": at}
     if options.warp is None:
         turned = half_turned_fields({name: values})[name]
         has_axes = turned is not values  # of a vector or tensor in RAS+

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from functools import wraps
-from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar
+from typing import Literal, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -51,7 +51,7 @@ from tetopt.geometry.simplex import determinants, volume_gradients, volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.model.mappings import check_young
-from tetopt.system.arrays import Bools, Floats, Ints
+from tetopt.system.arrays import Bools, Floats, Ints, Json
 from tetopt.system.budget import check_memory
 
 Method = Literal["auto", "direct", "amg"]
@@ -670,7 +670,7 @@ def solve_in_steps(system: System, method: Method = "auto") -> tuple[Floats, int
         if is_direct(system, method):
             solution = factorize_matrix(system.K_ff)(system.load)
         else:
-            options: dict[str, Any] = {
+            options: Json = {
                 "rtol": RESIDUAL_FRACTION,
                 "maxiter": 1000,
                 "callback": count,

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import orient_cells
 from tetopt.interop.notebook import in_kernel
-from tetopt.system.arrays import Floats, Ints, plain_array
+from tetopt.system.arrays import Arrays, Floats, Ints, Json, plain_array
 from tetopt.system.extras import install_hint
 
 if TYPE_CHECKING:
@@ -302,13 +302,13 @@ def from_skfem(mesh: Any) -> Simplices:
 # --- to others
 
 
-def check_fields(what: str, fields: Fields | None, n_rows: int | None = None) -> dict[str, NDArray]:
+def check_fields(what: str, fields: Fields | None, n_rows: int | None = None) -> Arrays:
     """Return arrays of numbers by name; InputError unless each has `n_rows` rows, by default any
     number.
     """
     if not isinstance(fields, Mapping | None):
         raise InputError(f"{what}: expected a dict of arrays by name, got {type(fields).__name__}")
-    arrays: dict[str, NDArray] = {}
+    arrays: Arrays = {}
     for name, rows in (fields or {}).items():
         line = f"{what}: {name!a}: expected an array of numbers"
         line += "" if n_rows is None else f" with {n_rows} rows"
@@ -431,7 +431,7 @@ def show_grid(
     name: str | None,
     screenshot: str | Path | None,
     off_screen: bool | None,
-    look: dict[str, Any],
+    look: Json,
 ) -> Any:
     """Show a pyvista grid, coloured by the named field; see `tetopt.mesh.Mesh.plot`."""
     pyvista = library("pyvista", "plot")

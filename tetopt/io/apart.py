@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
+from tetopt.system.arrays import Json
 from tetopt.system.budget import address_bytes
 from tetopt.system.child import limit_self, signal_words, start_child
 from tetopt.system.interpreter import python_command, python_environment
@@ -104,7 +105,7 @@ def read_apart(
     return answer["value"]
 
 
-def _of_child(job: dict[str, Any], seconds: float) -> tuple[dict[str, Any] | None, int]:
+def _of_child(job: Json, seconds: float) -> tuple[Json | None, int]:
     """Return the answer of a child, None if it is incomplete, and its exit code; kill it after
     some seconds.
     """
@@ -130,7 +131,7 @@ def _of_child(job: dict[str, Any], seconds: float) -> tuple[dict[str, Any] | Non
 # The answer: one line of JSON, followed by the arrays that it has marks for, in order.
 
 
-def _sent(stream: IO[bytes], answer: dict[str, Any]) -> None:
+def _sent(stream: IO[bytes], answer: Json) -> None:
     arrays: list[NDArray] = []
 
     def marked(value: Any) -> Any:
@@ -147,11 +148,11 @@ def _sent(stream: IO[bytes], answer: dict[str, Any]) -> None:
     stream.flush()
 
 
-def _receive_answer(stream: IO[bytes]) -> dict[str, Any] | None:
+def _receive_answer(stream: IO[bytes]) -> Json | None:
     """Return the child's answer; None if it is incomplete."""
     line, pipe = stream.readline(), SimpleNamespace(read=stream.read)
 
-    def unmarked(table: dict[str, Any]) -> Any:
+    def unmarked(table: Json) -> Any:
         if table.get(ARRAY_MARK) is not True:
             return table
         return np.lib.format.read_array(pipe, allow_pickle=False)
@@ -167,7 +168,7 @@ def _receive_answer(stream: IO[bytes]) -> dict[str, Any] | None:
 # In the child
 
 
-def _answer(job: dict[str, Any]) -> dict[str, Any]:
+def _answer(job: Json) -> Json:
     """Read within the limits of the job; return the value, or why the file is refused."""
     module, _, name = job["read"].partition(":")
     try:

@@ -6,10 +6,10 @@ import json
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from tetopt.errors import InputError, warn
 from tetopt.interop.conversions import check_fields
@@ -29,7 +29,7 @@ from tetopt.model.loads import known_set
 from tetopt.model.materials import Materials
 from tetopt.model.model import Model, in_space, in_units, locking_words
 from tetopt.model.sets import MOST_LETTERS, SET_NAME, Sets, is_set
-from tetopt.system.arrays import Ints
+from tetopt.system.arrays import Arrays, Ints, Json
 
 
 class Format(NamedTuple):
@@ -217,9 +217,9 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
 def save_mesh(
     path: str | Path,
     mesh: Mesh,
-    cell_data: dict[str, NDArray] | None = None,
-    about: dict[str, Any] | None = None,
-    point_data: dict[str, NDArray] | None = None,
+    cell_data: Arrays | None = None,
+    about: Json | None = None,
+    point_data: Arrays | None = None,
     order: int = 1,
 ) -> None:
     """Write a mesh and its data in the format of the file's suffix, whole or not at all.

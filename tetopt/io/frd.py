@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.fem.solution import von_mises
@@ -24,7 +23,7 @@ from tetopt.io.apart import read_apart
 from tetopt.mesh import Mesh
 from tetopt.model.fields import half_turned_fields, scaled_fields
 from tetopt.model.model import SPACES, STRESS_UNITS, half_turn
-from tetopt.system.arrays import Floats, Ints
+from tetopt.system.arrays import Arrays, Floats, Ints
 from tetopt.system.budget import check_memory, memory_words
 from tetopt.system.extras import install_hint
 from tetopt.system.incoming import regular_file
@@ -78,7 +77,7 @@ class _Grid(NamedTuple):
     ids: Ints  # (N,)
     cells: list[Ints]  # by kind
     n_times: int
-    arrays: list[dict[str, NDArray]]  # for each requested time, by the file's names
+    arrays: list[Arrays]  # for each requested time, by the file's names
 
 
 class _Stage(NamedTuple):
@@ -282,7 +281,7 @@ def _stages(path: Path, whole: bytes) -> list[_Stage]:
     return [_Stage(*key, count) for key, count in sorted(stages.items())]
 
 
-def _results_of_step(path: Path, arrays: dict[str, NDArray], step: int) -> dict[str, Floats]:
+def _results_of_step(path: Path, arrays: Arrays, step: int) -> dict[str, Floats]:
     """Return the file's arrays of this step after checking them; InputError unless they are
     usable.
     """

@@ -61,7 +61,7 @@ from tetopt.model.fields import node_field
 from tetopt.model.file import MASK_TEXT
 from tetopt.model.model import Model, element_facets, elements
 from tetopt.model.sets import facet_triples
-from tetopt.system.arrays import Floats, Ints
+from tetopt.system.arrays import Arrays, Floats, Ints
 
 # gmsh's numbers for elements by dimension and order: line, triangle, tetrahedron of order 1, then
 # of order 2.
@@ -378,7 +378,7 @@ def _view(section: str, name: str, numbers: Ints, values: NDArray) -> str:
     )
 
 
-def _view_columns(fields: dict[str, NDArray]) -> dict[str, Floats]:
+def _view_columns(fields: Arrays) -> dict[str, Floats]:
     """Convert fields to views: numbers, vectors and tensors; others column by column."""
     names = names_apart(fields, lambda name: name.replace('"', "'"))  # gmsh cannot escape quotes
     return as_columns(

@@ -27,7 +27,7 @@ from tetopt.model.fields import half_turned_fields, is_stress, scaled_fields
 from tetopt.model.file import MeshFile, text_in
 from tetopt.model.model import ON_PREFIX, STRESS_UNITS, half_turn
 from tetopt.model.sets import SET_NAME, Sets, free_name, rows_of
-from tetopt.system.arrays import Ints
+from tetopt.system.arrays import Arrays, Ints
 from tetopt.system.incoming import regular_file
 
 MESH_SUFFIXES = (*VTK_SUFFIXES, ".msh", ".msh2")
@@ -137,8 +137,8 @@ def _middles(raw: Raw, kind: str) -> tuple[Ints, bool, tuple[str, ...]]:
 
 
 def _numbers(
-    raw: Raw, ndim: int, cell_data: dict[str, NDArray], point_data: dict[str, NDArray]
-) -> tuple[list[dict[str, NDArray]], tuple[str, ...]]:
+    raw: Raw, ndim: int, cell_data: Arrays, point_data: Arrays
+) -> tuple[list[Arrays], tuple[str, ...]]:
     """Return numeric cell data and point data in RAS+ and kPa, and notes on dropped data."""
     fields, notes = [], []
     for what, values_of in (("cell", cell_data), ("point", point_data)):
@@ -217,7 +217,7 @@ def _read_vtk(path: Path) -> Raw:
     return by_corners(raw)
 
 
-def _space(path: Path, field_data: dict[str, NDArray]) -> str:
+def _space(path: Path, field_data: Arrays) -> str:
     """Return "lps" if the file states this, as written by tetopt or 3D Slicer, else "ras"."""
     words = " ".join(text_in(field_data, name) or "" for name in ("space", "SPACE"))
     if path.suffix.lower() == ".vtk":

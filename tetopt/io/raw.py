@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.interop.conversions import CELL_DIMENSIONS, corner_kinds
-from tetopt.system.arrays import Floats, Ints
+from tetopt.system.arrays import Arrays, Floats, Ints
 
 
 class RawGrid(NamedTuple):
@@ -18,9 +18,9 @@ class RawGrid(NamedTuple):
     connectivity: Ints
     offsets: Ints  # (M + 1,), into the connectivity
     cell_types: NDArray[np.uint8]  # (M,)
-    point_data: dict[str, NDArray]
-    cell_data: dict[str, NDArray]
-    field_data: dict[str, NDArray]
+    point_data: Arrays
+    cell_data: Arrays
+    field_data: Arrays
     notes: tuple[str, ...] = ()  # one line for each dropped item
 
 
@@ -38,9 +38,9 @@ class Raw(NamedTuple):
 
     points: Floats  # (N, 3)
     cells: dict[str, Ints]
-    cell_data: dict[str, dict[str, NDArray]]  # by name, then type
-    point_data: dict[str, NDArray]  # by name, one row per point
-    field_data: dict[str, NDArray]
+    cell_data: dict[str, Arrays]  # by name, then type
+    point_data: Arrays  # by name, one row per point
+    field_data: Arrays
     groups: list[Group]
     space: str
     middles: dict[str, Ints] = {}  # noqa: RUF012 - never changed; see `by_corners`
@@ -56,7 +56,7 @@ def by_corners(raw: Raw) -> Raw:
     kinds = corner_kinds(raw.cells)
     n_corners = {corner: CELL_DIMENSIONS[corner] + 1 for corner in kinds.values()}
 
-    def renamed(by_kind: dict[str, NDArray]) -> dict[str, NDArray]:
+    def renamed(by_kind: Arrays) -> Arrays:
         return {kinds.get(kind, kind): values for kind, values in by_kind.items()}
 
     cells = {kind: nodes[:, : n_corners.get(kind)] for kind, nodes in renamed(raw.cells).items()}

@@ -36,7 +36,7 @@ from tetopt.io.volumes import (
     volume_index,
 )
 from tetopt.model.label_names import LabelTable
-from tetopt.system.arrays import Floats, Ints
+from tetopt.system.arrays import Floats, Ints, Json
 from tetopt.system.extras import install_hint
 from tetopt.system.incoming import irregular
 
@@ -870,7 +870,7 @@ def _planes(frames: list[Frame]) -> Iterator[NDArray]:
     if low := _low_bits(file):  # pydicom takes the highest bit to be that of the number of bits
         file.tags.BitsStored += low
     is_all = indices == list(range(file.n_frames))  # read in one go
-    options: dict[str, Any] = {"raw": True, "allow_excess_frames": False}
+    options: Json = {"raw": True, "allow_excess_frames": False}
     count = 0
     with _errors_of(file.name):
         for plane in iter_pixels(file.tags, indices=None if is_all else indices, **options):

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from tetopt.io.apart import read_apart
 from tetopt.io.gmsh import OwnComments, own_comments
 from tetopt.io.raw import Group, Raw, by_corners
 from tetopt.model.label_names import LABEL_FIELD, TABLE_TEXT, LabelTable, table_words
-from tetopt.system.arrays import Ints
+from tetopt.system.arrays import Arrays, Ints, Json
 from tetopt.system.budget import check_memory, memory_words
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def read_msh(path: Path) -> Raw:
     return Raw(**fields, groups=groups)
 
 
-def _fields_of(path: str) -> dict[str, Any]:
+def _fields_of(path: str) -> Json:
     """Return the fields of a `Raw`."""
     import meshio
 
@@ -178,7 +178,7 @@ def _members(raw: Raw, kind: str, entities_of: dict[str, list[int]]) -> dict[str
 
 def _groups(
     cells: dict[str, Ints],
-    cell_data: dict[str, dict[str, NDArray]],
+    cell_data: dict[str, Arrays],
     names: dict[tuple[int, int], str],
     groups_of: dict[tuple[int, int], list[int]] | None,
 ) -> list[Group]:

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.io.apart import read_apart
 from tetopt.io.raw import RawGrid
+from tetopt.system.arrays import Arrays, Json
 
 if TYPE_CHECKING:
     from vtkmodules.vtkCommonDataModel import vtkUnstructuredGrid
@@ -32,7 +32,7 @@ def read_vtk(path: Path) -> RawGrid:
     return check_grid(*read_apart(arrays_of, path, library="VTK"))
 
 
-def check_grid(kind: str, errors: str, arrays: dict[str, Any]) -> RawGrid:
+def check_grid(kind: str, errors: str, arrays: Json) -> RawGrid:
     """Convert the result of `arrays_of` to a grid after checking that its arrays are consistent.
 
     Raises
@@ -57,7 +57,7 @@ def check_grid(kind: str, errors: str, arrays: dict[str, Any]) -> RawGrid:
 # In the child
 
 
-def arrays_of(path: str) -> tuple[str, str, dict[str, Any]]:
+def arrays_of(path: str) -> tuple[str, str, Json]:
     """Return the type of data set, VTK's first error, and the arrays of a `RawGrid`."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkCommonCore import (
@@ -97,7 +97,7 @@ def arrays_of(path: str) -> tuple[str, str, dict[str, Any]]:
     return kind, "", plain_arrays(grid) | {"cell_types": vtk_to_numpy(types).astype(np.uint8)}
 
 
-def plain_arrays(grid: vtkUnstructuredGrid) -> dict[str, Any]:
+def plain_arrays(grid: vtkUnstructuredGrid) -> Json:
     """Return the arrays of a `RawGrid` by name, except for cell types."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
@@ -126,7 +126,7 @@ def _first_error(output: str | bytes | None) -> str:
     )
 
 
-def _data_of(data: Any) -> dict[str, NDArray]:
+def _data_of(data: Any) -> Arrays:
     """Return arrays by name."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkCommonCore import (

@@ -20,7 +20,6 @@ from itertools import count
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.topology import facets
@@ -37,7 +36,7 @@ from tetopt.model.sets import (
     free_name,
     label_set_names,
 )
-from tetopt.system.arrays import Ints
+from tetopt.system.arrays import Arrays, Ints
 
 UNNAMED_GROUP = "unnamed"  # the group of cells in no other group
 LEAST_ROOM = 1000  # numbers reserved for labels
@@ -377,9 +376,7 @@ def without_data(model: Model) -> list[str]:
     ]
 
 
-def as_columns(
-    fields: dict[str, NDArray], shapes: Container[tuple[int, ...]] = ()
-) -> dict[str, NDArray]:
+def as_columns(fields: Arrays, shapes: Container[tuple[int, ...]] = ()) -> Arrays:
     """Split cell or point data into scalars by name: columns are numbered NAME_0, NAME_1, ...
 
     Rows with one of the `shapes` are kept whole. A column with the name of another field is
@@ -388,7 +385,7 @@ def as_columns(
     whole = {
         name for name, values in fields.items() if values.ndim == 1 or values.shape[1:] in shapes
     }
-    columns: dict[str, NDArray] = {}
+    columns: Arrays = {}
     for name, values in fields.items():
         if name in whole:
             columns[name] = values

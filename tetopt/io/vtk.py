@@ -36,6 +36,7 @@ from tetopt.model.file import text_in
 from tetopt.model.loads import load_words
 from tetopt.model.model import STRESS_UNITS, Model, elements, grid_fields
 from tetopt.model.sets import SET_NAME, Box, Sets, is_set
+from tetopt.system.arrays import Arrays
 from tetopt.system.incoming import json_of
 
 if TYPE_CHECKING:
@@ -162,7 +163,7 @@ def add_sets(grid: vtkUnstructuredGrid, mesh: Mesh, sets: Sets) -> None:
         add_texts(grid, {CHECKSUM_NAME: _checksum(mesh)})
 
 
-def sets_in(field_data: dict[str, NDArray], mesh: Mesh) -> tuple[Sets, tuple[str, ...]]:
+def sets_in(field_data: Arrays, mesh: Mesh) -> tuple[Sets, tuple[str, ...]]:
     """Return the sets in a file's field data, if they were written for these cells, and notes on
     dropped ones.
     """
@@ -192,7 +193,7 @@ def _checksum(mesh: Mesh) -> str:
     return hashlib.sha256(np.ascontiguousarray(mesh.cells, dtype="<i8").tobytes()).hexdigest()
 
 
-def box_in(field_data: dict[str, NDArray], ndim: int) -> Box | None:
+def box_in(field_data: Arrays, ndim: int) -> Box | None:
     """Return the box of the meshed image from a file's field data, if present and valid."""
     try:
         box = json_of(text_in(field_data, "box") or "")

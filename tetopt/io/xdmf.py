@@ -110,7 +110,7 @@ from tetopt.model.fields import NODE_MODULI, node_field
 from tetopt.model.loads import load_words
 from tetopt.model.model import Model, element_facets, elements, header_lines
 from tetopt.model.sets import Sets
-from tetopt.system.arrays import Floats, Ints
+from tetopt.system.arrays import Arrays, Floats, Ints
 
 # By dimension and order, with VTK's order of nodes; lines must state their number of nodes.
 TOPOLOGY_TYPES = {
@@ -205,7 +205,7 @@ def _mesh_grid(model: Model, others: str) -> str:
     )
 
 
-def _columns(fields: dict[str, NDArray]) -> dict[str, NDArray]:
+def _columns(fields: Arrays) -> Arrays:
     """Convert fields to forms that VTK recognises: scalars and vectors, no matrices."""
     return as_columns(fields, shapes=((3,),))
 

@@ -25,7 +25,7 @@ from tetopt.io.apart import read_apart
 from tetopt.io.text import plain
 from tetopt.io.units import mm_of_axes, notes_of_size
 from tetopt.io.volumes import Reader, Request, check_room, one_line, volume_index
-from tetopt.system.arrays import Floats
+from tetopt.system.arrays import Floats, Json
 from tetopt.system.budget import check_memory
 from tetopt.system.extras import install_hint
 from tetopt.system.files import folder_written_whole
@@ -322,7 +322,7 @@ def _node(path: Path, name: str = "") -> Any:
         ) from error
 
 
-def _levels(path: Path, scales: dict[str, Any], notes: list[str]) -> list[ZarrLevel]:
+def _levels(path: Path, scales: Json, notes: list[str]) -> list[ZarrLevel]:
     """Return the arrays of a multiscale; errors of `STRUCTURE_ERRORS` if it has another
     structure than NGFF's.
     """
@@ -341,7 +341,7 @@ def _levels(path: Path, scales: dict[str, Any], notes: list[str]) -> list[ZarrLe
     ]
 
 
-def _level(path: Path, dataset: dict[str, Any], after: Sequence[dict], axes: _Axes) -> ZarrLevel:
+def _level(path: Path, dataset: Json, after: Sequence[dict], axes: _Axes) -> ZarrLevel:
     """Return one dataset of a multiscale, with the transformations `after` its own."""
     array = _node(path, dataset["path"])
     _check_array(array)
@@ -355,7 +355,7 @@ def _level(path: Path, dataset: dict[str, Any], after: Sequence[dict], axes: _Ax
     )
 
 
-def _axes_of(axes: list[dict[str, Any]]) -> _Axes:
+def _axes_of(axes: list[Json]) -> _Axes:
     """Return the axes of a multiscale."""
     names, notes = tuple(plain(str(axis.get("name"))) for axis in axes), list[str]()
     kinds = [
@@ -386,7 +386,7 @@ def _axes_of(axes: list[dict[str, Any]]) -> _Axes:
     return _Axes(names, space, list(rows), np.array(signs) * (1.0 if mm is None else mm), notes, mm)
 
 
-def _scale_and_shift(transforms: list[dict[str, Any]], n: int) -> tuple[Floats, Floats]:
+def _scale_and_shift(transforms: list[Json], n: int) -> tuple[Floats, Floats]:
     """Combine successive scales and translations of n axes."""
     scale, shift, has_scale = np.ones(n), np.zeros(n), False
     for each in transforms:

@@ -24,7 +24,7 @@ from tetopt.model.label_names import count_of_labels, label_words
 from tetopt.start.label_sizes import SizesByLabel
 from tetopt.start.octree import is_for_walls
 from tetopt.start.sizes import LONG_EDGE, EdgeRatios, Sizes
-from tetopt.system.arrays import Floats
+from tetopt.system.arrays import Floats, Json
 
 # Of the cells, over the voxels': other volumes are told beside the verdict.
 NEAR_VOLUME, NEAR_MASK = (0.85, 1.15), (0.95, 1.05)
@@ -250,7 +250,7 @@ def failures(failed: Mapping[str, str], known: Iterable[Problem]) -> Iterator[Pr
 
 
 def unmet_requirements(
-    requirements: Mapping[str, str], measured: dict[str, Any], word: str = "mask"
+    requirements: Mapping[str, str], measured: Json, word: str = "mask"
 ) -> Iterator[Problem]:
     """Yield violated `requirements` (`tetopt.measure.judge`), and lesser deviations from mask and
     labels. `word` is the name of the meshed region in messages.
@@ -263,7 +263,7 @@ def unmet_requirements(
     yield from find_oddity("dropped", n_dropped, word=word, volumes=_dropped_words(measured))
 
 
-def _dropped_words(measured: dict[str, Any]) -> str:
+def _dropped_words(measured: Json) -> str:
     """Describe the volume of dropped components, in voxels, by label if there are labels."""
     mask, volumes = measured.get("mask"), measured.get("dropped_volumes")
     if mask is None or not volumes:
@@ -275,7 +275,7 @@ def _dropped_words(measured: dict[str, Any]) -> str:
     return f", as large as {sum(voxels.values()):.3g} voxels{of_labels}"
 
 
-def _of_labels(measured: dict[str, Any], word: str) -> Iterator[Problem]:
+def _of_labels(measured: Json, word: str) -> Iterator[Problem]:
     """Yield small labels without a cell, and labels of poor volume or overlap, beyond those that
     violate the requirement.
     """
@@ -406,7 +406,7 @@ def of_result(
     mode: Mode,
     n_nodes: int,
     nodes: int | None,
-    measured: dict[str, Any],
+    measured: Json,
     k_D: float | None = None,
     has_sizes: bool = False,
 ) -> Iterator[Problem]:
@@ -440,7 +440,7 @@ def _of_nodes(
     mode: Mode,
     n_nodes: int,
     nodes: int,
-    measured: dict[str, Any],
+    measured: Json,
     k_D: float | None,
     has_sizes: bool,
 ) -> Iterator[Problem]:

@@ -20,6 +20,7 @@ from tetopt.errors import InputError
 from tetopt.job.options import JobOptions, SizeOptions, kinds_of, near_hint, option_of
 from tetopt.job.plan import plan_job
 from tetopt.model.mappings import MAPPED_OPTIONS
+from tetopt.system.arrays import Json
 from tetopt.system.incoming import json_of
 
 Record = TypeVar("Record")
@@ -74,7 +75,7 @@ class Job(JobOptions):
             object.__setattr__(self, name, _of_field(Job, name, getattr(self, name)))
         plan_job(self, reads_files=False)
 
-    def given(self) -> dict[str, Any]:
+    def given(self) -> Json:
         """Return options that differ from the default, by name; paths as strings.
 
         Returns
@@ -198,7 +199,7 @@ if Job.__doc__:  # Python removes its indentation from 3.13 on
     Job.__doc__ = inspect.cleandoc(Job.__doc__).replace("PARAMETERS", _parameters())
 
 
-def in_kinds(record: Callable[..., Record], values: dict[str, Any]) -> Record:
+def in_kinds(record: Callable[..., Record], values: Json) -> Record:
     """Create a record of options, converting values to the fields' types; raise InputError for
     an invalid one.
     """

@@ -31,6 +31,7 @@ from tetopt.io.formats import FORMATS
 from tetopt.model.averages import DEFAULT_AVERAGE
 from tetopt.model.materials import DEFAULT_NU
 from tetopt.start.lattice import Kind
+from tetopt.system.arrays import Json
 
 Lattice = Literal[Kind, "octree"]
 Method = Literal["fast", "paper"]
@@ -601,13 +602,13 @@ def near_hint(name: str, names: Iterable[str]) -> str:
     return f"; did you mean {near[0]}?" if near else ""
 
 
-def kinds_of(record: Any) -> dict[str, Any]:
+def kinds_of(record: Any) -> Json:
     """Return the fields of a record class with their annotations."""
     return _known_kinds(record)
 
 
 @cache
-def _known_kinds(record: Any) -> dict[str, Any]:
+def _known_kinds(record: Any) -> Json:
     kinds = get_type_hints(record, include_extras=True)
     return {field.name: kinds[field.name] for field in fields(record)}
 
@@ -629,7 +630,7 @@ def option_name(name: str, kind: Any) -> str:
     return option_of(kind).name or name.replace("_", "-").lower()
 
 
-def given_options(record: Any) -> dict[str, Any]:
+def given_options(record: Any) -> Json:
     """Return a record's values that differ from the default, by command-line names; arguments by
     their fields' names.
 

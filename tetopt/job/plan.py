@@ -36,6 +36,7 @@ from tetopt.start.lattice import KINDS, MAX_NODES
 from tetopt.start.memory import BOUND_MARGIN, CHANNEL_BYTES, meshing_bytes
 from tetopt.start.octree import nodes_of_sizes
 from tetopt.start.sizes import Sizes
+from tetopt.system.arrays import Json
 from tetopt.system.budget import check_memory
 from tetopt.system.files import check_output, check_outputs, results_folder
 
@@ -91,7 +92,7 @@ class Plan(NamedTuple):
         return any(getattr(self.bare, name) is not None for name in SIZE_NAMES)
 
     @property
-    def engine_options(self) -> dict[str, Any]:
+    def engine_options(self) -> Json:
         """Options of `mesh_image` except those of the initial mesh, in the order of run.json."""
         job = self.job
         options = {"k_D": job.k_D, "iterations": job.iterations, "boundary": job.boundary}
@@ -133,7 +134,7 @@ def check_volume(plan: Plan) -> None:
     )
 
 
-def stated_options(plan: Plan, ndim: int) -> dict[str, Any]:
+def stated_options(plan: Plan, ndim: int) -> Json:
     """Return the options as the mesh's file and run.json state them; files by their names."""
     job = plan.job
     return {
@@ -446,5 +447,5 @@ def _limits(job: JobOptions, table: LabelTable = NO_TABLE) -> Sizes | None:
         "cells_across": job.cells_across,
         "by_label": by_label,
     }
-    limits: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
+    limits: Json = {name: value for name, value in values.items() if value is not None}
     return Sizes(**limits) if limits else None

@@ -22,12 +22,13 @@ from tetopt.job.options import (
     option_name,
 )
 from tetopt.model.mappings import FILES_IN_TEXTS, named_file
+from tetopt.system.arrays import Json
 
 # Options that do not affect the outputs: names of outputs, and threads.
 OPTIONS_IGNORED = ("threads", *(each.name for each in fields(OutputOptions)))
 
 
-def job_request(job: JobOptions) -> dict[str, Any]:
+def job_request(job: JobOptions) -> Json:
     """Return all that determines the outputs of a run: options, the files' names and checksums, the
     version.
 
@@ -50,7 +51,7 @@ def job_request(job: JobOptions) -> dict[str, Any]:
     options = {name: value for name, value in given_options(job).items() if name not in left_out}
     files = {name: each for name in list(options) if (each := _files(name, options[name]))}
     stated = {name: value for name, value in options.items() if name not in files}
-    whole: dict[str, Any] = {
+    whole: Json = {
         "options": {**stated, "format": job.output.suffix.lower()},
         "files": {
             name: [[path.name, checksum(path)] for path in paths] for name, paths in files.items()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from tetopt.engine.loop import MeshingResult
 from tetopt.errors import error_words
@@ -35,6 +35,7 @@ from tetopt.measure.quality import quality
 from tetopt.mesh import Mesh
 from tetopt.model.model import Model
 from tetopt.report.summary import model_summary
+from tetopt.system.arrays import Json
 from tetopt.system.files import outputs_of_run, save_json
 
 
@@ -74,12 +75,12 @@ class Result(NamedTuple):
 
     mesh: Mesh
     model: Model
-    numbers: dict[str, Any]
+    numbers: Json
     violated: dict[str, str]
     task: Task
     meshed: Meshed
     shapes: Shapes
-    measured: dict[str, Any]
+    measured: Json
 
     @property
     def optimized(self) -> MeshingResult:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import cast, get_args
 
 import numpy as np
 
@@ -44,7 +44,7 @@ from tetopt.model.sets import (
     parse_set,
     standard_names,
 )
-from tetopt.system.arrays import Ints
+from tetopt.system.arrays import Ints, Json
 from tetopt.system.files import kept_places
 
 MEAN_FIELD = r"mean(_\d+)?"  # of the image, and of further contrasts
@@ -187,7 +187,7 @@ def solver_model(
     loaded: MeshFile,
     image: Image | None,
     options: ModelOptions,
-    about: dict[str, Any],
+    about: Json,
     box: Box | None,
 ) -> Model:
     """Build the model of a mesh, with its data, sets and texts, with the options."""
@@ -257,7 +257,7 @@ def convert_model(
     loaded: MeshFile,
     image: Image | None,
     options: ModelOptions,
-    about: dict[str, Any],
+    about: Json,
     box: Box | None,
     has_units: bool = True,
 ) -> Model:

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.contents.align import (
     KEEP_PIECES,
@@ -66,7 +65,7 @@ from tetopt.model.label_names import (
 )
 from tetopt.model.sets import box_of, box_text
 from tetopt.model.tissues import is_preset, merge_labels, numbers_by_name, renumber_labels
-from tetopt.system.arrays import Ints
+from tetopt.system.arrays import Arrays, Ints, Json
 
 
 class Source(NamedTuple):
@@ -78,7 +77,7 @@ class Source(NamedTuple):
     contrasts: list[Image]  # on the first one's voxels
     labels: Image | None  # on the same voxels
     mask: Image | None
-    about: dict[str, Any]  # names, checksums, weights and the image's box, for the mesh's file
+    about: Json  # names, checksums, weights and the image's box, for the mesh's file
     table: LabelTable  # of the labels
 
     @property
@@ -115,7 +114,7 @@ class Source(NamedTuple):
         spread = self.content.spread
         return spread.low == spread.high
 
-    def fields(self, mesh: Mesh, labels: Ints | None = None) -> dict[str, NDArray]:
+    def fields(self, mesh: Mesh, labels: Ints | None = None) -> Arrays:
         """Return the fields of the mesh's file: those of `cell_fields`, means of further contrasts,
         and the label.
 
@@ -139,7 +138,7 @@ class Source(NamedTuple):
         words = {TABLE_TEXT: table_words(table)} if table.names or table.colours else {}
         return self._replace(table=table, about=self.about | words)
 
-    def by_contrast(self, fields: dict[str, NDArray]) -> list[dict[str, Any]]:
+    def by_contrast(self, fields: Arrays) -> list[Json]:
         """Return, for each contrast, the fraction of its variance that is left within cells with
         these fields.
         """
@@ -252,8 +251,8 @@ def _region(
 
 
 def _inputs(
-    options: SourceOptions, weights: list[float], level: float | None, extras: dict[str, Any]
-) -> dict[str, Any]:
+    options: SourceOptions, weights: list[float], level: float | None, extras: Json
+) -> Json:
     """Return what a mesh's file states of its inputs; of the optional ones, those not None."""
     tissues = [file_and_volume(path)[0] for path in tissue_files(options.tissues)]
     others = [path for path in (options.mask, options.labels, *tissues) if path is not None]

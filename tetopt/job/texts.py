@@ -11,6 +11,7 @@ from typing import Any, Union, get_args, get_origin
 from tetopt.errors import InputError
 from tetopt.job.job import of_option
 from tetopt.job.options import RunOptions, kinds_of, near_hint, option_name
+from tetopt.system.arrays import Json
 
 SWITCH_WORDS = {
     **dict.fromkeys(("1", "true", "yes"), True),
@@ -18,7 +19,7 @@ SWITCH_WORDS = {
 }
 
 
-def option_words(options: dict[str, Any]) -> list[str]:
+def option_words(options: Json) -> list[str]:
     """Convert options of `given_options`, without arguments, to the words of a command."""
     words = []
     for name, value in options.items():
@@ -43,7 +44,7 @@ def with_options(options: RunOptions, texts: dict[str, str]) -> RunOptions:
         An unknown option, or an invalid value.
     """
     kinds = {option_name(name, kind): (name, kind) for name, kind in kinds_of(RunOptions).items()}
-    values: dict[str, Any] = {}
+    values: Json = {}
     wrong = []
     for name, text in texts.items():
         if name not in kinds:

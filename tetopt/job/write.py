@@ -9,7 +9,6 @@ from itertools import islice
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.contents.content import continue_image
 from tetopt.engine.label_state import crowded_nodes
@@ -44,6 +43,7 @@ from tetopt.model.model import Model
 from tetopt.model.sets import Sets, box_of, label_set_names, surviving_sets
 from tetopt.report.summary import run_summary
 from tetopt.start.sizes import edge_ratios
+from tetopt.system.arrays import Arrays, Json
 from tetopt.system.budget import peak_bytes, return_freed
 from tetopt.system.files import kept_places, save_bytes
 
@@ -52,8 +52,8 @@ def model_with(
     task: Task,
     mesh: Mesh,
     solver: SolverOptions,
-    about: dict[str, Any],
-    fields: dict[str, NDArray] | None = None,
+    about: Json,
+    fields: Arrays | None = None,
 ) -> Model:
     """Build the model of a mesh with the options; `fields` of its cells are computed if not
     given.
@@ -91,9 +91,7 @@ def _warn_of_losses(started: MeshFile, own: Sets, has_labels: bool) -> None:
         warn(f"{words}; pass `young` and `loads`", Note)
 
 
-def save_outcome(
-    task: Task, outcome: Meshed, failed: dict[str, str]
-) -> tuple[Model, dict[str, Any]]:
+def save_outcome(task: Task, outcome: Meshed, failed: dict[str, str]) -> tuple[Model, Json]:
     """Write the mesh, or save it elsewhere; return the model, and the files' statements about the
     run.
 
@@ -132,9 +130,7 @@ def save_outcome(
     return model, about
 
 
-def _measured_fields(
-    source: Source, result: MeshingResult, failed: dict[str, str]
-) -> dict[str, NDArray]:
+def _measured_fields(source: Source, result: MeshingResult, failed: dict[str, str]) -> Arrays:
     """Return the fields of the result's cells; only shapes and labels if the image's cannot be
     computed.
     """
@@ -147,9 +143,7 @@ def _measured_fields(
     )
 
 
-def measures_of(
-    task: Task, result: MeshingResult, model: Model, failed: dict[str, str]
-) -> dict[str, Any]:
+def measures_of(task: Task, result: MeshingResult, model: Model, failed: dict[str, str]) -> Json:
     """Measure the fit to mask, labels, contrasts and sizes."""
     return_freed()  # by writing the mesh
     source = task.source
@@ -176,8 +170,8 @@ def _table_of(source: Source) -> LabelTable | None:
 
 
 def numbers_of(
-    task: Task, outcome: Meshed, shapes: Shapes, model: Model, about: dict[str, Any], seconds: float
-) -> dict[str, Any]:
+    task: Task, outcome: Meshed, shapes: Shapes, model: Model, about: Json, seconds: float
+) -> Json:
     """Return every number of a run except measurements: the begin of run.json."""
     source = task.source
     table = _table_of(source)

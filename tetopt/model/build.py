@@ -6,7 +6,6 @@ from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.contents.content import Content, continue_image
 from tetopt.contents.domain import mask_text
@@ -68,7 +67,7 @@ from tetopt.model.materials import (
 )
 from tetopt.model.model import Model
 from tetopt.model.sets import Box, Sets, box_of, box_text, standard_sets, with_requested
-from tetopt.system.arrays import Floats, Ints, plain_array
+from tetopt.system.arrays import Arrays, Floats, Ints, Json, plain_array
 
 
 def build_model(
@@ -84,10 +83,10 @@ def build_model(
     bins: int | None = None,
     spacing: Spacing = "equal",
     order: int | None = None,
-    cell_data: dict[str, NDArray] | None = None,
+    cell_data: Arrays | None = None,
     known_sets: Sets | None = None,
     box: Box | None = None,
-    about: dict[str, Any] | None = None,
+    about: Json | None = None,
 ) -> Model:
     """Build the model of a mesh for a solver, for `tetopt.save_model` and `Model.to_skfem`.
 
@@ -240,7 +239,7 @@ def model_of_file(
     loaded: MeshFile,
     image: Image | None,
     choices: Choices,
-    about: dict[str, Any],
+    about: Json,
     box: Box | None,
     known_sets: Sets | None = None,
 ) -> Model:
@@ -272,8 +271,8 @@ def model_of_file(
 def _model(
     cells: _ModelCells,
     choices: Choices,
-    cell_data: dict[str, NDArray],
-    about: dict[str, Any],
+    cell_data: Arrays,
+    about: Json,
     known_sets: Sets,
 ) -> Model:
     """Build a model whose sets are those known and the chosen ones."""
@@ -313,8 +312,8 @@ def _of_result(
     result: MeshingResult,
     image: Image | Content | None,
     order: int | None,
-    cell_data: dict[str, NDArray] | None,
-) -> tuple[Mesh, Content, int | None, dict[str, NDArray]]:
+    cell_data: Arrays | None,
+) -> tuple[Mesh, Content, int | None, Arrays]:
     """Return a result's mesh and content, and its order and data of cells, unless given."""
     mesh, content = result.mesh, result.content
     if image is not None or content is None:
@@ -330,8 +329,8 @@ def _of_result(
 
 
 def _voxels(
-    image: Image | Content | None, mesh: Mesh | MeshFile, about: dict[str, Any]
-) -> tuple[Image | None, Image | None, dict[str, Any]]:
+    image: Image | Content | None, mesh: Mesh | MeshFile, about: Json
+) -> tuple[Image | None, Image | None, Json]:
     """Return the image with the voxels that count, the whole image, and the file's strings with
     one on the mask.
     """
@@ -358,13 +357,13 @@ def _voxels(
     return (whole if whole is None else continue_image(whole, within)), whole, about
 
 
-def _table_of(about: dict[str, Any]) -> LabelTable:
+def _table_of(about: Json) -> LabelTable:
     """Return the label table among a model's texts."""
     table = about.get(TABLE_TEXT)
     return table if isinstance(table, LabelTable) else table_of_words(table)
 
 
-def _with_table_in_words(about: dict[str, Any], labels: Ints | None) -> dict[str, Any]:
+def _with_table_in_words(about: Json, labels: Ints | None) -> Json:
     """Return the texts with a label table in JSON's types, in which all labels of cells have a
     colour.
     """
@@ -422,9 +421,7 @@ class _ModelCells(NamedTuple):
     names: dict[int, str]  # of labels
 
 
-def _cells_of(
-    mesh: Mesh, image: Image | None, cell_data: dict[str, NDArray], about: dict[str, Any]
-) -> _ModelCells:
+def _cells_of(mesh: Mesh, image: Image | None, cell_data: Arrays, about: Json) -> _ModelCells:
     """Return a mesh's cells with the means, labels and names of labels in their data."""
     mean = cell_data.get("mean")
     mean = mean if mean is not None and mean.ndim == 1 else None

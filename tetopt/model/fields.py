@@ -15,6 +15,7 @@ from tetopt.geometry.simplex import dihedral_angles, rho
 from tetopt.image import Image
 from tetopt.measure.judge import warn_of_other_mask
 from tetopt.mesh import Mesh
+from tetopt.system.arrays import Arrays
 
 # Fields that depend on the world's axes or on the unit of stress, by name; a suffix such as _step2
 # may follow.
@@ -35,7 +36,7 @@ STRESS_FIELDS = (
 HALF_TURN = np.array([-1.0, -1.0, 1.0])  # about z, from RAS+ to LPS+ or back
 
 
-def cell_fields(mesh: Mesh, image: Image | Content | None = None) -> dict[str, NDArray]:
+def cell_fields(mesh: Mesh, image: Image | Content | None = None) -> Arrays:
     """Return the standard fields of each cell, as written to mesh files.
 
     Parameters
@@ -72,7 +73,7 @@ def cell_fields(mesh: Mesh, image: Image | Content | None = None) -> dict[str, N
     ['max', 'mean', 'min', 'min_dihedral', 'n_voxels', 'rho', 'variance', 'volume']
     >>> tetopt.save_mesh("ball.vtu", mesh, fields)
     """
-    fields: dict[str, NDArray] = {}
+    fields: Arrays = {}
     if isinstance(image, Content):
         warn_of_other_mask(mesh, image.own_mask)
     if image is not None:
@@ -116,7 +117,7 @@ def node_field(values: NDArray, mesh: Mesh, order: int) -> NDArray:
     return filled
 
 
-def half_turned_fields(fields: dict[str, NDArray]) -> dict[str, NDArray]:
+def half_turned_fields(fields: Arrays) -> Arrays:
     """Transform 3-D vectors and tensors (row by row) among named fields from RAS+ to LPS+ or back.
 
     Fields with such a name but another shape come from other programs and are not changed.
@@ -141,9 +142,7 @@ def is_stress(name: str) -> bool:
     return _base_name(name) in STRESS_FIELDS
 
 
-def scaled_fields(
-    fields: dict[str, NDArray], stress: float, length: float, ndim: int
-) -> dict[str, NDArray]:
+def scaled_fields(fields: Arrays, stress: float, length: float, ndim: int) -> Arrays:
     """Convert moduli, stresses, displacements and volumes among named fields to other units,
     given as the number of new units per present unit.
     """

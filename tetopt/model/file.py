@@ -35,7 +35,7 @@ from tetopt.model.sets import (
     standard_names,
     standard_sets,
 )
-from tetopt.system.arrays import Bools, Floats, Ints
+from tetopt.system.arrays import Arrays, Bools, Floats, Ints, Json
 from tetopt.system.incoming import json_of
 
 # cell data in tetopt's files
@@ -88,8 +88,8 @@ class MeshFile(NamedTuple):
     """
 
     mesh: Mesh
-    cell_data: dict[str, NDArray]
-    field_data: dict[str, NDArray]
+    cell_data: Arrays
+    field_data: Arrays
     n_turned: int
     n_left: int = 0
     sets: Sets = Sets({}, {})
@@ -97,7 +97,7 @@ class MeshFile(NamedTuple):
     space: str = "ras"
     notes: tuple[str, ...] = ()
     order: int = 1
-    point_data: dict[str, NDArray] = {}  # noqa: RUF012 - never changed
+    point_data: Arrays = {}  # noqa: RUF012 - never changed
 
     def text(self, name: str) -> str | None:
         """Return a string from the field data, if present.
@@ -122,7 +122,7 @@ class MeshFile(NamedTuple):
         """
         return text_in(self.field_data, name)
 
-    def table(self, name: str) -> dict[str, Any]:
+    def table(self, name: str) -> Json:
         """Return the table in a string of the field data that is JSON.
 
         Parameters
@@ -176,13 +176,13 @@ class MeshFile(NamedTuple):
         return table_in(self.text(TABLE_TEXT))
 
 
-def text_in(field_data: dict[str, NDArray], name: str) -> str | None:
+def text_in(field_data: Arrays, name: str) -> str | None:
     """Return a text from a file's field data, None if it is missing."""
     values = field_data.get(name, np.empty(0))
     return str(values.ravel()[0]) if values.dtype.kind == "U" and values.size else None
 
 
-def texts_of(loaded: MeshFile, *, is_other: bool = False) -> dict[str, Any]:
+def texts_of(loaded: MeshFile, *, is_other: bool = False) -> Json:
     """Return the texts of a mesh's file to keep in another file; with another image, only that
     on the mesh's mask.
     """

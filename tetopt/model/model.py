@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import of_order, quadratic_facet_nodes
@@ -25,7 +24,7 @@ from tetopt.model.loads import FACET_FORCES, SHOWN_LOAD_DIGITS, Load, facet_forc
 from tetopt.model.materials import Materials
 from tetopt.model.sets import Sets, facet_triples
 from tetopt.model.skfem import skfem_mesh
-from tetopt.system.arrays import Floats, Ints
+from tetopt.system.arrays import Arrays, Floats, Ints, Json
 
 if TYPE_CHECKING:
     import meshio
@@ -110,7 +109,7 @@ class Model(NamedTuple):
     """
 
     mesh: Mesh
-    cell_data: dict[str, NDArray]
+    cell_data: Arrays
     sets: Sets
     materials: Materials | None = None
     loads: tuple[Load, ...] = ()
@@ -120,8 +119,8 @@ class Model(NamedTuple):
     node_young: Floats | None = None
     gauss_young: Floats | None = None
     is_nonlinear: bool = False
-    about: dict[str, Any] = {}  # noqa: RUF012 - never changed
-    point_data: dict[str, NDArray] = {}  # noqa: RUF012 - never changed
+    about: Json = {}  # noqa: RUF012 - never changed
+    point_data: Arrays = {}  # noqa: RUF012 - never changed
 
     def _repr_html_(self) -> str:
         """Show the model in a notebook, with the middle section shaded by mean or modulus."""
@@ -412,7 +411,7 @@ def mass_densities(model: Model) -> Floats:
     )
 
 
-def grid_fields(model: Model) -> tuple[dict[str, NDArray], dict[str, NDArray]]:
+def grid_fields(model: Model) -> tuple[Arrays, Arrays]:
     """Return the fields of cells and of nodes of the model's order: data, sets of facets, and
     materials.
     """

@@ -11,7 +11,7 @@ import re
 import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,7 +22,7 @@ from tetopt.geometry.simplex import area_normals, outward_facet_nodes
 from tetopt.geometry.topology import connected_sets, facets, largest_component
 from tetopt.image import Image, transform_vectors
 from tetopt.mesh import Mesh
-from tetopt.system.arrays import Bools, Floats, Ints
+from tetopt.system.arrays import Bools, Floats, Ints, Json
 
 BOUNDARY_SET = "boundary"  # all facets that belong to only one cell
 MASK_SURFACE_SET = "mask_surface"  # boundary facets that are not on the faces of the image's box
@@ -698,7 +698,7 @@ def merged_sets(standard: Sets, own: Sets) -> tuple[Sets, dict[str, str]]:
     return Sets(*parts), renamed
 
 
-def box_text(box: Box) -> dict[str, Any]:
+def box_text(box: Box) -> Json:
     """Return the text for a mesh's `about` that `tetopt.io.vtk.box_in` reads."""
     return {"shape": list(box.shape), "affine": box.affine.tolist()}
 

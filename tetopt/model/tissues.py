@@ -8,7 +8,7 @@ import re
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.model.label_names import labels_named
 from tetopt.model.mappings import named_file
-from tetopt.system.arrays import Ints
+from tetopt.system.arrays import Ints, Json
 from tetopt.system.incoming import rows_of, toml_of
 
 REST = "*"  # all labels in no other group, except 0
@@ -238,5 +238,5 @@ def _labels_of(word: str, names: Mapping[int, str], present: Ints) -> list[int]:
 
 
 @cache
-def _presets() -> dict[str, dict[str, Any]]:
+def _presets() -> dict[str, Json]:
     return toml_of(Path(__file__).with_name("tissues.toml"), "table of presets")

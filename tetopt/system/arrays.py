@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from operator import index
-from typing import SupportsIndex
+from typing import Any, SupportsIndex
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +13,8 @@ from tetopt.errors import InputError
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
+Arrays = dict[str, NDArray]  # by name: fields of cells or of nodes
+Json = dict[str, Any]  # an object of JSON, or what one states: values by name
 
 
 def plain_array(what: str, values: ArrayLike) -> NDArray:
