@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
+from tetopt.io.volumes import collect_notes, note
 from tetopt.system.arrays import Json
 from tetopt.system.budget import address_bytes
 from tetopt.system.child import limit_self, signal_words, start_child
@@ -100,6 +101,7 @@ def read_apart(
             f"{library} crashed on this file ({ending}; memory limit {most_bytes / 1e9:.1f} GB); "
             "the file is damaged: copy or export it again"
         )
+    note(*answer.get("notes", ()))
     if "refused" in answer:
         raise InputError(answer["refused"])
     return answer["value"]
@@ -176,7 +178,9 @@ def _answer(job: Json) -> Json:
         limit_self("RLIMIT_AS", address_bytes() + job["bytes"])
         limit_self("RLIMIT_CPU", job["seconds"])
         limit_self("RLIMIT_CORE", 0)  # no core file with a patient's scan
-        return {"value": read(job["path"], *job["rest"])}
+        with collect_notes() as notes:
+            value = read(job["path"], *job["rest"])
+        return {"value": value, "notes": notes}
     except InputError as error:
         return {"refused": str(error)}
     except MemoryError:

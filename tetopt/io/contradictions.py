@@ -16,6 +16,7 @@ import numpy as np
 
 from tetopt.errors import InputError
 from tetopt.io.text import plain
+from tetopt.io.volumes import note
 from tetopt.system.arrays import Floats
 
 SAME_VOXELS = 0.05  # of a voxel's shortest edge: positions this close are equal
@@ -41,87 +42,67 @@ SPACES_OF_ITK = (  # of NRRD: ITK turns their coordinates to LPS and takes all o
 )
 
 
-def notes_of_places(
-    names: tuple[str, str],
-    used: Floats,
-    other: Floats,
-    shape: Sequence[int],
-) -> list[str]:
-    """Return a warning if two affines, (n+1, n+1), mm, place the voxels of a `shape` differently,
+def note_other_place(header: Any, shape: Sequence[int]) -> None:
+    """Note a NIfTI header whose sform and qform, mm, place the voxels of a `shape` differently,
     beyond rounding.
 
     A sheared affine agrees with a rotated one next to it, because quaternions have no shear.
     """
-    n = len(used) - 1
-    columns, others = used[:n, :n], other[:n, :n]
-    steps = np.linalg.norm(columns, axis=0)
-    if not (steps > 0.0).all() or not np.isfinite(used).all():
-        return []  # refused later
-    left, _, right = np.linalg.svd(columns / steps)
-    shear = columns - left @ right * steps
-    corners = np.stack(np.meshgrid(*([0.0, size - 1.0] for size in shape[:n])), axis=-1).reshape(
-        -1, n
-    )
-    apart = np.linalg.norm(corners @ (columns - others).T + used[:n, n] - other[:n, n], axis=1)
-    slack = SAME_VOXELS * steps.min() + SAME_FRACTION * np.linalg.norm(corners @ columns.T, axis=1)
-    slack += 2.0 * np.linalg.norm(corners @ shear.T, axis=1)
-    words = (
-        [f"place it differently, by up to {apart.max():.3g} mm"] if (apart > slack).any() else []
-    )
-    if np.linalg.det(columns) * np.linalg.det(others) < 0.0:
-        words.append("are mirror images of each other (left/right)")
-    return (
-        [f"{names[0]} and {names[1]} {', and '.join(words)}; {names[0]} is used, check it"]
-        if words
-        else []
-    )
-
-
-def notes_of_nifti(header: Any, shape: Sequence[int]) -> list[str]:
-    """Return a warning if the sform and the qform of a NIfTI header differ."""
     sform, sform_code = header.get_sform(coded=True)
     qform, qform_code = header.get_qform(coded=True)
     if sform is None or qform is None:
-        return []
-    spaces = [
-        f" ({SPACES_OF_NIFTI.get(code, code)})" if sform_code != qform_code else ""
-        for code in (sform_code, qform_code)
-    ]
-    names = (f"the sform{spaces[0]}", f"the qform{spaces[1]}")
-    return notes_of_places(
-        names, sform.astype(np.float64), qform.astype(np.float64), [*shape[:3], 1, 1][:3]
-    )
+        return
+    used, other = sform.astype(np.float64), qform.astype(np.float64)
+    columns, others = used[:3, :3], other[:3, :3]
+    steps = np.linalg.norm(columns, axis=0)
+    if not (steps > 0.0).all() or not np.isfinite(used).all():
+        return  # refused later
+    left, _, right = np.linalg.svd(columns / steps)
+    shear = columns - left @ right * steps
+    ends = ([0.0, size - 1.0] for size in [*shape[:3], 1, 1][:3])
+    corners = np.stack(np.meshgrid(*ends), axis=-1).reshape(-1, 3)
+    apart = np.linalg.norm(corners @ (columns - others).T + used[:3, 3] - other[:3, 3], axis=1)
+    slack = SAME_VOXELS * steps.min() + SAME_FRACTION * np.linalg.norm(corners @ columns.T, axis=1)
+    slack += 2.0 * np.linalg.norm(corners @ shear.T, axis=1)
+    words = [f"place it differently, by up to {apart.max():.3g} mm"] * (apart > slack).any()
+    if np.linalg.det(columns) * np.linalg.det(others) < 0.0:
+        words.append("are mirror images of each other (left/right)")
+    if words:
+        spaces = [
+            f" ({SPACES_OF_NIFTI.get(code, code)})" if sform_code != qform_code else ""
+            for code in (sform_code, qform_code)
+        ]
+        note(
+            f"the sform{spaces[0]} and the qform{spaces[1]} {', and '.join(words)}; "
+            f"the sform{spaces[0]} is used, check it"
+        )
 
 
-def notes_of_rest(rest: int, sizes: Sequence[int], value_bytes: int) -> list[str]:
-    """Return a warning if a file goes on for a slice or more after the voxels that its header
+def note_rest(rest: int, sizes: Sequence[int], value_bytes: int) -> None:
+    """Note a file that goes on for a slice or more after the voxels that its header
     declares.
     """
-    if rest < value_bytes * math.prod(sizes[:2]):
-        return []
-    words = " x ".join(map(str, sizes))
-    return [
-        f"its header declares {words} voxels, but the file has {rest} more bytes after them; "
-        "check its sizes"
-    ]
+    if rest >= value_bytes * math.prod(sizes[:2]):
+        note(
+            f"its header declares {' x '.join(map(str, sizes))} voxels, but the file has {rest} "
+            "more bytes after them; check its sizes"
+        )
 
 
-def notes_of_metaimage(fields: Mapping[str, str]) -> list[str]:
-    """Return warnings of the fields of a MetaImage header."""
-    notes = []
+def note_metaimage(fields: Mapping[str, str]) -> None:
+    """Note oddities among the fields of a MetaImage header."""
     if "ElementSpacing" not in fields and "ElementSize" not in fields:
-        notes.append("has no voxel size: assuming 1 mm")
+        note("has no voxel size: assuming 1 mm")
     matrix = next((_numbers(fields[key]) for key in DIRECTIONS if key in fields), np.zeros(0))
     # a row per axis of the voxels
     directions = matrix.reshape(3, 3) if len(matrix) == 9 else np.eye(3)
     letters = fields.get("AnatomicalOrientation", "").upper()
     if _is_other_orientation(letters, directions):
         along = "x".join(_along(directions, "LPS"))
-        notes.append(
+        note(
             f"states directions {along}, which are used, and AnatomicalOrientation {letters}, "
             "which has other sides (left/right); check it"
         )
-    return notes
 
 
 def _along(directions: Floats, ends: str) -> list[str]:
@@ -147,8 +128,8 @@ def _is_other_orientation(letters: str, directions: Floats) -> bool:
     return letters not in ("".join(_along(directions, "LPS")), "".join(_along(directions, "RAI")))
 
 
-def notes_of_nrrd(fields: Mapping[str, str], sizes: Sequence[int]) -> list[str]:
-    """Return warnings of the fields of an NRRD header, whose names are in lower case without
+def note_nrrd(fields: Mapping[str, str], sizes: Sequence[int]) -> None:
+    """Note oddities among the fields of an NRRD header, whose names are in lower case without
     blanks.
 
     Raises
@@ -168,29 +149,28 @@ def notes_of_nrrd(fields: Mapping[str, str], sizes: Sequence[int]) -> list[str]:
                     f'its header has both "{one}" ({plain(fields[one])[:60]}) and "{other}" '
                     f"({plain(fields[other])[:60]}), which NRRD excludes; remove the wrong one"
                 )
-    space, notes = fields.get("space", ""), []
-    if "spacedirections" in fields and space.lower() not in SPACES_OF_ITK:
-        words = f'its space "{plain(space)}"' if space else "it has no space, which"
-        notes.append(
-            f"{words} does not tell left from right: assuming left-posterior-superior, as ITK does"
-        )
+    space = fields.get("space", "")
     if "spacedirections" in fields:
-        return notes
+        if space.lower() not in SPACES_OF_ITK:
+            words = f'its space "{plain(space)}"' if space else "it has no space, which"
+            note(
+                f"{words} does not tell left from right: assuming left-posterior-superior, as ITK "
+                "does"
+            )
+        return
     if space:
         raise InputError(
             f'its header has the space "{plain(space)}" but no "space directions"; add them'
         )
-    spacings = _numbers(fields.get("spacings", ""))
     n_axes = min(len(sizes), 3)  # a fourth axis, of components or times, may have none
-    n_unknown = n_axes - int(np.isfinite(spacings).sum())
+    n_unknown = n_axes - int(np.isfinite(_numbers(fields.get("spacings", ""))).sum())
     if n_unknown > 0:
         along = "" if n_unknown == n_axes else f" along {n_unknown} of {n_axes} axes"
-        notes.append(f"has no voxel size{along}: assuming 1 mm")
-    notes.append(
+        note(f"has no voxel size{along}: assuming 1 mm")
+    note(
         "it has no space, which leaves left and right open: assuming left-posterior-superior, as "
         "ITK does"
     )
-    return notes
 
 
 def _numbers(text: str) -> Floats:

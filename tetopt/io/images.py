@@ -26,7 +26,7 @@ from tetopt.io.read_dicom import DICOM
 from tetopt.io.read_itk import ITK
 from tetopt.io.readback import save_checked
 from tetopt.io.stacks import PICTURES, SLICES, check_spacing
-from tetopt.io.volumes import Reader, Request, one_line, plane_affine
+from tetopt.io.volumes import Reader, Request, collect_notes, one_line, plane_affine
 from tetopt.io.zarr_images import (
     METADATA_FILES,
     ZARR,
@@ -34,7 +34,6 @@ from tetopt.io.zarr_images import (
     image_folder,
     is_zarr,
     save_zarr,
-    zarr_levels,
 )
 from tetopt.system.files import check_suffix
 from tetopt.system.incoming import irregular
@@ -136,13 +135,13 @@ def load_image(
     >>> tetopt.load_image("ball.nii.gz", slice_=(2, 8)).shape
     (16, 16)
     """
-    path, notes = Path(path), list[str]()
-    with errors_named(path):
+    path = Path(path)
+    with errors_named(path), collect_notes() as notes:
         reader = reader_of(path)
         is_part = reader.reads_crop if slice_ is None else reader.reads_slice
         parts = (slice_, crop) if is_part else (None, None)
         request = Request(volume, spacing_mm, lambda shape: _box_of(shape, *parts))
-        data, affine = reader.read(path, request, notes)
+        data, affine = reader.read(path, request)
         if reader.has_spacing:
             check_spacing(spacing_mm, np.linalg.norm(affine[:-1, :-1], axis=0))
         image = Image(data, affine)
@@ -186,12 +185,12 @@ def smaller_words(path: Path, bounds: Sequence[tuple[int, int]], most_voxels: fl
         start + (side - n) // 2 for (start, _), side, n in zip(bounds, sides, kept, strict=True)
     ]
     box = ",".join(f"{start}:{start + n}" for start, n in zip(starts, kept, strict=True))
-    levels = zarr_levels(path, []) if is_zarr(path) else []
-    few = [level for level in levels if math.prod(level.shape) <= most_voxels]
+    levels = reader_of(path).levels(path)
+    few = [name for name, shape in levels.items() if math.prod(shape) <= most_voxels]
     other = f"resample it to voxels {math.ceil(10.0 / factor) / 10.0:g} times as long"
     if few:
-        finest = max(few, key=lambda level: math.prod(level.shape))
-        other = f"use its level {finest.folder} ({_sides_words(finest.shape)} voxels)"
+        finest = max(few, key=lambda name: math.prod(levels[name]))
+        other = f"use its level {finest} ({_sides_words(levels[finest])} voxels)"
     return f"use `crop` {box} ({_sides_words(kept)} voxels) or the like, or {other}"
 
 

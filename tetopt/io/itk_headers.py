@@ -90,7 +90,7 @@ class VoxelHeader(NamedTuple):
     texts: dict[str, str]  # key:=value pairs of NRRD
     sizes: list[int]
     value_bytes: int  # all voxels
-    files: list[str]  # data files; empty if the voxels follow the header
+    files: list[Path]  # data files, beside the header; empty if the voxels follow it
     ratio: int  # maximum expansion of a byte of the file
     skip: str  # bytes before the voxels, as written; -1 if the voxels are at the end
     n_bytes: int  # of the header itself, if voxels follow
@@ -117,7 +117,7 @@ def _check_bytes(path: Path, header: VoxelHeader) -> int:
     """Return the number of bytes of all files of the image; InputError if its header declares
     more, or far fewer.
     """
-    n_bytes = sum(file.stat().st_size for file in (path, *_data_files(path, header)))
+    n_bytes = sum(file.stat().st_size for file in (path, *header.files))
     if header.value_bytes > n_bytes * header.ratio:
         sizes = " x ".join(str(size) for size in header.sizes)
         raise InputError(
@@ -138,7 +138,7 @@ def _check_packed(path: Path, header: VoxelHeader) -> None:
     """
     n_bytes = 0
     try:
-        for file in _data_files(path, header) or [path]:
+        for file in header.files or [path]:
             inflater = zlib.decompressobj(32 + zlib.MAX_WBITS)  # of zlib or gzip
             with file.open("rb") as stream:
                 stream.seek(header.n_bytes if file == path else int(header.skip))
@@ -151,19 +151,6 @@ def _check_packed(path: Path, header: VoxelHeader) -> None:
             f"{DAMAGED_FILE} (its header declares {header.value_bytes} bytes of voxels, but "
             f"{n_bytes} are packed)"
         )
-
-
-def data_files(path: Path) -> list[Path]:
-    """Return the data files of a header, empty if the voxels follow it; InputError for reasons
-    of `check_header`.
-    """
-    return _data_files(path, read_header(path))
-
-
-def _data_files(path: Path, header: VoxelHeader) -> list[Path]:
-    for name in header.files:
-        _check_beside(path, name)
-    return [path.parent / name for name in header.files]
 
 
 def header_sizes(path: Path) -> tuple[int, ...]:
@@ -186,17 +173,17 @@ def read_header(path: Path) -> VoxelHeader:
     """Return the header of a file; InputError for the reasons of `check_header` in the header."""
     with path.open("rb") as stream:
         head = stream.read(HEADER_BYTES)
-    header = _parse_head(head, path.suffix.lower() in NRRD_SUFFIXES)
-    if header.files and len(head) == HEADER_BYTES:  # the rest might name other files
+    header, names = _parse_head(head, path.suffix.lower() in NRRD_SUFFIXES)
+    if names and len(head) == HEADER_BYTES:  # the rest might name other files
         raise InputError(
             f"{UNREADABLE_FILE} (a header of more than {HEADER_BYTES} bytes with separate data "
             "files)"
         )
-    return header
+    return header._replace(files=[_file_beside(path, name) for name in names])
 
 
-def _check_beside(path: Path, name: str) -> None:
-    """Raise InputError unless the name is that of a regular file in the header's folder."""
+def _file_beside(path: Path, name: str) -> Path:
+    """Return the regular file of this name in the header's folder; InputError if there is none."""
     if name in ("", ".", "..") or re.search(r"[/\\:\0%*?]", name):
         raise InputError(
             f'expected a data file next to the header, named without a folder, got "{name}"'
@@ -207,30 +194,24 @@ def _check_beside(path: Path, name: str) -> None:
         raise InputError(f'{UNREADABLE_FILE} (its data file "{name}": {error.strerror})') from error
     if other is not None:
         raise InputError(f'its data file "{name}" is {other}; expected a regular file')
+    return path.parent / name
 
 
-def _sizes(text: str, n_axes: int) -> list[int]:
-    """Parse the lengths of the axes."""
-    words = text.split()
-    if len(words) != n_axes or not all(re.fullmatch(r"\d{1,18}", word) for word in words):
-        raise InputError(f"{UNREADABLE_FILE} (expected {n_axes} sizes, got {text[:80]})")
-    return [int(word) for word in words]
-
-
-def _n_axes(text: str) -> int:
-    if re.fullmatch(r"\d{1,3}", text) is None or not 1 <= int(text) <= MOST_AXES:
-        raise InputError(f"{UNREADABLE_FILE} (expected 1 to {MOST_AXES} axes, got {text[:80]})")
-    return int(text)
-
-
-def _parse_head(head: bytes, is_nrrd: bool) -> VoxelHeader:
-    """Parse the first bytes of a file as a header; `Names` are those of the format's fields."""
+def _parse_head(head: bytes, is_nrrd: bool) -> tuple[VoxelHeader, list[str]]:
+    """Parse the first bytes of a file as a header; return it, and the names of data files."""
     names = NRRD_NAMES if is_nrrd else METAIMAGE_NAMES
     fields, texts, files, n_bytes = _lines(head, names)
     for key in names[:4]:
         if key not in fields:
             raise InputError(f"{UNREADABLE_FILE} (its header has no {key})")
-    sizes = _sizes(fields[names.sizes], _n_axes(fields[names.axes]))
+    axes = fields[names.axes]
+    if re.fullmatch(r"\d{1,3}", axes) is None or not 1 <= int(axes) <= MOST_AXES:
+        raise InputError(f"{UNREADABLE_FILE} (expected 1 to {MOST_AXES} axes, got {axes[:80]})")
+    stated = fields[names.sizes]
+    words = stated.split()
+    if len(words) != int(axes) or not all(re.fullmatch(r"\d{1,18}", word) for word in words):
+        raise InputError(f"{UNREADABLE_FILE} (expected {axes} sizes, got {stated[:80]})")
+    sizes = list(map(int, words))
     channels = "1" if is_nrrd else fields.get("ElementNumberOfChannels", "1")
     if re.fullmatch(r"\d{1,9}", channels) is None:
         raise InputError(f"{UNREADABLE_FILE} (ElementNumberOfChannels = {channels[:80]})")
@@ -242,7 +223,7 @@ def _parse_head(head: bytes, is_nrrd: bool) -> VoxelHeader:
         ratio = 1 if fields.get("BinaryData", "True").lower() in TRUE else TEXT_RATIO
     value_bytes = math.prod(sizes) * int(channels) * _value_bytes(fields[names.kind])
     skip = fields.get(names.skip, "0")
-    return VoxelHeader(fields, texts, sizes, value_bytes, files, ratio, skip, n_bytes)
+    return VoxelHeader(fields, texts, sizes, value_bytes, [], ratio, skip, n_bytes), files
 
 
 def _lines(head: bytes, names: Names) -> tuple[dict[str, str], dict[str, str], list[str], int]:

@@ -32,8 +32,8 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 from tetopt.image import shifted_affine
 from tetopt.io.apart import DEFLATE_RATIO
-from tetopt.io.contradictions import notes_of_nifti, notes_of_rest
-from tetopt.io.units import mm_of_axes, notes_of_size
+from tetopt.io.contradictions import note_other_place, note_rest
+from tetopt.io.units import mm_of_axes, note_size
 from tetopt.io.volumes import (
     DAMAGED_FILE,
     TOO_LONG,
@@ -41,7 +41,9 @@ from tetopt.io.volumes import (
     UNREADABLE_FILE,
     Reader,
     Request,
+    Voxels,
     check_room,
+    note,
     one_line,
     plane_affine,
     volume_index,
@@ -72,24 +74,19 @@ DATA_ERRORS = (*FILE_ERRORS, ValueError, TypeError, OverflowError)
 HEADER_ERRORS = (*DATA_ERRORS, KeyError, HeaderDataError, WrapStructError, MGHError)
 
 
-def read_nibabel(path: Path, request: Request, notes: list[str]) -> tuple[NDArray, Floats]:
+def read_nibabel(path: Path, request: Request) -> Voxels:
     """Return data and affine, 2-D or 3-D; InputError without a leading path."""
     header_file, voxel_file = _files_of(path)
-    with _nibabel_heard() as words:
-        header, head = _header_of(header_file)
-    notes += [
-        f"nibabel repaired its header ({word}); check its voxel sizes and position"
-        for word in words
-    ]
-    shape = tuple(int(size) for size in header.get_data_shape())
-    notes += _notes_of_place(header, shape, head)
-    lengths = _units(header, notes)
+    header, head = _header_of(header_file)
+    shape = _shape_of(header)
+    _note_place(header, shape, head)
+    lengths = _units(header)
     affine = np.array(header.get_best_affine(), dtype=np.float64)
     affine[:3] *= 1.0 if lengths is None else lengths[:, None]
-    notes += notes_of_size(shape, affine, lengths)
+    note_size(shape, affine, lengths)
     volume_index(shape[3:], request.volume)
     bounds = request.box(shape[:3])
-    data = _voxels(voxel_file, header, shape, request.volume or 0, bounds, notes)
+    data = _voxels(voxel_file, header, shape, request.volume or 0, bounds)
     start = [first for first, _ in bounds]
     affine = shifted_affine(affine, start + [0] * (3 - len(start))) if any(start) else affine
     if data.ndim == 2:
@@ -99,8 +96,10 @@ def read_nibabel(path: Path, request: Request, notes: list[str]) -> tuple[NDArra
 
 def nibabel_shape(path: Path) -> tuple[int, ...]:
     """Return the lengths of all axes in the header."""
-    with _nibabel_heard():
-        header, _ = _header_of(_files_of(path)[0])
+    return _shape_of(_header_of(_files_of(path)[0])[0])
+
+
+def _shape_of(header: Any) -> tuple[int, ...]:
     return tuple(int(size) for size in header.get_data_shape())
 
 
@@ -152,6 +151,27 @@ def _open_nifti(path: Path) -> Any:
     return gzip.open(path) if path.name.lower().endswith(PACKED_SUFFIXES) else path.open("rb")
 
 
+@contextlib.contextmanager
+def _note_nibabel() -> Iterator[None]:
+    """Note nibabel's log messages of this thread, which are then not printed."""
+    thread = threading.get_ident()
+
+    def keep(record: logging.LogRecord) -> bool:
+        if record.thread != thread:
+            return True
+        if record.levelno >= logging.WARNING:
+            word = one_line(record.getMessage())
+            note(f"nibabel repaired its header ({word}); check its voxel sizes and position")
+        return False
+
+    imageglobals.logger.addFilter(keep)
+    try:
+        yield
+    finally:
+        imageglobals.logger.removeFilter(keep)
+
+
+@_note_nibabel()
 def _header_of(path: Path) -> tuple[Any, bytes]:
     """Return nibabel's header, checked and repaired, and the first bytes of the file."""
     try:
@@ -190,54 +210,33 @@ def _check_nifti(header: Any) -> None:
         raise InputError(f"{DAMAGED_FILE} (its voxels would begin at byte {offset:g})")
 
 
-@contextlib.contextmanager
-def _nibabel_heard() -> Iterator[list[str]]:
-    """Collect nibabel's log messages of this thread, which are then not printed."""
-    words: list[str] = []
-    thread = threading.get_ident()
-
-    def keep(record: logging.LogRecord) -> bool:
-        if record.thread != thread:
-            return True
-        if record.levelno >= logging.WARNING:
-            words.append(one_line(record.getMessage()))
-        return False
-
-    imageglobals.logger.addFilter(keep)
-    try:
-        yield words
-    finally:
-        imageglobals.logger.removeFilter(keep)
-
-
-def _notes_of_place(header: Any, shape: tuple[int, ...], head: bytes) -> list[str]:
-    """Return warnings for a header without orientation, which nibabel guesses."""
+def _note_place(header: Any, shape: tuple[int, ...], head: bytes) -> None:
+    """Note a header without orientation, which nibabel guesses, or with two."""
     if isinstance(header, MGHHeader):
-        if any(head[MGH_FLAG]):
-            return []
-        return [
-            "has no orientation: its voxel sizes (1 mm), position and left/right are nibabel's "
-            "guess"
-        ]
-    notes = notes_of_nifti(header, shape)
-    if int(header["sform_code"]) or int(header["qform_code"]):
-        return notes
-    guess = "has no orientation: position and left/right are nibabel's guess"
-    return [f"{guess}; if they matter, convert it again with its sform or qform", *notes]
+        if not any(head[MGH_FLAG]):
+            note(
+                "has no orientation: its voxel sizes (1 mm), position and left/right are "
+                "nibabel's guess"
+            )
+        return
+    if not (int(header["sform_code"]) or int(header["qform_code"])):
+        note(
+            "has no orientation: position and left/right are nibabel's guess; if they matter, "
+            "convert it again with its sform or qform"
+        )
+    note_other_place(header, shape)
 
 
-def _units(header: Any, notes: list[str]) -> Floats | None:
+def _units(header: Any) -> Floats | None:
     """Return the length of the file's unit, mm, for each axis; None if it states none."""
     if isinstance(header, MGHHeader):
         return None
     try:
         unit = header.get_xyzt_units()[0]
     except KeyError:
-        notes.append(
-            f"its unit of length has the unknown code {header['xyzt_units'] % 8}: assuming mm"
-        )
+        note(f"its unit of length has the unknown code {header['xyzt_units'] % 8}: assuming mm")
         return None
-    return mm_of_axes([unit.replace("unknown", "")] * 3, "xyzt_units", notes)
+    return mm_of_axes([unit.replace("unknown", "")] * 3, "xyzt_units")
 
 
 def _voxels(
@@ -246,7 +245,6 @@ def _voxels(
     shape: tuple[int, ...],
     volume: int,
     bounds: list[tuple[int, int]],
-    notes: list[str],
 ) -> NDArray:
     """Return the scaled values of a box of a volume; InputError unless the file can hold all up to
     this volume, before memory is allocated.
@@ -285,7 +283,7 @@ def _voxels(
     if end > size:
         raise too_short
     if not isinstance(header, MGHHeader):  # MGH has tags there
-        notes += notes_of_rest(size - whole, shape, dtype.itemsize)
+        note_rest(size - whole, shape, dtype.itemsize)
     try:
         slope, inter = header.get_slope_inter()
         scale = (1.0 if slope is None else slope, 0.0 if inter is None else inter)

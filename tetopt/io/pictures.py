@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.io.apart import read_apart
-from tetopt.io.volumes import UNREADABLE_FILE, volume_index
-from tetopt.system.arrays import Floats
+from tetopt.io.volumes import UNREADABLE_FILE, Voxels, volume_index
 from tetopt.system.extras import install_hint
 
 PICTURE_SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
@@ -23,7 +22,7 @@ PHOTOMETRIC_TAG = 262  # 0 if 0 is white
 MOST_PIXELS = 2**30  # in a frame: 32,768 squared, more than any slide scanner's plain picture
 
 
-def read_picture(path: Path, volume: int | None) -> tuple[NDArray, Floats]:
+def read_picture(path: Path, volume: int | None) -> Voxels:
     """Return grey values (rows, columns) and affine of a frame; InputError without a leading
     path.
     """

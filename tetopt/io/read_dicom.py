@@ -15,7 +15,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from itertools import islice
+from itertools import groupby, islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,14 +24,16 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.io.apart import read_apart
-from tetopt.io.text import plain
-from tetopt.io.units import notes_of_size
+from tetopt.io.text import count_text, plain
+from tetopt.io.units import note_size
 from tetopt.io.volumes import (
     UNREADABLE_FILE,
     Reader,
     Request,
+    Voxels,
     check_room,
     exact_type,
+    note,
     one_line,
     volume_index,
 )
@@ -115,31 +117,17 @@ class Frame(NamedTuple):
     segment: int
 
 
-class FrameGrid(NamedTuple):
-    """Where frames lie."""
-
-    affine: Floats  # (4, 4), RAS
-    slices: Ints  # of each frame, from 0
-    n_slices: int
-
-
-def read_dicom(path: Path, request: Request, notes: list[str]) -> tuple[NDArray, Floats]:
+def read_dicom(path: Path, request: Request) -> Voxels:
     """Return data and affine of a file, or of the one series in a folder; InputError without a
     leading path.
     """
-    data, affine, words = _read(image_of, path, request.volume)
-    notes += words + notes_of_size(data.shape, affine, np.ones(3))  # DICOM's unit is the mm
+    data, affine = _read(image_of, path, request.volume)
+    note_size(data.shape, affine, np.ones(3))  # DICOM's unit is the mm
     return data, affine
 
 
-def _is_dicom_source(path: Path) -> bool:
-    """Return whether to read a path as DICOM: any folder, and files with its mark, as scanners name
-    files without a suffix.
-    """
-    return path.is_dir() or is_dicom(path)
-
-
-DICOM = Reader((".dcm",), read_dicom, is_this=_is_dicom_source)
+# any folder, and files with DICOM's mark, as scanners name files without a suffix
+DICOM = Reader((".dcm",), read_dicom, is_this=lambda path: path.is_dir() or is_dicom(path))
 
 
 def read_segments_table(path: Path) -> LabelTable:
@@ -153,21 +141,19 @@ def frame_of_reference(path: Path) -> str | None:
     """Return the UID of the frame of reference of a file or a folder's first; None if not DICOM
     or without one.
     """
-    files = sorted(path.iterdir()) if path.is_dir() else [path]
-    first = next((file for file in files if file.is_file() and is_dicom(file)), None)
+    first = next(dicom_files(path), None)
     return None if first is None else _read(frame_of, first)
+
+
+def dicom_files(path: Path) -> Iterator[Path]:
+    """Yield the DICOM files in a folder, by name, or the file itself if it is one."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    return (file for file in files if file.is_file() and is_dicom(file))
 
 
 def dicom_file(path: Path) -> Path | None:
     """Return the path if it is a DICOM file, or the only one in this folder; otherwise None."""
-    files = (
-        [file for file in path.iterdir() if file.is_file()]
-        if path.is_dir()
-        else [path]
-        if path.is_file()
-        else []
-    )
-    files = [file for file in files if is_dicom(file)]
+    files = list(islice(dicom_files(path), 2))
     return files[0] if len(files) == 1 else None
 
 
@@ -193,26 +179,25 @@ def _read(read: Callable[..., Any], path: Path, *rest: Any) -> Any:
 # In the child
 
 
-def image_of(path: str, volume: int | None) -> tuple[NDArray, Floats, list[str]]:
-    """Return data, affine and warnings."""
-    notes: list[str] = []
-    files = _series(Path(path), notes)
+def image_of(path: str, volume: int | None) -> Voxels:
+    """Return data and affine."""
+    files = _series(Path(path))
     is_segmentation = any(file.is_segmentation for file in files)
     if is_segmentation and len(files) > 1:
         raise InputError(
             f"expected one segmentation, got {len(files)} DICOM files of a series with one; {ALONE}"
         )
     for file in files:
-        _check_voxels(file, notes)
-        _check_bits(file, notes)
+        _check_voxels(file)
+        _check_bits(file)
     _check_sizes(files)
     _check_world(files)
-    frames = _one_volume([frame for file in files for frame in _frames(file, notes)], volume)
-    grid = _place_frames(frames, notes, is_sparse=is_segmentation)
-    shape = (grid.n_slices, *files[0].size[::-1])
+    frames = _one_volume([frame for file in files for frame in _frames(file)], volume)
+    affine, slices = _place_frames(frames, is_sparse=is_segmentation)
+    shape = (int(slices.max()) + 1, *files[0].size[::-1])
     check_room(shape[::-1], np.dtype(np.float32).itemsize)
-    data = (_number_segments if is_segmentation else _rescale_frames)(frames, grid, shape, notes)
-    return data.T, grid.affine, notes
+    data = (_number_segments if is_segmentation else _rescale_frames)(frames, slices, shape)
+    return data.T, affine
 
 
 def segments_of(path: str) -> list[tuple[int, str, list[float]]]:
@@ -220,7 +205,7 @@ def segments_of(path: str) -> list[tuple[int, str, list[float]]]:
     their numbers.
     """
     rows = []
-    for file in _series(Path(path), []):
+    for file in _series(Path(path)):
         for number, segment in _segments(file).items():
             lab = segment.get("RecommendedDisplayCIELabValue")
             rows.append(
@@ -282,7 +267,7 @@ def _srgb(lab: Sequence[int]) -> list[float]:
 # Files
 
 
-def _series(path: Path, notes: list[str]) -> list[DicomFile]:
+def _series(path: Path) -> list[DicomFile]:
     """Open the file, or the files of the one series in a folder, in the order of their names."""
     if not path.is_dir():
         file = _open_dicom(path, "the file")
@@ -292,16 +277,16 @@ def _series(path: Path, notes: list[str]) -> list[DicomFile]:
             raise InputError(f"{file.name} {words}")
         return [file]
     series: dict[str, list[DicomFile]] = {}
-    for each in sorted(
-        file for file in path.iterdir() if file.is_file() and file.name.upper() != "DICOMDIR"
-    ):
-        file = _open_dicom(each, f"the DICOM file {each.name}") if is_dicom(each) else None
-        if file is None:
+    skipped = list[str]()
+    for each in dicom_files(path):
+        if each.name.upper() == "DICOMDIR":
+            continue
+        if (file := _open_dicom(each, f"the DICOM file {each.name}")) is None:
             continue
         if (words := _no_voxels(file)) and "Rows" in file.tags:
             raise InputError(f"{file.name} {words}")
         if words:
-            notes.append(f"skipped {each.name}, which {words.partition(';')[0]}")
+            skipped.append(f"skipped {each.name}, which {words.partition(';')[0]}")
             continue
         series.setdefault(str(file.tags.get("SeriesInstanceUID", "")), []).append(file)
     if not series:
@@ -312,15 +297,14 @@ def _series(path: Path, notes: list[str]) -> list[DicomFile]:
             raise InputError(
                 f"no DICOM series in this folder itself; choose one of its subfolders: {below}"
             )
-        skipped = f" ({notes[0]})" if notes else ""
-        raise InputError(
-            f"no DICOM series in this folder or its subfolders{skipped}; check the path"
-        )
+        first = f" ({skipped[0]})" if skipped else ""
+        raise InputError(f"no DICOM series in this folder or its subfolders{first}; check the path")
     if len(series) > 1:
         listed = ", ".join(f"{uid} ({len(files)} files)" for uid, files in series.items())
         raise InputError(
             f"expected one DICOM series, got {len(series)}; put one into its own folder: {listed}"
         )
+    note(*skipped)
     return next(iter(series.values()))
 
 
@@ -398,7 +382,7 @@ def _no_voxels(file: DicomFile) -> str:
     return f"is of the kind {kind}, without voxels; give the images themselves"
 
 
-def _check_voxels(file: DicomFile, notes: list[str]) -> None:
+def _check_voxels(file: DicomFile) -> None:
     """Raise InputError unless the voxels are numbers that can be decoded here."""
     from pydicom.pixels import get_decoder
 
@@ -439,16 +423,14 @@ def _check_voxels(file: DicomFile, notes: list[str]) -> None:
                 f"{rows} x {columns} "
                 f"voxels, at least {least:.4g} bytes, but it has {n_bytes}; copy it again"
             )
-        words = (
-            "more bytes of voxels than its header declares: the rest is ignored; check "
-            "Rows, Columns, NumberOfFrames"
-        )
-        # one or two may be padding
-        if not syntax.is_compressed and n_bytes > least + 2 and words not in notes:
-            notes.append(words)
+        if not syntax.is_compressed and n_bytes > least + 2:  # one or two may be padding
+            note(
+                "more bytes of voxels than its header declares: the rest is ignored; check Rows, "
+                "Columns, NumberOfFrames"
+            )
 
 
-def _check_bits(file: DicomFile, notes: list[str]) -> None:
+def _check_bits(file: DicomFile) -> None:
     """Raise InputError unless the highest bit of values fits their number of bits; note lower
     bits that are left.
     """
@@ -461,12 +443,8 @@ def _check_bits(file: DicomFile, notes: list[str]) -> None:
                 f"{tags.BitsStored} and HighBit "
                 f"{tags.HighBit}, which contradict each other; export it again"
             )
-        words = (
-            f"its HighBit is {tags.get('HighBit')}: the lowest {low} bits of its values are "
-            "left out"
-        )
-        if low and words not in notes:
-            notes.append(words)
+        if low:
+            note(f"its HighBit is {tags.HighBit}: the lowest {low} bits of its values are left out")
 
 
 def _check_sizes(files: list[DicomFile]) -> None:
@@ -501,7 +479,7 @@ def _check_world(files: list[DicomFile]) -> None:
 # Frames
 
 
-def _frames(file: DicomFile, notes: list[str]) -> list[Frame]:
+def _frames(file: DicomFile) -> list[Frame]:
     """Return the frames of a file, as their functional groups state, or else the file."""
     with _errors_of(file.name):
         tags, n = file.tags, file.n_frames
@@ -512,7 +490,7 @@ def _frames(file: DicomFile, notes: list[str]) -> list[Frame]:
                 f"{file.name} has {n} frames, but states where {len(own)} lie; export it again"
             )
         is_plain = not own and n > 1
-        places = _stack_frames(file, notes) if is_plain and not file.is_segmentation else None
+        places = _stack_frames(file) if is_plain and not file.is_segmentation else None
         frames = [_frame(file, k, (own[k] if own else {}, shared)) for k in range(n)]
         return (
             frames
@@ -537,6 +515,9 @@ def _frame(file: DicomFile, index: int, groups: tuple[Any, ...]) -> Frame:
     def numbers(keyword: str, sequence: str, count: int) -> tuple[float, ...]:
         return _numbers(name, keyword, lambda: stated(keyword, sequence), count)
 
+    def number(keyword: str, sequence: str, default: float = 0.0) -> float:
+        return next(iter(numbers(keyword, sequence, 1)), default)
+
     pixel: tuple[float, ...] = ()
     for keyword in ("PixelSpacing", "ImagerPixelSpacing", "NominalScannedPixelSpacing"):
         pixel = pixel or numbers(keyword, "PixelMeasuresSequence", 2)
@@ -547,7 +528,8 @@ def _frame(file: DicomFile, index: int, groups: tuple[Any, ...]) -> Frame:
         int(each.DimensionIndexPointer) for each in tags.get("DimensionIndexSequence") or ()
     ]
     pairs = zip(dimensions, indices, strict=True) if len(dimensions) == len(indices) else ()
-    slope = (numbers("RescaleSlope", "PixelValueTransformationSequence", 1) or (1.0,))[0]
+    rescaling = "PixelValueTransformationSequence"
+    slope = number("RescaleSlope", rescaling, 1.0)
     if "DoseGridScaling" in tags:
         slope = float(tags.DoseGridScaling)
     return Frame(
@@ -557,12 +539,9 @@ def _frame(file: DicomFile, index: int, groups: tuple[Any, ...]) -> Frame:
         place=numbers("ImagePositionPatient", "PlanePositionSequence", 3),
         axes=numbers("ImageOrientationPatient", "PlaneOrientationSequence", 6),
         pixel=pixel,
-        step=(numbers("SpacingBetweenSlices", "PixelMeasuresSequence", 1) or (0.0,))[0],
-        thickness=(numbers("SliceThickness", "PixelMeasuresSequence", 1) or (0.0,))[0],
-        scale=(
-            slope,
-            (numbers("RescaleIntercept", "PixelValueTransformationSequence", 1) or (0.0,))[0],
-        ),
+        step=number("SpacingBetweenSlices", "PixelMeasuresSequence"),
+        thickness=number("SliceThickness", "PixelMeasuresSequence"),
+        scale=(slope, number("RescaleIntercept", rescaling)),
         volume=(
             str(stated("StackID", content, "")),
             int(stated("TemporalPositionIndex", content, 0)),
@@ -594,7 +573,7 @@ def _numbers(name: str, keyword: str, source: Callable[[], Any], count: int) -> 
     return tuple(numbers)
 
 
-def _stack_frames(file: DicomFile, notes: list[str]) -> list[tuple[float, ...]]:
+def _stack_frames(file: DicomFile) -> list[tuple[float, ...]]:
     """Return the places of frames without functional groups, where the file states a distance
     between them.
     """
@@ -620,7 +599,7 @@ def _stack_frames(file: DicomFile, notes: list[str]) -> list[tuple[float, ...]]:
         raise InputError(f"{file.name} {NO_PLACES.format(n)}")
     along = np.cross(first.axes[:3], first.axes[3:])
     if not offsets:
-        notes.append(
+        note(
             f"its frames are put {first.step:.4g} mm apart along the slices' normal, as "
             "SpacingBetweenSlices states"
         )
@@ -657,9 +636,9 @@ def _one_volume(frames: list[Frame], volume: int | None) -> list[Frame]:
 # Places
 
 
-def _place_frames(frames: list[Frame], notes: list[str], *, is_sparse: bool) -> FrameGrid:
-    """Return the grid of frames from their own positions; raise InputError unless they are those of
-    a volume.
+def _place_frames(frames: list[Frame], *, is_sparse: bool) -> tuple[Floats, Ints]:
+    """Return the affine of frames, by their own positions, and the slice of each; InputError unless
+    they are those of a volume.
 
     The slice axis is that of the positions, not orthogonal to the others in a tilted gantry. With
     `is_sparse`, frames may share a slice, and slices may have none.
@@ -670,24 +649,9 @@ def _place_frames(frames: list[Frame], notes: list[str], *, is_sparse: bool) -> 
         raise InputError(
             f"{first.name}: expected the directions of its axes to be orthogonal, got {first.axes}"
         )
-    for frame in frames[1:]:
-        if len(frame.axes) != len(first.axes) or not np.allclose(
-            frame.axes, first.axes, rtol=0.0, atol=_SAME_DIRECTION
-        ):
-            raise InputError(
-                f"the DICOM slices are not parallel (a localizer?): {frame.name} and "
-                f"{first.name} have different "
-                "directions; choose another series"
-            )
-        if len(frame.pixel) != len(first.pixel) or not np.allclose(
-            frame.pixel, first.pixel, rtol=1e-3, atol=0.0
-        ):
-            raise InputError(
-                f"{frame.name} and {first.name} have pixels of different sizes; choose another "
-                "series"
-            )
+    _check_alike(frames)
     if not first.pixel:
-        notes.append("states no size of pixels: 1 mm is assumed")
+        note("states no size of pixels: 1 mm is assumed")
     between_rows, between_columns = first.pixel or (1.0, 1.0)
     if min(between_rows, between_columns) <= 0.0:
         raise InputError(
@@ -700,15 +664,56 @@ def _place_frames(frames: list[Frame], notes: list[str], *, is_sparse: bool) -> 
             raise InputError(
                 f"{unplaced.name} does not state where it lies; convert or export the series again"
             )
-        notes.append("states no position: its first voxel is put at the world's origin")
+        note("states no position: its first voxel is put at the world's origin")
     points = np.array([frame.place or (0.0, 0.0, 0.0) for frame in frames])
     normal = np.cross(*axes)
-    step, slices = (_sparse if is_sparse else _even)(points, normal, frames, notes)
+    ranks = _ranks(points, normal)
+    places = points[np.unique(ranks, return_index=True)[1]]
+    if len(places) < len(points) and not is_sparse:
+        raise _several_volumes(frames, len(places))
+    if len(places) == 1:
+        step, slices = normal * _thickness(first), np.zeros(1, dtype=np.int64)
+    else:
+        step, slices = _steps(places, first, is_sparse)
+        _check_step(step, normal, first)
     affine = np.eye(4)
     affine[:3, :3] = np.column_stack([axes[0] * between_columns, axes[1] * between_rows, step])
-    affine[:3, 3] = points[slices.argmin()]
+    affine[:3, 3] = places[0]
     affine[:2] *= -1.0  # LPS to RAS
-    return FrameGrid(affine, slices, int(slices.max()) + 1)
+    return affine, slices[ranks]
+
+
+def _check_alike(frames: list[Frame]) -> None:
+    """Raise InputError for frames of other directions or pixels than the first one's."""
+    first = frames[0]
+    for frame in frames[1:]:
+        if len(frame.axes) != len(first.axes) or not np.allclose(
+            frame.axes, first.axes, rtol=0.0, atol=_SAME_DIRECTION
+        ):
+            raise InputError(
+                f"the DICOM slices are not parallel (a localizer?): {frame.name} and {first.name} "
+                "have different directions; choose another series"
+            )
+        if len(frame.pixel) != len(first.pixel) or not np.allclose(
+            frame.pixel, first.pixel, rtol=1e-3, atol=0.0
+        ):
+            raise InputError(
+                f"{frame.name} and {first.name} have pixels of different sizes; choose another "
+                "series"
+            )
+
+
+def _several_volumes(frames: list[Frame], n_places: int) -> InputError:
+    n, remedy = len(frames), "put the slices of one volume into a separate folder, or "
+    if all(frame.file.n_frames == n for frame in frames):
+        remedy = ""
+    elif all(frame.file.n_frames == n_places for frame in frames):
+        remedy = "give one of its files, or "
+    return InputError(
+        f"the {n} slices of this DICOM series have {count_text(n_places, 'position')}: it has "
+        f"several volumes (times, echoes or repeats); {remedy}convert it to a 4-D NIfTI file "
+        "(dcm2niix)"
+    )
 
 
 def _ranks(points: Floats, normal: Floats) -> Ints:
@@ -720,112 +725,72 @@ def _ranks(points: Floats, normal: Floats) -> Ints:
     return ranks
 
 
-def _even(
-    points: Floats, normal: Floats, frames: list[Frame], notes: list[str]
-) -> tuple[Floats, Ints]:
-    """Return the step between slices, and each one's rank; InputError unless each has a place,
-    evenly spaced.
+def _steps(places: Floats, first: Frame, is_sparse: bool) -> tuple[Floats, Ints]:
+    """Return the step between slices, and the slice of each place, (n, 3), in their order: the
+    next one or, if sparse, a multiple of the stated or of the least distance. InputError if they
+    are uneven.
     """
-    n, ranks = len(points), _ranks(points, normal)
-    if n == 1:
-        return normal * _thickness(frames[0], notes), ranks
-    n_places = int(ranks.max()) + 1
-    if n_places < n:
-        remedy = "put the slices of one volume into a separate folder, or "
-        if all(frame.file.n_frames == n for frame in frames):
-            remedy = ""
-        elif all(frame.file.n_frames == n_places for frame in frames):
-            remedy = "give one of its files, or "
-        raise InputError(
-            f"the {n} slices of this DICOM series have {n_places} "
-            f"position{'s' * (n_places > 1)}: it has "
-            f"several volumes (times, echoes or repeats); {remedy}convert it to a 4-D NIfTI file "
-            "(dcm2niix)"
-        )
-    points = points[np.argsort(ranks)]
-    step = (points[-1] - points[0]) / (n - 1)
-    off = np.linalg.norm(points - points[0] - np.arange(n)[:, None] * step, axis=1)
-    if off.max() > _UNEVEN_FRACTION * np.linalg.norm(step):
-        raise InputError(
-            f"the DICOM slices are not evenly spaced ({_unevenness(points, off)}); export the "
-            "series again, or "
-            "resample it to NIfTI"
-        )
-    _check_step(step, normal, frames, notes)
-    return step, ranks
-
-
-def _sparse(
-    points: Floats, normal: Floats, frames: list[Frame], notes: list[str]
-) -> tuple[Floats, Ints]:
-    """Return the step between slices, and each frame's slice; InputError unless all lie at
-    multiples of the step.
-
-    The step is the one stated if the places fit it, and otherwise the smallest between two places.
-    """
-    ranks = _ranks(points, normal)
-    places = points[np.unique(ranks, return_index=True)[1]]
-    if len(places) == 1:
-        return normal * _thickness(frames[0], notes), ranks
     along = np.linalg.norm(places - places[0], axis=1)
-    for length in (abs(frames[0].step), float(np.diff(along).min())):
-        if length <= _SAME_PLACE_MM:
-            continue
-        slices = np.rint(along / length)
+    nearest = float(np.diff(along).min())
+    tried = [np.arange(len(places))]
+    if is_sparse:
+        lengths = (abs(first.step), nearest)
+        tried = [np.rint(along / length) for length in lengths if length > _SAME_PLACE_MM]
+    for slices in tried:
         step = (places[-1] - places[0]) / slices[-1]
         off = np.linalg.norm(places - places[0] - slices[:, None] * step, axis=1)
         if (np.diff(slices) > 0).all() and off.max() <= _UNEVEN_FRACTION * np.linalg.norm(step):
-            _check_step(step, normal, frames, notes)
             if np.diff(slices).min() > 1:
-                notes.append(
-                    f"its slices are {length:.4g} mm apart as it states, but its frames "
-                    f"{np.diff(along).min():.4g} mm "
-                    "or more: those between are empty"
+                note(
+                    f"its slices are {abs(first.step):.4g} mm apart as it states, but its frames "
+                    f"{nearest:.4g} mm or more: those between are empty"
                 )
             elif (n_empty := int(slices[-1]) + 1 - len(slices)) > MOST_EMPTY * len(slices):
-                notes.append(
-                    f"its frames lie in {len(slices)} slices, far apart: {n_empty} slices "
-                    "between them are empty; "
-                    "check that they are of one scan"
+                note(
+                    f"its frames lie in {len(slices)} slices, far apart: {n_empty} slices between "
+                    "them are empty; check that they are of one scan"
                 )
-            return step, slices.astype(np.int64)[ranks]
+            return step, slices.astype(np.int64)
+    what = (
+        "the frames of this segmentation are not at multiples of one distance"
+        if is_sparse
+        else "the DICOM slices are not evenly spaced"
+    )
     raise InputError(
-        "the frames of this segmentation are not at multiples of one distance "
-        f"({_unevenness(places, off)}); export "
-        "it again, or resample it to NIfTI"
+        f"{what} ({_unevenness(places, off)}); export the series again, or resample it to NIfTI"
     )
 
 
-def _thickness(frame: Frame, notes: list[str]) -> float:
+def _thickness(frame: Frame) -> float:
     """Return the extent of the only slice along its normal."""
     length = abs(frame.step) or frame.thickness
     if length <= 0.0:
-        notes.append("has one slice and states no thickness: 1 mm is assumed")
+        note("has one slice and states no thickness: 1 mm is assumed")
         return 1.0
     return length
 
 
-def _check_step(step: Floats, normal: Floats, frames: list[Frame], notes: list[str]) -> None:
+def _check_step(step: Floats, normal: Floats, first: Frame) -> None:
     """Raise InputError for slices beside each other; note a step other than the one stated."""
     across = float(step @ normal)
     if across <= _SAME_PLACE_MM:
         raise InputError(
             "the DICOM slices lie beside each other, not above each other; choose another series"
         )
-    lengths, stated = (across, float(np.linalg.norm(step))), abs(frames[0].step)
+    lengths, stated = (across, float(np.linalg.norm(step))), abs(first.step)
     if stated and all(abs(length / stated - 1.0) > _UNEVEN_FRACTION for length in lengths):
-        notes.append(
+        note(
             f"its slices lie {lengths[1]:.4g} mm apart by their positions, which are used; "
             "SpacingBetweenSlices is "
             f"{stated:.4g} mm"
         )
-    thickness = frames[0].thickness
+    thickness = first.thickness
     if (
-        frames[0].file.is_segmentation
+        first.file.is_segmentation
         and not stated
         and 0.0 < thickness * (1.0 + _UNEVEN_FRACTION) < lengths[0]
     ):
-        notes.append(
+        note(
             f"its slices lie {lengths[1]:.4g} mm apart by their positions, which are used; "
             "SliceThickness is "
             f"{thickness:.4g} mm, so slices between them may be missing"
@@ -905,38 +870,27 @@ def _low_bits(file: DicomFile) -> int:
     )
 
 
-def _rescale_frames(
-    frames: list[Frame], grid: FrameGrid, shape: tuple[int, int, int], notes: list[str]
-) -> NDArray:
+def _rescale_frames(frames: list[Frame], slices: Ints, shape: tuple[int, int, int]) -> NDArray:
     """Return the values of frames, each rescaled as it states."""
     if any("ModalityLUTSequence" in frame.file.tags for frame in frames):
-        notes.append(
-            "its values are as stored: its table of values (ModalityLUTSequence) is not applied"
-        )
-    scales, bits = (
-        {frame.scale for frame in frames},
-        max(int(frame.file.tags.BitsAllocated) for frame in frames),
-    )
-    data = np.empty(shape, dtype=exact_type(bits, scales))
-    slices = dict(zip(map(id, frames), grid.slices.tolist(), strict=True))
-    of_file: dict[int, list[Frame]] = {}
-    for frame in frames:
-        of_file.setdefault(id(frame.file), []).append(frame)
-    for those in of_file.values():
+        note("its values are as stored: its table of values (ModalityLUTSequence) is not applied")
+    bits = max(int(frame.file.tags.BitsAllocated) for frame in frames)
+    data = np.empty(shape, dtype=exact_type(bits, {frame.scale for frame in frames}))
+    places = iter(slices.tolist())
+    for _, of_file in groupby(frames, key=lambda frame: id(frame.file)):
+        those = list(of_file)
         for frame, plane in zip(those, _planes(those), strict=True):
-            data[slices[id(frame)]] = plane * frame.scale[0] + frame.scale[1]
+            data[next(places)] = plane * frame.scale[0] + frame.scale[1]
     return data
 
 
-def _number_segments(
-    frames: list[Frame], grid: FrameGrid, shape: tuple[int, int, int], notes: list[str]
-) -> NDArray:
+def _number_segments(frames: list[Frame], slices: Ints, shape: tuple[int, int, int]) -> NDArray:
     """Return the segments' numbers; where segments overlap, the larger number, or the larger
     fraction.
     """
     tags = frames[0].file.tags
-    order = np.lexsort([np.array([frame.segment for frame in frames]), grid.slices])
-    frames, slices = [frames[k] for k in order], grid.slices[order]
+    order = np.lexsort([[frame.segment for frame in frames], slices])
+    frames, slices = [frames[k] for k in order], slices[order]
     names = {number: _name(each) for number, each in _segments(frames[0].file).items()}
     for one, other, k, before in zip(frames[1:], frames, slices[1:], slices, strict=False):
         if (one.segment, k) == (other.segment, before):
@@ -947,21 +901,21 @@ def _number_segments(
     if tags.get("SegmentationType") == "LABELMAP":
         for k, plane in zip(slices, _planes(frames), strict=True):
             data[k] = plane
-        _clear(data, {0, int(tags.get("PixelPaddingValue") or 0)}, names, notes)
+        _clear(data, {0, int(tags.get("PixelPaddingValue") or 0)}, names)
         return data
     if unnamed := next((frame for frame in frames if frame.segment not in names), None):
         raise InputError(f"{unnamed.name} states no segment of the file; export it again")
     whole = 1
     if tags.get("SegmentationType") == "FRACTIONAL":
         whole = int(tags.MaximumFractionalValue)
-        notes.append(
+        note(
             "its segments are fractions: voxels belong to the largest, if it is "
             f"{SEGMENT_FRACTION:g} or more"
         )
-    return _write_segments(frames, slices, data, whole, names, notes)
+    return _write_segments(frames, slices, data, whole, names)
 
 
-def _clear(data: NDArray, outside: set[int], names: dict[int, str], notes: list[str]) -> None:
+def _clear(data: NDArray, outside: set[int], names: dict[int, str]) -> None:
     """Set voxels `outside` of all segments to 0, and those of other values without a segment,
     which are noted.
     """
@@ -972,7 +926,7 @@ def _clear(data: NDArray, outside: set[int], names: dict[int, str], notes: list[
         if k not in outside | names.keys()
     }
     if unknown:
-        notes.append(
+        note(
             f"{sum(unknown.values())} voxels have values of no segment ({list(unknown)[:8]}) and "
             "get label 0"
         )
@@ -985,7 +939,6 @@ def _write_segments(
     data: NDArray,
     whole: int,
     names: dict[int, str],
-    notes: list[str],
 ) -> NDArray:
     """Write numbers of segments to `data`, for frames in the order of slices and segments; note
     overlaps.
@@ -1014,5 +967,5 @@ def _write_segments(
             else ""
         )
         kept = "larger number" if whole == 1 else "larger fraction, or number"
-        notes.append(f"segments overlap, and the {kept} is kept: {text}{more}")
+        note(f"segments overlap, and the {kept} is kept: {text}{more}")
     return data

@@ -11,15 +11,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.io.apart import read_apart
-from tetopt.io.contradictions import notes_of_metaimage, notes_of_nrrd, notes_of_rest
-from tetopt.io.itk_headers import NRRD_SUFFIXES, check_header, data_files, header_sizes
+from tetopt.io.contradictions import note_metaimage, note_nrrd, note_rest
+from tetopt.io.itk_headers import (
+    NRRD_SUFFIXES,
+    SPACE_KINDS,
+    check_header,
+    header_sizes,
+    read_header,
+)
 from tetopt.io.segments import labels_of_layers, segments_of
-from tetopt.io.units import mm_of_axes, notes_of_size
-from tetopt.io.volumes import UNREADABLE_FILE, Reader, Request, one_line, volume_index
+from tetopt.io.units import mm_of_axes, note_size
+from tetopt.io.volumes import UNREADABLE_FILE, Reader, Request, Voxels, one_line, volume_index
 from tetopt.system.arrays import Floats
 from tetopt.system.extras import install_hint
 
@@ -30,24 +35,22 @@ ITK_READERS = {
     ".mha": "MetaImageIO",
     ".mhd": "MetaImageIO",
 }
-# of NRRD's axes; others are times, colours, vectors
-SPATIAL_KINDS = ("domain", "space", "???", "none")
 
 
-def read_itk(path: Path, request: Request, notes: list[str]) -> tuple[NDArray, Floats]:
+def read_itk(path: Path, request: Request) -> Voxels:
     """Return data and affine of a file; InputError without a leading path."""
-    _check_installed()
+    if importlib.util.find_spec("SimpleITK") is None:
+        raise InputError(f"NRRD and MetaImage need SimpleITK; {install_hint('SimpleITK')}")
     header, size = check_header(path)
     is_nrrd = path.suffix.lower() in NRRD_SUFFIXES
-    about = (
-        notes_of_nrrd(header.fields, header.sizes) if is_nrrd else notes_of_metaimage(header.fields)
-    )
+    if is_nrrd:
+        note_nrrd(header.fields, header.sizes)
+    else:
+        note_metaimage(header.fields)
     if header.ratio == 1 and header.skip.isdecimal():  # neither packed nor text
         rest = size - header.n_bytes - int(header.skip) - header.value_bytes
-        about += notes_of_rest(
-            rest, header.sizes, header.value_bytes // max(math.prod(header.sizes), 1)
-        )
-    lengths = (_nrrd_units if is_nrrd else _metaimage_units)(header.fields, about)
+        note_rest(rest, header.sizes, header.value_bytes // max(math.prod(header.sizes), 1))
+    lengths = (_nrrd_units if is_nrrd else _metaimage_units)(header.fields)
     segments = segments_of(header.texts)
     data, affine = read_apart(
         _volume_of,
@@ -59,17 +62,22 @@ def read_itk(path: Path, request: Request, notes: list[str]) -> tuple[NDArray, F
         library="SimpleITK",
     )
     if segments:
-        data = labels_of_layers(data, segments, about)
+        data = labels_of_layers(data, segments)
     n = len(affine) - 1
     affine[:n] *= 1.0 if lengths is None else lengths[:n, None]
-    notes += about + notes_of_size(data.shape, affine, lengths)
+    note_size(data.shape, affine, lengths)
     return data, affine
 
 
-ITK = Reader(tuple(ITK_READERS), read_itk, shape=header_sizes, other_files=data_files)
+ITK = Reader(
+    tuple(ITK_READERS),
+    read_itk,
+    shape=header_sizes,
+    other_files=lambda path: read_header(path).files,
+)
 
 
-def _nrrd_units(fields: dict[str, str], notes: list[str]) -> Floats | None:
+def _nrrd_units(fields: dict[str, str]) -> Floats | None:
     """Return the lengths of units along the world axes, mm; None if there are none."""
     name, key = ("space units", "spaceunits") if "spaceunits" in fields else ("units", "units")
     if key not in fields:
@@ -80,29 +88,23 @@ def _nrrd_units(fields: dict[str, str], notes: list[str]) -> Floats | None:
         words = [
             word
             for k, word in enumerate(words)
-            if k >= len(kinds) or kinds[k].lower() in SPATIAL_KINDS
+            if k >= len(kinds) or kinds[k].lower() in SPACE_KINDS
         ]
     if len(words) < 2:
         raise InputError(
             f"{name}: expected a unit in quotation marks per axis, got {fields[key][:80]}"
         )
-    return mm_of_axes(words[:3], name, notes)
+    return mm_of_axes(words[:3], name)
 
 
-def _metaimage_units(fields: dict[str, str], notes: list[str]) -> Floats | None:
-    words = [fields.get("DistanceUnits", "").strip("?")] * 3
-    return mm_of_axes(words, "DistanceUnits", notes)
-
-
-def _check_installed() -> None:
-    if importlib.util.find_spec("SimpleITK") is None:
-        raise InputError(f"NRRD and MetaImage need SimpleITK; {install_hint('SimpleITK')}")
+def _metaimage_units(fields: dict[str, str]) -> Floats | None:
+    return mm_of_axes([fields.get("DistanceUnits", "").strip("?")] * 3, "DistanceUnits")
 
 
 # In the child
 
 
-def _volume_of(path: str, volume: int | None, has_layers: bool = False) -> tuple[NDArray, Floats]:
+def _volume_of(path: str, volume: int | None, has_layers: bool) -> Voxels:
     """Return data, with layers on a last axis if it has them, and affine."""
     import SimpleITK as sitk
 
@@ -111,9 +113,12 @@ def _volume_of(path: str, volume: int | None, has_layers: bool = False) -> tuple
         reader.SetFileName(path)
         reader.SetImageIO(ITK_READERS[Path(path).suffix.lower()])
         reader.ReadImageInformation()
-        n_layers = reader.GetNumberOfComponents() if has_layers else 0
-        if not has_layers:
-            _check_components(reader.GetNumberOfComponents())
+        count = reader.GetNumberOfComponents()
+        if count > 1 and not has_layers:
+            raise InputError(
+                f"expected one number per voxel, got {count} (RGB or vectors); convert it to grey "
+                "first"
+            )
         size = reader.GetSize()
         index = volume_index(size[3:], volume)
         if index:
@@ -121,23 +126,13 @@ def _volume_of(path: str, volume: int | None, has_layers: bool = False) -> tuple
             reader.SetExtractIndex([0, 0, 0, *index])
         data = sitk.GetArrayFromImage(reader.Execute())
         if has_layers:  # components vary fastest
-            return np.moveaxis(data.reshape(*size[::-1], n_layers).T, 0, -1), _ras_affine(reader)
+            data = np.moveaxis(data.reshape(*size[::-1], count), -1, 0)
         return data.T, _ras_affine(reader)
     except RuntimeError as error:
-        raise _in_words(error) from error
-
-
-def _in_words(error: RuntimeError) -> InputError:
-    # The innermost cause comes last; the "Reason:" after it is an unrelated errno.
-    words = re.split(r"ERROR: (?:\w+ ?\(0x[0-9a-f]+\): )?|\[nrrd\] ", one_line(error))[-1]
-    return InputError(f"{UNREADABLE_FILE} (SimpleITK: {words.split(' Reason: ')[0]})")
-
-
-def _check_components(count: int) -> None:
-    if count > 1:
-        raise InputError(
-            f"expected one number per voxel, got {count} (RGB or vectors); convert it to grey first"
-        )
+        # The innermost cause comes last; the "Reason:" after it is an unrelated errno.
+        words = re.split(r"ERROR: (?:\w+ ?\(0x[0-9a-f]+\): )?|\[nrrd\] ", one_line(error))[-1]
+        words = words.split(" Reason: ")[0]
+        raise InputError(f"{UNREADABLE_FILE} (SimpleITK: {words})") from error
 
 
 def _ras_affine(source: Any) -> Floats:

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from tetopt.contents.labels import LARGEST_LABEL
 from tetopt.errors import InputError
-from tetopt.io.text import plain
+from tetopt.io.text import list_names, plain
+from tetopt.io.volumes import note
 from tetopt.model.label_names import LabelTable
 
 SEGMENT_FIELD = re.compile(r"Segment(\d{1,6})_(\w+)")
@@ -79,7 +80,7 @@ def segments_table(segments: list[Segment]) -> LabelTable:
     )
 
 
-def labels_of_layers(layers: NDArray, segments: list[Segment], notes: list[str]) -> NDArray:
+def labels_of_layers(layers: NDArray, segments: list[Segment]) -> NDArray:
     """Return the label of each voxel, from its values in the layers, which are on the last axis.
 
     Where segments overlap, the later layer wins; overlaps, shared values and values of no segment
@@ -100,43 +101,30 @@ def labels_of_layers(layers: NDArray, segments: list[Segment], notes: list[str])
     names = segments_table(segments).names
     if len(names) < len(segments):
         doubled = ", ".join(f'"{name}"' for name in names.values() if " / " in name)
-        notes.append(
-            f"segments of one layer share a label value and cannot be told apart: {doubled}"
-        )
+        note(f"segments of one layer share a label value and cannot be told apart: {doubled}")
     if [each.label for each in segments] != [each.value for each in segments]:
-        notes.append(
-            f"its segments share label values; they are numbered in order: {_segment_words(names)}"
+        note(
+            "its segments share label values; they are numbered in order: "
+            f"{list_names([f'{label} {name}' for label, name in names.items()])}"
         )
     labels = np.zeros(layers.shape[:-1], np.int32)
     is_free = (layers != 0).any(axis=-1)
     for each in sorted(segments, key=lambda each: each.layer):
         is_here = layers[..., each.layer] == each.value
-        covered = dict(
-            zip(
-                *(part.tolist() for part in np.unique(labels[is_here], return_counts=True)),
-                strict=True,
-            )
-        )
+        covered = np.column_stack(np.unique(labels[is_here], return_counts=True)).tolist()
         below = [
             f'{count} of the {np.count_nonzero(labels == label)} voxels of "{names[label]}"'
-            for label, count in covered.items()
+            for label, count in covered
             if label not in (0, each.label)
         ]
         if below:
-            notes.append(f'segment "{each.name}" covers {", ".join(below)}; later layers win')
+            note(f'segment "{each.name}" covers {", ".join(below)}; later layers win')
         labels[is_here] = each.label
         is_free &= ~is_here
     if is_free.any():
         described = np.unique(layers[is_free]).tolist()
-        notes.append(
-            f"{is_free.sum()} voxels have values of no segment ({described[:8]}) and get label 0"
-        )
+        note(f"{is_free.sum()} voxels have values of no segment ({described[:8]}) and get label 0")
     return labels
-
-
-def _segment_words(names: Mapping[int, str]) -> str:
-    shown = [f"{label} {name}" for label, name in names.items()]
-    return ", ".join(shown[:8]) + (f" and {len(shown) - 8} more" if len(shown) > 8 else "")
 
 
 def _whole(name: str, field: str, text: str, least: int) -> int:

@@ -26,7 +26,16 @@ from tetopt.io.pictures import MOST_PIXELS, PICTURE_SUFFIXES, frame_of, read_pic
 from tetopt.io.read_dicom import is_dicom
 from tetopt.io.text import plain
 from tetopt.io.units import mm_of_unit
-from tetopt.io.volumes import UNREADABLE_FILE, Reader, Request, check_room, exact_type, one_line
+from tetopt.io.volumes import (
+    UNREADABLE_FILE,
+    Reader,
+    Request,
+    Voxels,
+    check_room,
+    exact_type,
+    note,
+    one_line,
+)
 from tetopt.system.arrays import Floats
 from tetopt.system.extras import install_hint
 from tetopt.system.incoming import irregular
@@ -99,22 +108,19 @@ class Tiff(NamedTuple):
     sizes: Sequence[float | None] = (None,) * 3  # mm, along columns, rows and slices
     is_calibrated: bool = False  # whether the sizes are more than those of a print
     scale: Sequence[float] = (1.0, 0.0)  # slope and intercept of values
-    notes: Sequence[str] = ()
 
 
-def read_pictures(path: Path, request: Request, notes: list[str]) -> tuple[NDArray, Floats]:
+def read_pictures(path: Path, request: Request) -> Voxels:
     """Return data and affine of a picture, or of a TIFF file's stack of pages; InputError
     without a leading path.
     """
     tiff = Tiff(None)
-    if path.name.lower().endswith(TIFF_SUFFIXES) and _has_tifffile():
+    if _is_for_tifffile(path.name):
         is_page = request.volume is not None
         tiff = Tiff(
             *read_apart(_stack_of, path, is_page, value_bytes=MOST_PIXELS, library="tifffile")
         )
-    notes += tiff.notes
-    n = 2 if tiff.voxels is None else 3
-    steps = _steps(tiff, n, request.spacing_mm, notes)
+    steps = _steps(tiff, 2 if tiff.voxels is None else 3, request.spacing_mm)
     if tiff.voxels is None:
         data, affine = read_picture(path, request.volume)
         affine[:2] *= 1.0 if steps is None else steps[:, None]
@@ -124,11 +130,11 @@ def read_pictures(path: Path, request: Request, notes: list[str]) -> tuple[NDArr
     return _scale_values(tiff.voxels, tiff.scale), _affine(steps)
 
 
-def read_slices(path: Path, request: Request, notes: list[str]) -> tuple[NDArray, Floats]:
+def read_slices(path: Path, request: Request) -> Voxels:
     """Return data and affine of a folder of slices, in their order; InputError without a leading
     path.
     """
-    series, said = _series(slice_files(path))
+    series = _series(slice_files(path))
     size = sum((path / name).stat().st_size for name in series)
     tiff = Tiff(
         *read_apart(
@@ -141,9 +147,8 @@ def read_slices(path: Path, request: Request, notes: list[str]) -> tuple[NDArray
             library="Pillow",
         )
     )
-    notes += [*said, *tiff.notes]
+    steps = _steps(tiff, 3, request.spacing_mm)
     assert tiff.voxels is not None
-    steps = _steps(tiff, 3, request.spacing_mm, notes)
     assert steps is not None
     return _scale_values(tiff.voxels, tiff.scale), _affine(steps)
 
@@ -152,13 +157,12 @@ PICTURES = Reader(PICTURE_SUFFIXES, read_pictures, has_spacing=False)
 SLICES = Reader((), read_slices, is_this=lambda path: bool(slice_files(path)), has_spacing=False)
 
 
-def _has_tifffile() -> bool:
-    return importlib.util.find_spec("tifffile") is not None
+def _is_for_tifffile(name: str) -> bool:
+    has_library = importlib.util.find_spec("tifffile") is not None
+    return name.lower().endswith(TIFF_SUFFIXES) and has_library
 
 
-def _steps(
-    tiff: Tiff, n: int, spacing_mm: float | Sequence[float] | None, notes: list[str]
-) -> Floats | None:
+def _steps(tiff: Tiff, n: int, spacing_mm: float | Sequence[float] | None) -> Floats | None:
     """Return n voxel sizes, mm, as the file or `spacing_mm` states; None without any. InputError
     if they differ.
     """
@@ -169,9 +173,7 @@ def _steps(
     if tiff.is_calibrated:
         check_spacing(spacing_mm, stated)
     elif (np.abs(sizes - stated) > SAME_SIZE * stated).any():
-        notes.append(
-            f"its resolution tags say {_sizes(stated)} mm; `spacing_mm` is used, {_sizes(sizes)}"
-        )
+        note(f"its resolution tags say {_sizes(stated)} mm; `spacing_mm` is used, {_sizes(sizes)}")
     return sizes
 
 
@@ -209,9 +211,9 @@ def slice_files(path: Path) -> list[str]:
     return names
 
 
-def _series(names: list[str]) -> tuple[list[str], list[str]]:
-    """Return the names of one series in the order of their numbers, and notes; InputError for a
-    gap or two series.
+def _series(names: list[str]) -> list[str]:
+    """Return the names of one series in the order of their numbers; InputError for a gap or two
+    series.
     """
     parts = {name: re.split(r"(\d+)", name) for name in names}
     forms = {name: tuple(part.lower() for part in each[::2]) for name, each in parts.items()}
@@ -242,17 +244,11 @@ def _series(names: list[str]) -> tuple[list[str], list[str]]:
             f"expected evenly numbered slices, got {order[k]} followed by {order[k + 1]}; a "
             "slice is missing or doubled"
         )
-    notes = (
-        [f"{others[0]} does not belong to the series of {order[0]} and is left out"]
-        if others
-        else []
-    )
-    notes += (
-        [f"its slices are numbered in steps of {steps[0]}; `spacing_mm` is their distance"]
-        if steps[0] > 1
-        else []
-    )
-    return order, notes
+    if others:
+        note(f"{others[0]} does not belong to the series of {order[0]} and is left out")
+    if steps[0] > 1:
+        note(f"its slices are numbered in steps of {steps[0]}; `spacing_mm` is their distance")
+    return order
 
 
 def _affine(sizes: Floats) -> Floats:
@@ -273,11 +269,7 @@ def _slices_of(path: str, names: list[str], has_spacing: bool) -> Tiff:
     for k, name in enumerate(names):
         file = str(Path(path) / name)
         try:
-            tiff = (
-                _stack_of(file, True)
-                if name.lower().endswith(TIFF_SUFFIXES) and _has_tifffile()
-                else Tiff(None)
-            )
+            tiff = _stack_of(file, True) if _is_for_tifffile(name) else Tiff(None)
             first = tiff if k == 0 else first
             if not has_spacing and (not tiff.is_calibrated or None in tiff.sizes):
                 break
@@ -335,15 +327,14 @@ def _stack_of(path: str, is_page: bool) -> Tiff:
             return tiff
         if words:
             raise InputError(f"truncated or damaged; copy it again ({words[0]})")
-        notes = [*tiff.notes]
-        shape = _stack_shape(file, axes, notes)
+        shape = _stack_shape(file, axes)
         flips = _axes_to_flip(first)
         check_room(shape, series[0].dtype.itemsize)
         parts = [_values(each) for each in series]
         data = (parts[0] if len(parts) == 1 else np.stack(parts)).reshape(shape)
         if words:
             raise InputError(f"truncated or damaged; copy it again ({words[0]})")
-        return tiff._replace(voxels=np.flip(data, flips).T, notes=notes)
+        return tiff._replace(voxels=np.flip(data, flips).T)
 
 
 def _stack_axes(file: Any) -> dict[str, int]:
@@ -354,7 +345,7 @@ def _stack_axes(file: Any) -> dict[str, int]:
     return {name: int(size) for name, size in (*axes, *of_ome) if int(size) > 1}
 
 
-def _stack_shape(file: Any, axes: dict[str, int], notes: list[str]) -> list[int]:
+def _stack_shape(file: Any, axes: dict[str, int]) -> list[int]:
     """Return the numbers of slices, rows and columns; InputError unless the pages are one stack."""
     series, description = file.series, file.pages.first.description
     # A program may write a page at a time, each as a picture of its own.
@@ -364,7 +355,7 @@ def _stack_shape(file: Any, axes: dict[str, int], notes: list[str]) -> list[int]
         raise InputError(f"expected slices of one size and type, got {shapes}; export one stack")
     is_imagej = description.startswith("ImageJ=") and "\nspacing=" in description
     if is_imagej and set(axes) == set("CYX") and axes["C"] > MOST_CHANNELS:
-        notes.append(f"its {axes.pop('C')} channels have a slice spacing: they are read as slices")
+        note(f"its {axes.pop('C')} channels have a slice spacing: they are read as slices")
     if wrong := [f"{axes[name]} {word}" for name, word in AXIS_WORDS.items() if name in axes]:
         raise InputError(
             f"expected a stack of grey slices, got {' and '.join(wrong)}; export one part"
@@ -396,23 +387,19 @@ def _axes_to_flip(page: Any) -> tuple[int, ...]:
 
 def _tiff_of(page: Any) -> Tiff:
     """Return what a page states of its voxels."""
-    notes = []
     if page.photometric == 0:
-        notes.append("its photometric says that 0 is white; values are kept as stored")
+        note("its photometric says that 0 is white; values are kept as stored")
     fields: dict[str, str] = {}
     for line in page.description.splitlines() if page.description.startswith("ImageJ=") else ():
         key, _, fields[key] = line.partition("=")
     pixels = _ome_pixels(page.description)
     own = _ome_sizes(pixels) if pixels else _imagej_sizes(page, fields)
-    scale = (
-        _imagej_scale(fields, notes)
-        if page.dtype is not None and page.dtype.kind == "u"
-        else (1.0, 0.0)
-    )
-    return Tiff(None, own or _resolution(page), own is not None, scale, notes)
+    is_unsigned = page.dtype is not None and page.dtype.kind == "u"
+    scale = _imagej_scale(fields) if is_unsigned else (1.0, 0.0)
+    return Tiff(None, own or _resolution(page), own is not None, scale)
 
 
-def _imagej_scale(fields: dict[str, str], notes: list[str]) -> tuple[float, float]:
+def _imagej_scale(fields: dict[str, str]) -> tuple[float, float]:
     """Return slope and intercept of ImageJ's calibration, if it is a straight line; others are
     noted.
     """
@@ -425,7 +412,7 @@ def _imagej_scale(fields: dict[str, str], notes: list[str]) -> tuple[float, floa
         except (KeyError, ValueError):
             pass
     if curve != IMAGEJ_NONE:
-        notes.append(
+        note(
             "its values are as stored: ImageJ's calibration of them is no straight line and is "
             "not applied"
         )

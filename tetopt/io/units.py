@@ -11,6 +11,7 @@ import numpy as np
 
 from tetopt.errors import InputError
 from tetopt.io.text import plain
+from tetopt.io.volumes import note
 from tetopt.system.arrays import Floats
 
 # NGFF's units of length, with names of UDUNITS-2, in mm.
@@ -93,7 +94,7 @@ def mm_of_unit(word: str, name: str = "unit") -> float | None:
     )
 
 
-def mm_of_axes(words: Sequence[str], name: str, notes: list[str]) -> Floats | None:
+def mm_of_axes(words: Sequence[str], name: str) -> Floats | None:
     """Return the length of each axis's unit, mm, assuming mm where one is missing; None if all are
     missing.
 
@@ -106,19 +107,16 @@ def mm_of_axes(words: Sequence[str], name: str, notes: list[str]) -> Floats | No
         A word is not a length.
     """
     lengths = [mm_of_unit(word, name) for word in words]
-    missing = {
-        axis: word for axis, (word, mm) in enumerate(zip(words, lengths, strict=True)) if mm is None
-    }
-    if any(missing.values()) or 0 < len(missing) < len(words):
-        listed = ", ".join(f'axis {axis}: "{plain(word)}"' for axis, word in missing.items())
-        notes.append(f"{name}: expected a unit of length, got none for {listed}; assuming mm")
-    if len(missing) == len(words):
-        return None
-    return np.array([1.0 if mm is None else mm for mm in lengths])
+    missing = [axis for axis, mm in enumerate(lengths) if mm is None]
+    is_whole = len(missing) == len(words)
+    if missing and (not is_whole or any(words)):
+        listed = ", ".join(f'axis {axis}: "{plain(words[axis])}"' for axis in missing)
+        note(f"{name}: expected a unit of length, got none for {listed}; assuming mm")
+    return None if is_whole else np.array([1.0 if mm is None else mm for mm in lengths])
 
 
-def notes_of_size(shape: Sequence[int], affine: Floats, lengths: Floats | None) -> list[str]:
-    """Return a warning if the longest side of the image's box is unusual.
+def note_size(shape: Sequence[int], affine: Floats, lengths: Floats | None) -> None:
+    """Note an unusual longest side of the image's box.
 
     `lengths` are those of the axes' units, mm; None if the file states no unit, which may then be
     another than mm.
@@ -126,13 +124,11 @@ def notes_of_size(shape: Sequence[int], affine: Floats, lengths: Floats | None) 
     steps = np.linalg.norm(affine[:-1, :-1], axis=0)
     longest = max(float(step) * size for step, size in zip(steps, shape, strict=False))
     if SHORTEST_BOX <= longest <= LONGEST_BOX or (lengths is not None and (lengths != 1.0).any()):
-        return []
-    if lengths is not None:
-        return [
-            f"the longest side of its box is {longest:.4g} mm, in the unit that its header states"
-        ]
+        return
     voxel = " x ".join(f"{step:.4g}" for step in steps)
-    return [
-        f"the longest side of its box is {longest:.4g} mm; are its voxels {voxel} mm, or in "
-        "another unit?"
-    ]
+    rest = (
+        f"; are its voxels {voxel} mm, or in another unit?"
+        if lengths is None
+        else ", in the unit that its header states"
+    )
+    note(f"the longest side of its box is {longest:.4g} mm{rest}")

@@ -5,7 +5,9 @@ about damaged files.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,16 +30,33 @@ UNREADABLE_FILE = (
 )
 
 
+Voxels = tuple[NDArray, Floats]  # data and affine
+_NOTES: ContextVar[list[str]] = ContextVar("notes")
+
+
+@contextmanager
+def collect_notes() -> Iterator[list[str]]:
+    """Collect what is noted within this context."""
+    notes = list[str]()
+    token = _NOTES.set(notes)
+    try:
+        yield notes
+    finally:
+        _NOTES.reset(token)
+
+
+def note(*texts: str) -> None:
+    """Note oddities of the file that is read, each once; nothing outside `collect_notes`."""
+    notes = _NOTES.get([])
+    notes += [text for text in texts if text not in notes]
+
+
 class Request(NamedTuple):
     """The part of a file to read, and voxel sizes for files that state none."""
 
     volume: int | None
     spacing_mm: float | Sequence[float] | None
     box: Callable[[Sequence[int]], list[tuple[int, int]]]  # of a volume with this shape
-
-
-def _no_files(_path: Path) -> list[Path]:
-    return []
 
 
 class Reader(NamedTuple):
@@ -65,10 +84,12 @@ class Reader(NamedTuple):
     """
 
     suffixes: tuple[str, ...]
-    read: Callable[[Path, Request, list[str]], tuple[NDArray, Floats]]
+    read: Callable[[Path, Request], Voxels]
     is_this: Callable[[Path], bool] = lambda _path: False
     shape: Callable[[Path], tuple[int, ...] | None] = lambda _path: None
-    other_files: Callable[[Path], list[Path]] = _no_files
+    # of a pyramid, the numbers of voxels by the level's folder
+    levels: Callable[[Path], Mapping[str, tuple[int, ...]]] = lambda _path: {}
+    other_files: Callable[[Path], Sequence[Path]] = lambda _path: ()
     has_spacing: bool = True
     reads_crop: bool = False
     reads_slice: bool = False

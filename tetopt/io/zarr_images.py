@@ -23,8 +23,17 @@ from tetopt.errors import InputError
 from tetopt.image import check_affine, check_kind, shifted_affine
 from tetopt.io.apart import read_apart
 from tetopt.io.text import plain
-from tetopt.io.units import mm_of_axes, notes_of_size
-from tetopt.io.volumes import Reader, Request, check_room, one_line, volume_index
+from tetopt.io.units import mm_of_axes, note_size
+from tetopt.io.volumes import (
+    Reader,
+    Request,
+    Voxels,
+    check_room,
+    collect_notes,
+    note,
+    one_line,
+    volume_index,
+)
 from tetopt.system.arrays import Floats, Json
 from tetopt.system.budget import check_memory
 from tetopt.system.extras import install_hint
@@ -62,6 +71,9 @@ MOST_LEVELS = 64  # in a multiscale: more than halving any volume can give
 STRUCTURE_ERRORS = (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError)
 
 
+Pick = int | list[int]  # of an axis: an index, or start and stop
+
+
 class ZarrLevel(NamedTuple):
     """One array of an image, with its placement."""
 
@@ -89,7 +101,6 @@ class _Axes(NamedTuple):
     space: list[int]  # numbers of the spatial axes
     rows: list[int]  # of the affine, for each spatial axis
     steps: Floats  # mm along this row per unit of the axis
-    notes: list[str]
     mm: Floats | None  # lengths of units, if there are any
 
 
@@ -109,36 +120,45 @@ def is_node(path: Path) -> bool:
     return any((path / name).exists() for name in NODE_FILES)
 
 
-def read_zarr(path: Path, request: Request, notes: list[str]) -> tuple[NDArray, Floats]:
+def read_zarr(path: Path, request: Request) -> Voxels:
     """Return data and affine of the requested box of the finest level, of which nothing else is
     read.
     """
-    level = zarr_levels(path, notes)[0]
+    level = zarr_levels(path)[0]
     bounds = request.box(level.shape)
-    shape, picks = (
-        [stop - start for start, stop in bounds],
-        zarr_picks(level, request.volume, bounds),
+    shape = [stop - start for start, stop in bounds]
+    picks = zarr_picks(level, request.volume, bounds)
+    value_bytes = level.array.dtype.itemsize
+    check_room(shape, value_bytes)
+    check_chunks(level, picks)
+    n_bytes = math.prod(shape) * value_bytes
+    # in a child process, as compiled codecs trust the headers of chunks
+    values = read_apart(
+        _values, level.folder, picks, size=n_bytes, value_bytes=n_bytes, library="zarr"
     )
-    check_room(shape, level.array.dtype.itemsize)
-    check_chunks(level, picks, notes)
-    affine = shifted_affine(level.affine, [start for start, _ in bounds])
-    return read_chunks(level, picks, math.prod(shape)), affine
+    return values, shifted_affine(level.affine, [start for start, _ in bounds])
 
 
 def zarr_shape(path: Path) -> tuple[int, ...]:
     """Return the number of voxels along the three spatial axes, then the lengths of the others."""
-    level = zarr_levels(path, [])[0]
+    level = zarr_levels(path)[0]
     return (*level.shape, *(int(level.array.shape[axis]) for axis in level.others))
 
 
 ZARR = Reader(
-    (ZARR_SUFFIX,), read_zarr, is_this=is_zarr, shape=zarr_shape, reads_crop=True, reads_slice=True
+    (ZARR_SUFFIX,),
+    read_zarr,
+    is_this=is_zarr,
+    shape=zarr_shape,
+    levels=lambda path: {str(level.folder): level.shape for level in zarr_levels(path)},
+    reads_crop=True,
+    reads_slice=True,
 )
 
 
 def zarr_picks(
     level: ZarrLevel, volume: int | None, bounds: Sequence[tuple[int, int]]
-) -> list[int | slice]:
+) -> list[Pick]:
     """Return the index of a box of one volume of a level, along all axes of its array.
 
     Raises
@@ -149,30 +169,14 @@ def zarr_picks(
     words = ", ".join(f"{level.names[axis]} ({level.array.shape[axis]})" for axis in level.others)
     # The last axis varies fastest, as in the file.
     trailing = [level.array.shape[axis] for axis in level.others[::-1]]
-    picks: dict[int, int | slice] = dict(
+    picks: dict[int, Pick] = dict(
         zip(level.others[::-1], volume_index(trailing, volume, words), strict=True)
     )
-    picks |= {axis: slice(*ends) for axis, ends in zip(level.space, bounds, strict=True)}
+    picks |= {axis: list(ends) for axis, ends in zip(level.space, bounds, strict=True)}
     return [picks[axis] for axis in range(len(picks))]
 
 
-def read_chunks(level: ZarrLevel, picks: Sequence[int | slice], n_voxels: int) -> NDArray:
-    """Read voxels in a child process, as compiled codecs trust the headers of chunks.
-
-    Raises
-    ------
-    InputError
-        Without a leading path: chunks are damaged, or a codec crashes on them.
-    """
-    index = [[pick.start, pick.stop] if isinstance(pick, slice) else pick for pick in picks]
-    n_bytes = n_voxels * level.array.dtype.itemsize
-    values: NDArray = read_apart(
-        _values, level.folder, index, size=n_bytes, value_bytes=n_bytes, library="zarr"
-    )
-    return values
-
-
-def _values(folder: str, index: list[list[int] | int]) -> NDArray:
+def _values(folder: str, index: list[Pick]) -> NDArray:
     """Return a part of an array, in the child."""
     array = _node(Path(folder))
     try:
@@ -190,7 +194,7 @@ def _values(folder: str, index: list[list[int] | int]) -> NDArray:
         ) from error
 
 
-def zarr_levels(path: Path, notes: list[str]) -> list[ZarrLevel]:
+def zarr_levels(path: Path) -> list[ZarrLevel]:
     """Return the arrays of an image, the finest first: those of OME-Zarr's first multiscale, from
     a level on if `path` is one of them, or a single array.
 
@@ -205,7 +209,7 @@ def zarr_levels(path: Path, notes: list[str]) -> list[ZarrLevel]:
         _check_array(node)
         if (affine := _own_affine(node)) is None:
             if (folder := image_folder(path)) is not None:
-                levels = zarr_levels(folder, notes)
+                levels = zarr_levels(folder)
                 names = [level.folder for level in levels]
                 if path in names:
                     return levels[names.index(path) :]
@@ -229,7 +233,7 @@ def zarr_levels(path: Path, notes: list[str]) -> list[ZarrLevel]:
         )
         raise InputError(f"this Zarr group has no OME-Zarr image (multiscales){listed}")
     try:
-        return _levels(path, ome["multiscales"][0], notes)
+        return _levels(path, ome["multiscales"][0])
     except InputError:
         raise
     except STRUCTURE_ERRORS as error:
@@ -322,17 +326,20 @@ def _node(path: Path, name: str = "") -> Any:
         ) from error
 
 
-def _levels(path: Path, scales: Json, notes: list[str]) -> list[ZarrLevel]:
+def _levels(path: Path, scales: Json) -> list[ZarrLevel]:
     """Return the arrays of a multiscale; errors of `STRUCTURE_ERRORS` if it has another
     structure than NGFF's.
     """
-    axes, after = _axes_of(scales["axes"]), scales.get("coordinateTransformations", [])
+    with collect_notes() as notes:  # of no concern to an image with its own affine
+        axes = _axes_of(scales["axes"])
+    after = scales.get("coordinateTransformations", [])
     levels = [_level(path, each, after, axes) for each in scales["datasets"][:MOST_LEVELS]]
     own = _own_affine(levels[0].array)
     if own is None:
-        notes += axes.notes + notes_of_size(levels[0].shape, levels[0].affine, axes.mm)
+        note(*notes)
+        note_size(levels[0].shape, levels[0].affine, axes.mm)
         return levels
-    notes += notes_of_size(levels[0].shape, own, np.ones(3))
+    note_size(levels[0].shape, own, np.ones(3))
     # NGFF 0.5 has no rotations: the attribute of the first level places all levels.
     turn = own @ np.linalg.inv(levels[0].affine)
     return [
@@ -357,7 +364,7 @@ def _level(path: Path, dataset: Json, after: Sequence[dict], axes: _Axes) -> Zar
 
 def _axes_of(axes: list[Json]) -> _Axes:
     """Return the axes of a multiscale."""
-    names, notes = tuple(plain(str(axis.get("name"))) for axis in axes), list[str]()
+    names = tuple(plain(str(axis.get("name"))) for axis in axes)
     kinds = [
         axis.get("type", "space" if axis.get("name") in ("x", "y", "z") else None) for axis in axes
     ]
@@ -370,12 +377,12 @@ def _axes_of(axes: list[Json]) -> _Axes:
         )
     units = [axes[number].get("unit") or "" for number in space]
     if not any(units):
-        notes.append("has no unit on its axes: assuming mm")
-    mm = mm_of_axes(units, "its OME-Zarr metadata: unit", notes)
+        note("has no unit on its axes: assuming mm")
+    mm = mm_of_axes(units, "its OME-Zarr metadata: unit")
     ways = [WAYS.get((axes[number].get("orientation") or {}).get("value", "")) for number in space]
     if None in ways:
         ways = [WAYS.get(names[number].lower()) for number in space]
-        notes.append(
+        note(
             "has no orientation: assuming x, y and z are right, anterior and superior; if "
             "left/right "
             "matters, give its axes an orientation (NGFF's RFC-4)"
@@ -383,7 +390,7 @@ def _axes_of(axes: list[Json]) -> _Axes:
     rows, signs = zip(*(way or (None, 0.0) for way in ways), strict=True)
     if set(rows) != {0, 1, 2}:
         raise _unusable("axes", words, "x, y and z, or three different orientations")
-    return _Axes(names, space, list(rows), np.array(signs) * (1.0 if mm is None else mm), notes, mm)
+    return _Axes(names, space, list(rows), np.array(signs) * (1.0 if mm is None else mm), mm)
 
 
 def _scale_and_shift(transforms: list[Json], n: int) -> tuple[Floats, Floats]:
@@ -439,12 +446,12 @@ def _check_array(array: Any) -> None:
     )
 
 
-def check_chunks(level: ZarrLevel, picks: Sequence[int | slice], notes: list[str]) -> None:
+def check_chunks(level: ZarrLevel, picks: Sequence[Pick]) -> None:
     """Check that the files of these voxels' chunks are regular, and not longer or shorter than they
     can be.
 
-    Writers omit chunks that contain only the fill value; therefore some missing chunks only add to
-    `notes`, but if all are missing it is an error.
+    Writers omit chunks that contain only the fill value; therefore some missing chunks are only
+    noted, but if all are missing it is an error.
 
     Raises
     ------
@@ -454,9 +461,7 @@ def check_chunks(level: ZarrLevel, picks: Sequence[int | slice], notes: list[str
     array = level.array
     edges = array.shards or array.chunks
     ranges = [
-        range(pick.start // size, -(-pick.stop // size))
-        if isinstance(pick, slice)
-        else [pick // size]
+        range(pick[0] // size, -(-pick[1] // size)) if isinstance(pick, list) else [pick // size]
         for pick, size in zip(picks, edges, strict=True)
     ]
     most_bytes = PACKED_BYTES + PACKED_VOXEL_BYTES * math.prod(edges)
@@ -492,7 +497,7 @@ def check_chunks(level: ZarrLevel, picks: Sequence[int | slice], notes: list[str
             f"all of its {n_chunks} chunks are missing; copy it again, with its whole folder"
         )
     if n_missing > 0:
-        notes.append(
+        note(
             f"{n_missing} of its {n_chunks} chunks are missing; their voxels get its fill value, "
             f"{array.fill_value or 0:g}; copy it again if it should have values there"
         )
