@@ -76,17 +76,16 @@ def test_a_mesh_s_file_has_its_sets_and_its_box():
 
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_every_format_is_written(here, suffix, capsys):
-    out, is_surface = f"out{suffix}", FORMATS[suffix].is_surface
-    more = "" if is_surface else f"--young {MAPPING} --bins 3 --set dark=below:20"
-    assert_done(f"convert mesh.vtu {out} {more} --space lps")
+    out = f"out{suffix}"
+    assert_done(
+        f"convert mesh.vtu {out} --young {MAPPING} --bins 3 --set dark=below:20 --space lps"
+    )
     assert Path(out).stat().st_size > 900
     said = capsys.readouterr().out
-    units = "" if is_surface else ", kPa, "
-    assert f"{out}: {FORMATS[suffix].what}, LPS+ mm{units}" in said
-    if more:
-        assert "3 materials" in said or "6 materials" in said or "4 materials" in said
-        assert "modulus error" in said
-        assert "dark_surface" in said
+    assert f"{out}: {FORMATS[suffix].what}, LPS+ mm, kPa, " in said
+    assert "3 materials" in said or "6 materials" in said or "4 materials" in said
+    assert "modulus error" in said
+    assert "dark_surface" in said
     assert here() == [out]
     assert exit_code(f"convert mesh.vtu {out}") == 2  # is there already
 
@@ -110,7 +109,7 @@ def test_convert_keeps_the_order_unless_told_otherwise(quadratic_path, capsys):
     mesh = load_mesh("mesh.vtu").mesh
     n_corners, n_all = len(mesh.points), len(quadratic(mesh.points, mesh.cells)[0])
     capsys.readouterr()
-    for suffix in (".vtu", ".msh", ".inp", ".stl"):
+    for suffix in (".vtu", ".msh", ".inp"):
         form = FORMATS[suffix]
         out, numbers = f"kept{suffix}", f"kept{suffix}.json"
         assert_done(f"convert {quadratic_path} {out} --json {numbers}")
@@ -688,11 +687,10 @@ def test_numbers_of_loads_are_printed_without_rounding_errors_and_kept_with_them
         ("a.inp", "--units psi", "--units: expected one of kPa, MPa, Pa, got psi"),
         ("a.inp", "--space xyz", "--space: expected ras or lps"),
         ("a.inp", "--order 3", "--order: expected 1 or 2"),
-        ("a.stl", "--order 2", "--order 2 is for .vtu, .vtk, "),
         ("a.inp", "--load compress:5%", "loads need materials"),
         ("a.inp", "--set x=above:3", "expected NAME=below:T"),
         ("a.feb", "", "needs a material; give a modulus mapping (--young)"),
-        ("a.stl", "--young 2", "contains only the boundary"),
+        ("a.stl", "", "known suffixes are .vtu (VTK, ParaView), "),
         ("a.inp", "--mask m.nii.gz", "--mask: needs --image"),
     ],
 )
@@ -726,9 +724,9 @@ def test_what_will_not_do_is_said_before_the_optimisation(capsys):
         ),
     ):
         assert_refused(capsys, f"mesh a.nii.gz -o {out} --spacing 8 {more}", "")
-    for out in ("a.inp", "a.feb", "a.stl"):
-        more = "" if out == "a.stl" else "--young 2"
-        assert_refused(capsys, f"mesh a.nii.gz --slice k=3 -o {out} --nodes 60 {more}", "triangles")
+    for out in ("a.inp", "a.feb"):
+        mesh = f"mesh a.nii.gz --slice k=3 -o {out} --nodes 60 --young 2"
+        assert_refused(capsys, mesh, "triangles")
     assert_refused(
         capsys, "mesh a.nii.gz --slice k=3 -o a.vtu --nodes 60 --space lps", "omit --space"
     )

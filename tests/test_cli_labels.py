@@ -263,9 +263,7 @@ def test_sets_that_are_none(capsys):
         "convert plain.vtu a.vtu --sets labels,faces",
         '--sets: expected some of labels, interfaces, boundary, or all, or none, got "faces"',
     )
-    assert_refused(
-        capsys, "convert plain.vtu a.stl --sets all", "leave out --young, --bins, --set, --sets"
-    )
+
     assert_refused(
         capsys,
         "fem plain.vtu --young 1 --load compress:5% --sets all",

@@ -25,8 +25,6 @@ MESH_OUTPUTS = (
     ".feb",
     ".mfem",
     ".mesh",
-    ".stl",
-    ".ply",
 )
 # What a second mutation meets in a file whose format the first has damaged.
 LOST_FORMAT = (

@@ -42,8 +42,7 @@ def print_model(output: Path, model: Model, solver: SolverOptions) -> None:
     """
     for line in _lines(output, model, solver):
         print_line(line)
-    if format_of(output).is_surface:
-        return
+
     size = "area, mm2" if model.mesh.ndim == 3 else "length, mm"
     table, cells, sets = (
         new_table("set", "facets", size, "nodes", "cells"),
@@ -148,9 +147,8 @@ def _load_lines(output: Path, model: Model) -> Iterator[str]:
 
 def _lines(output: Path, model: Model, solver: SolverOptions) -> Iterator[str]:
     form, suffix = format_of(output), output.suffix.lower()
-    if not form.is_surface:
-        yield from _moduli_lines(output, model)
-        yield from _load_lines(output, model)
+    yield from _moduli_lines(output, model)
+    yield from _load_lines(output, model)
     if suffix in GMSH_SUFFIXES:
         yield from _gmsh_lines(model, suffix)
     elif suffix in CELL_NUMBERS:
@@ -167,8 +165,6 @@ def _lines(output: Path, model: Model, solver: SolverOptions) -> Iterator[str]:
     )
     length = STRESS_UNITS[solver.units].length
     space = f"{solver.space.upper()}+ {length}" if model.mesh.ndim == 3 else length
-    if form.is_surface:
-        yield f"{output}: {form.what}, {space}"
-        return
+
     size = f"{nodes_in_words(model.mesh, model.order)}, {len(model.mesh.cells)} cells"
     yield f"{output}: {form.what}, {space}, {solver.units}, {size}"

@@ -35,7 +35,6 @@ from tetopt.job.solver_files import (
 from tetopt.mesh import Mesh
 from tetopt.model.fields import is_stress
 from tetopt.model.file import (
-    MATERIAL_FIELDS,
     REACTIONS_TEXT,
     MeshFile,
     loads_in,
@@ -111,36 +110,27 @@ def convert_file(
             loaded = without_stale_results(loaded, is_stale=is_stale)
     else:
         loaded = with_results(loaded, results)
-    solver, is_surface = (
-        replace(solver, order=_order_of(loaded, solver, output)),
-        format_of(output).is_surface,
-    )
+    solver = replace(solver, order=_order_of(loaded, solver, output))
     loaded = _with_straight_edges(loaded) if solver.order == 1 else loaded
     check_solver_options(output, solver, has_materials="young" in loaded.cell_data)
     if image is None and solver.average is not None:
         raise InputError(
             f"`average`: {solver.average} averages over voxels and needs an image; pass `image`"
         )
-    if not solver.loads and not is_surface:
+    if not solver.loads:
         solver = replace(solver, loads=_loads_of_file(loaded, choice))
     loaded, what, is_other = voxels_of(loaded, mesh, image, part, part.labels)
     loaded = _of_labels(loaded, choice)
-    about, box, voxels = (
-        _texts_of(loaded, solver, has_new_results=results is not None),
-        loaded.box,
-        None,
-    )
+    about = _texts_of(loaded, solver, has_new_results=results is not None)
+    box = loaded.box
+    voxels = None
     if image is not None and what is not None:
         about = texts_of(loaded, is_other=True) if is_other else about
         about |= {"image": image.name, "image_sha256": sha256(image)}
         voxels, box = what.image, box_of(what.given) if box is None else box
     if box is not None:
         about["box"] = box_text(box)
-    if is_surface:  # a surface has no materials
-        kept = {
-            name: rows for name, rows in loaded.cell_data.items() if name not in MATERIAL_FIELDS
-        }
-        loaded = loaded._replace(cell_data=kept)
+
     model = with_chosen_sets(convert_model(loaded, voxels, solver, about, box), output, solver)
     save_for_solver(output, model, solver)
     files = {"mesh": mesh.name, "output": output.name, "units": solver.units, "space": solver.space}
@@ -290,6 +280,5 @@ def _order_of(loaded: MeshFile, solver: SolverOptions, output: Path) -> int:
     form = format_of(output)
     if solver.order is not None or loaded.order == 1 or form.has_quadratic:
         return solver.order or loaded.order
-    if not form.is_surface:
-        note(f"{output}: {form.what} has no quadratic cells; they are written as linear cells")
+    note(f"{output}: {form.what} has no quadratic cells; they are written as linear cells")
     return 1

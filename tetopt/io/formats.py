@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -19,7 +20,6 @@ from tetopt.io.gmsh import gmsh22, gmsh41
 from tetopt.io.medit import medit
 from tetopt.io.mfem import mfem
 from tetopt.io.readback import save_checked
-from tetopt.io.surfaces import boundary_ply, boundary_stl
 from tetopt.io.text import file_name, legacy_name, names_apart, plain, short_name
 from tetopt.io.vtk import VTK_SUFFIXES, vtk, vtu
 from tetopt.io.xdmf import xdmf
@@ -37,10 +37,10 @@ class Format(NamedTuple):
 
     what: str
     write: Callable[[Model], bytes | str]
-    has_quadratic: bool = False
+    has_quadratic: bool = True
     # whether loads become a step that the solver runs; otherwise they are only text in the file
     runs: bool = False
-    is_surface: bool = False  # contains only the boundary
+
     # otherwise a modulus that varies within cells is averaged over each
     has_node_moduli: bool = False
     has_large: bool = False  # whether a step can request large deformation
@@ -49,30 +49,23 @@ class Format(NamedTuple):
 
 
 FORMATS = {
-    ".vtu": Format("VTK, ParaView", vtu, has_quadratic=True, has_node_moduli=True),
-    ".vtk": Format("legacy VTK, 3D Slicer", vtk, has_quadratic=True, has_node_moduli=True),
-    ".xdmf": Format("XDMF with tags, FEniCSx", xdmf, has_quadratic=True, has_node_moduli=True),
-    ".msh": Format("gmsh 4.1", gmsh41, has_quadratic=True, fields="none"),
-    ".msh2": Format("gmsh 2.2", gmsh22, has_quadratic=True, fields=""),
+    ".vtu": Format("VTK, ParaView", vtu, has_node_moduli=True),
+    ".vtk": Format("legacy VTK, 3D Slicer", vtk, has_node_moduli=True),
+    ".xdmf": Format("XDMF with tags, FEniCSx", xdmf, has_node_moduli=True),
+    ".msh": Format("gmsh 4.1", gmsh41, fields="none"),
+    ".msh2": Format("gmsh 2.2", gmsh22, fields=""),
     ".inp": Format(
-        "Abaqus, CalculiX",
-        abaqus,
-        has_quadratic=True,
-        runs=True,
-        has_node_moduli=True,
-        has_large=True,
-        fields="",
+        "Abaqus, CalculiX", abaqus, runs=True, has_node_moduli=True, has_large=True, fields=""
     ),
-    ".feb": Format("FEBio 4.0", febio, has_quadratic=True, runs=True, has_large=True, fields=""),
-    ".mfem": Format("MFEM mesh", mfem, has_quadratic=True, fields=""),
-    ".mesh": Format("medit", medit, has_quadratic=True, fields=""),
-    ".stl": Format("the boundary as STL", boundary_stl, is_surface=True, fields=""),
-    ".ply": Format("the boundary as PLY", boundary_ply, is_surface=True, fields=""),
+    ".feb": Format("FEBio 4.0", febio, runs=True, has_large=True, fields=""),
+    ".mfem": Format("MFEM mesh", mfem, fields=""),
+    ".mesh": Format("medit", medit, fields=""),
 }
 FIELDS = ("none", "mean", "all")  # of cells, besides labels and results
 # formats of 64-bit integers; others convert large ones to float64
 EXACT_INTEGERS = (".vtu", ".xdmf")
 MOST_OF_FLOATS = 2**53  # float64 holds all integers up to this one
+FINITE_FORMATS = (".feb", ".xdmf")  # whose readers take no NaN
 # How formats whose readers limit names of data to `MOST_NAME_CHARACTERS` show them.
 SHOWN_NAMES = {".vtk": legacy_name, ".msh": short_name, ".feb": short_name}
 
@@ -139,7 +132,7 @@ def register_format(
         raise InputError(
             f"suffix: {suffix} is a built-in format ({FORMATS[suffix].what}); choose another suffix"
         )
-    FORMATS[suffix] = Format(what, write, has_quadratic, runs, False, has_node_moduli, has_large)
+    FORMATS[suffix] = Format(what, write, has_quadratic, runs, has_node_moduli, has_large)
 
 
 def format_of(path: Path) -> Format:
@@ -209,8 +202,7 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
     """
     path = Path(path)
     save_checked(path, file_bytes(path, model, space=space, units=units))
-    is_for_solver = not format_of(path).is_surface and path.suffix.lower() not in VTK_SUFFIXES
-    if is_for_solver and (words := locking_words(model)):
+    if path.suffix.lower() not in VTK_SUFFIXES and (words := locking_words(model)):
         warn(f"{path}: {words}")
 
 
@@ -283,19 +275,15 @@ def file_bytes(path: Path, model: Model, *, space: str = "ras", units: str = "kP
     InputError
         For the reasons of `save_model`.
     """
-    whole = format_of(path).write(_ready(path, model, space, units))
-    return whole.encode() if isinstance(whole, str) else whole
-
-
-def _ready(path: Path, model: Model, space: str, units: str) -> Model:
-    """Prepare a model for writing; InputError if the format does not support it."""
     kind = format_of(path)
     if model.order not in (1, 2):
         raise InputError(f"order: expected 1 or 2, got {model.order}")
     if model.order == 2 and not kind.has_quadratic:
         able = ", ".join(name for name, other in FORMATS.items() if other.has_quadratic)
         raise InputError(f"{path}: only {able} support quadratic cells; omit `order` 2")
-    return _rename_data(path, in_units(in_space(_check_model(path, model), space), units))
+    ready = in_units(in_space(_check_model(path, model), space), units)
+    whole = kind.write(_rename_data(path, ready))
+    return whole.encode() if isinstance(whole, str) else whole
 
 
 def _check_model(path: Path, model: Model) -> Model:
@@ -317,7 +305,7 @@ def _check_model(path: Path, model: Model) -> Model:
                 f"{path}: expected integers up to {most} in {plain(name)!r}, got {values.max()}; "
                 "use .vtu"
             )
-        if path.suffix.lower() == ".feb" and not np.isfinite(values).all():
+        if path.suffix.lower() in FINITE_FORMATS and not np.isfinite(values).all():
             raise InputError(
                 f"{path}: expected finite numbers in {plain(name)!r}; remove this field, or use "
                 ".vtu"
@@ -400,19 +388,16 @@ def _rename_data(path: Path, model: Model) -> Model:
     if odd := [name for name in sets if not SET_NAME.fullmatch(name)]:
         words = f"letters, digits, _ or -, the first a letter, got {plain(odd[0])!r}"
         raise InputError(f"{path}: expected set names of up to {MOST_LETTERS} {words}")
-    if len({name.lower() for name in sets}) < len(sets):
-        twice = next(
-            name
-            for k, name in enumerate(sets)
-            if name.lower() in {each.lower() for each in sets[:k]}
-        )
-        raise InputError(f"{path}: two sets have the name {twice}; rename one of them")
+    counts = Counter(map(str.lower, sets))
+    if twice := [name for name in sets if counts[name.lower()] > 1]:
+        raise InputError(f"{path}: two sets have the name {twice[1]}; rename one of them")
     shown = SHOWN_NAMES.get(path.suffix.lower(), file_name)
-    names = [names_apart(data, shown) for data in (model.cell_data, model.point_data, model.about)]
-    if changed := [new for each in names for old, new in each.items() if old != new]:
+    changed, renamed = list[str](), dict[str, Json]()
+    for part in ("cell_data", "point_data", "about"):
+        data = getattr(model, part)
+        names = names_apart(data, shown)
+        changed += [new for old, new in names.items() if old != new]
+        renamed[part] = {names[name]: values for name, values in data.items()}
+    if changed:
         warn(f"{path}: renamed data whose names the format does not support: {', '.join(changed)}")
-    cell_data, point_data, about = (
-        {new[name]: values for name, values in data.items()}
-        for new, data in zip(names, (model.cell_data, model.point_data, model.about), strict=True)
-    )
-    return model._replace(cell_data=cell_data, point_data=point_data, about=about)
+    return model._replace(**renamed)

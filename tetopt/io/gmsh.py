@@ -57,7 +57,6 @@ from tetopt.io.tags import (
     without_labels,
 )
 from tetopt.io.text import comment_lines, names_apart, rows
-from tetopt.model.fields import node_field
 from tetopt.model.file import MASK_TEXT
 from tetopt.model.model import Model, element_facets, elements
 from tetopt.model.sets import facet_triples
@@ -361,13 +360,10 @@ def _views(model: Model, parts: list[Part]) -> list[str]:
         _view("ElementData", name, numbers, values[of_cell])
         for name, values in _fields(model).items()
     ]
-    at_nodes = {
-        name: node_field(values, model.mesh, model.order)
-        for name, values in model.point_data.items()
-    }
     points = np.arange(1, len(elements(model)[0]) + 1)
     return of_cells + [
-        _view("NodeData", name, points, values) for name, values in _view_columns(at_nodes).items()
+        _view("NodeData", name, points, values)
+        for name, values in _view_columns(model.point_data).items()
     ]
 
 

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.geometry.surface import Surface, extract_surface
+from tetopt.geometry.surface import Surface
 from tetopt.interop.conversions import check_fields
 from tetopt.io.readback import save_checked
 from tetopt.io.text import plain
 from tetopt.io.vtk import LEGACY_VERSION, written_bytes, xml_bytes
-from tetopt.model.model import SPACES, STRESS_UNITS, Model, half_turn
+from tetopt.model.model import SPACES, half_turn
 from tetopt.model.sets import MOST_LETTERS, SET_NAME
 from tetopt.system.arrays import simplex_arrays
 
@@ -133,30 +133,6 @@ def _check_arrays(path: Path, surface: Surface, labels: Labels | None) -> tuple[
                 "triangles"
             )
     return surface._replace(points=points, triangles=triangles), arrays
-
-
-def boundary_stl(model: Model) -> bytes:
-    """Return the model's watertight boundary as an STL file, without any other data."""
-    return _stl(*_boundary(model), {})
-
-
-def boundary_ply(model: Model) -> bytes:
-    """Return the model's watertight boundary as a PLY file, without any other data."""
-    return _ply(*_boundary(model), {})
-
-
-def _boundary(model: Model) -> tuple[Surface, str, str]:
-    """Return the surface, a text for its file that begins with the unit of length, and the space
-    of its points.
-    """
-    if model.mesh.ndim != 3:
-        raise InputError("surface: expected a tetrahedral mesh, got triangles")
-    surface = extract_surface(model.mesh.points, model.mesh.cells, np.arange(len(model.mesh.cells)))
-    return (
-        surface,
-        f"{STRESS_UNITS[model.units].length} {model.about.get('image', '')}",
-        model.space,
-    )
 
 
 def check_surface(path: str | Path) -> SurfaceCheck:

@@ -96,7 +96,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.errors import InputError
 from tetopt.io.tags import (
     Tagged,
     as_columns,
@@ -110,7 +109,7 @@ from tetopt.model.fields import NODE_MODULI, node_field
 from tetopt.model.loads import load_words
 from tetopt.model.model import Model, element_facets, elements, header_lines
 from tetopt.model.sets import Sets
-from tetopt.system.arrays import Arrays, Floats, Ints
+from tetopt.system.arrays import Floats, Ints
 
 # By dimension and order, with VTK's order of nodes; lines must state their number of nodes.
 TOPOLOGY_TYPES = {
@@ -122,6 +121,7 @@ TOPOLOGY_TYPES = {
     (3, 2): '"Tetrahedron_10"',
 }
 GEOMETRY_TYPES = {2: "XY", 3: "XYZ"}
+VECTOR_SHAPES = ((3,),)  # of a row
 TREE_PATH = "/Xdmf/Domain/Grid/Information/Grid"
 TIME_ELEMENT = '<Time Value="0"/>\n'  # pyvista 0.49 requires it in XDMF, meshio 5.3.5 rejects it
 INFORMATION_TEXT = "&lt;main/&gt;"  # meshio parses an Information's text as XML
@@ -142,25 +142,13 @@ def xdmf(model: Model) -> bytes:
     InputError
         Data of cells or points are not finite: VTK would stop reading there and invent the rest.
     """
-    _check(model)
-    grids = []
-    if model.sets.facets:
-        grids.append(_facet_grid(model))
-    if model.sets.cells:
-        grids.append(_cell_grid(model))
-    text = _mesh_grid(model, "".join(grids))
+    facets = _facet_grid(model) if model.sets.facets else ""
+    cells = _cell_grid(model) if model.sets.cells else ""
+    text = _mesh_grid(model, facets + cells)
     return (
         '<?xml version="1.0" encoding="utf-8"?>\n<Xdmf '
         f'Version="3.0">\n<Domain>\n{text}</Domain>\n</Xdmf>\n'
     ).encode()
-
-
-def _check(model: Model) -> None:
-    for what, data in (("cell", model.cell_data), ("point", model.point_data)):
-        for name, values in data.items():
-            if bad := int((~np.isfinite(values)).sum()):
-                words = f'got {bad} invalid values of "{name}"; use .vtu'
-                raise InputError(f"xdmf: expected finite {what} data, {words}")
 
 
 def _mesh_grid(model: Model, others: str) -> str:
@@ -179,11 +167,13 @@ def _mesh_grid(model: Model, others: str) -> str:
         fields = own | {name: values for name, values in fields.items() if name not in own}
         named += [("young", _values_text(young)), ("nu", _values_text(nu))]
     points, cells = elements(model)
-    nodal = {} if model.node_young is None else {NODE_MODULI: model.node_young}
-    nodal |= model.point_data
-    at_nodes = {name: node_field(values, model.mesh, model.order) for name, values in nodal.items()}
-    columns = [(*item, "Cell") for item in _columns(fields).items()]
-    columns += [(*item, "Node") for item in _columns(at_nodes).items()]
+    at_nodes = dict(model.point_data)
+    if model.node_young is not None:
+        young_nodes = node_field(model.node_young, model.mesh, model.order)
+        at_nodes = {NODE_MODULI: young_nodes} | at_nodes
+    # scalars and vectors, no matrices: the forms that VTK recognises
+    columns = [(*item, "Cell") for item in as_columns(fields, VECTOR_SHAPES).items()]
+    columns += [(*item, "Node") for item in as_columns(at_nodes, VECTOR_SHAPES).items()]
     whole = _body(model, model.mesh.ndim, cells, _item(cells), _item(points))
     whole += "".join(
         _attribute(name, values, center, _item(values)) for name, values, center in columns
@@ -203,11 +193,6 @@ def _mesh_grid(model: Model, others: str) -> str:
         '<Grid Name="mesh" GridType="Uniform" '
         f'Reference="{TREE_PATH}">\n{texts}{whole}{tree}</Grid>\n'
     )
-
-
-def _columns(fields: Arrays) -> Arrays:
-    """Convert fields to forms that VTK recognises: scalars and vectors, no matrices."""
-    return as_columns(fields, shapes=((3,),))
 
 
 def _cell_grid(model: Model) -> str:

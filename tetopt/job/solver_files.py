@@ -75,13 +75,6 @@ def check_solver_options(
         without any.
     """
     form = format_of(output)
-    if form.is_surface and (
-        solver.young or solver.bins or solver.sets or solver.loads or solver.written_sets
-    ):
-        raise InputError(
-            f"{output}: contains only the boundary; leave out `young`, `bins`, `sets`, "
-            "`written_sets` and `loads`"
-        )
     check_model_options(solver, has_materials, reads_files=reads_files)
     if solver.average is not None and solver.young is None:
         raise InputError("`average`: needs `young`")
