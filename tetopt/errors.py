@@ -5,6 +5,8 @@ line.
 import inspect
 import os
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 
 class InputError(ValueError):
@@ -37,6 +39,16 @@ def warn(message: str, category: type[UserWarning] = UserWarning) -> None:
     while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] == "tetopt":
         n_inside, frame = n_inside + 1, frame.f_back
     warnings.warn(message, category, stacklevel=n_inside + 1)
+
+
+@contextmanager
+def prefix_errors(words: object) -> Iterator[None]:
+    """Begin InputErrors of this context with the name of a file or an option, unless they do."""
+    try:
+        yield
+    except InputError as error:
+        begins = str(error).startswith(str(words))
+        raise InputError(str(error) if begins else f"{words}: {error}") from error
 
 
 def error_words(error: Exception) -> str:

@@ -364,10 +364,10 @@ PLATE = Mesh([[0.0, 0.0], [1.0, 0.0], [1.0, 2.0], [0.0, 2.0]], [[0, 1, 2], [0, 2
         ({"young": "soft"}, "young: expected one modulus for each cell, got 'soft'"),
         (
             {"nu": 0.5},
-            "nu: expected -1 < nu < 0.5, got 0.5; for nearly incompressible tissue use 0.45 to "
-            "0.49",
+            "nu: expected -1 < nu < 0.5, got 2 invalid values, the first 0.5 in cell 0, 0.5 in "
+            "cell 1; for nearly incompressible tissue use 0.45 to 0.49",
         ),
-        ({"nu": np.nan}, "nu: expected -1 < nu < 0.5, got nan"),
+        ({"nu": np.nan}, "-1 < nu < 0.5, got 2 invalid values, the first nan in cell 0"),
         ({"fixed_nodes": []}, "fixed_nodes: expected at least one node, got none"),
         (
             {"fixed_nodes": [2.0, 3.0]},

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tetopt.contents.content import Content, continuation, continue_image
 from tetopt.contents.labels import check_labels
-from tetopt.errors import InputError
+from tetopt.errors import InputError, prefix_errors
 from tetopt.image import Image
 from tetopt.job.aligned import (
     Align,
@@ -27,7 +27,7 @@ from tetopt.job.aligned import (
     warn_of_other_world,
 )
 from tetopt.job.mesh_file import table_of_segmentation, warn_of_other_image
-from tetopt.job.options import WHOLE_BOX, BoxPart, MaskedPart, stated_part
+from tetopt.job.options import BoxPart, MaskedPart, stated_part
 from tetopt.measure.fidelity import cell_labels
 from tetopt.measure.judge import warn_of_other_mask
 from tetopt.model.file import (
@@ -44,15 +44,7 @@ from tetopt.system.arrays import Json
 AFFINE_MM = 1e-4  # affines that differ by less are equal: files round them to 32 bits
 
 
-def read_volume(path: Path, part: BoxPart = WHOLE_BOX) -> Image:
-    """Read a 3-D image; raise InputError for a 2-D one."""
-    image = read_image(path, part)
-    if image.ndim != 3:
-        raise InputError(f"{path}: expected a volume, got a {image.ndim}-D image")
-    return image
-
-
-def read_labels(path: Path, image: Image, part: BoxPart = WHOLE_BOX) -> Image:
+def read_labels(path: Path, image: Image, part: BoxPart) -> Image:
     """Read the same part of a label image; raise InputError unless it lies on the image's
     voxels.
     """
@@ -70,7 +62,9 @@ def image_and_labels(
     path: Path, labels_path: Path | None, part: BoxPart
 ) -> tuple[Image, Image | None]:
     """Read a volume, and labels on its voxels if there are any."""
-    image = read_volume(path, part)
+    image = read_image(path, part)
+    if image.ndim != 3:
+        raise InputError(f"{path}: expected a volume, got a {image.ndim}-D image")
     return image, None if labels_path is None else read_labels(labels_path, image, part)
 
 
@@ -181,11 +175,9 @@ def _with_labels(
     def beside(other: Path, aligned: Align) -> Image:
         return aligned(masks()[other, aligned], labels, str(other))
 
-    try:
+    with prefix_errors(path):
         counted = _within(labels, part, beside, loaded)
         fields = {**loaded.cell_data, LABEL_FIELD: cell_labels(counted.image, loaded.mesh)}
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
     own = table_of_segmentation(path)
     texts: Json = {TABLE_TEXT: table_words(own)} if own.names else {}
     inputs = {

@@ -50,7 +50,7 @@ from tetopt.geometry.quadratic import (
 from tetopt.geometry.simplex import determinants, volume_gradients, volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.model.mappings import check_young
+from tetopt.model.mappings import check_nu, check_young
 from tetopt.system.arrays import Bools, Floats, Ints, Json
 from tetopt.system.budget import check_memory
 
@@ -807,12 +807,7 @@ def _check_nu(nu: ArrayLike, mesh: Mesh) -> Floats:
             f"nu: expected one ratio or one for each of {len(mesh.cells)} cells, got shape "
             f"{ratios.shape}"
         )
-    if not ((ratios > -1.0) & (ratios < 0.5)).all():
-        raise InputError(
-            f"nu: expected -1 < nu < 0.5, got {nu!r}; for nearly incompressible tissue use 0.45 "
-            "to 0.49"
-        )
-    return np.broadcast_to(ratios, (len(mesh.cells),))
+    return check_nu(np.broadcast_to(ratios, (len(mesh.cells),)))
 
 
 def _check_nodes(name: str, nodes: ArrayLike, mesh: Mesh) -> Ints:

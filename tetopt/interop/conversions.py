@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tetopt.errors import InputError
+from tetopt.errors import InputError, prefix_errors
 from tetopt.geometry.simplex import orient_cells
 from tetopt.interop.notebook import in_kernel
 from tetopt.system.arrays import Arrays, Floats, Ints, Json, plain_array
@@ -131,7 +131,7 @@ def kind_of_cells(kinds: Collection[str]) -> str:
     return kind
 
 
-def simplices_of(points: Floats, cells: Ints, middles: Ints | None = None) -> Simplices:
+def simplices_of(points: Floats, cells: Ints, middles: Ints | None) -> Simplices:
     """Convert cells over points in space to the arrays of a mesh.
 
     Parameters
@@ -222,7 +222,7 @@ def _pick_cells(caller: str, points: ArrayLike, cells: Mapping[str, Ints]) -> Si
     in_space = np.zeros((len(places), 3))
     in_space[:, : places.shape[1]] = places
     renamed = corner_kinds(cells)
-    try:
+    with prefix_errors(caller):
         kind = kind_of_cells([renamed.get(name, name) for name in cells])
         name = next(name for name in cells if renamed.get(name, name) == kind)
         n_corners = CELL_DIMENSIONS[kind] + 1
@@ -241,8 +241,6 @@ def _pick_cells(caller: str, points: ArrayLike, cells: Mapping[str, Ints]) -> Si
             )
         nodes = nodes.astype(np.int64)
         return simplices_of(in_space, nodes[:, :n_corners], nodes[:, n_corners:])
-    except InputError as error:
-        raise InputError(f"{caller}: {error}") from error
 
 
 def from_pyvista(grid: Any) -> Simplices:

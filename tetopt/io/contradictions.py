@@ -64,7 +64,7 @@ def note_other_place(header: Any, shape: Sequence[int]) -> None:
     apart = np.linalg.norm(corners @ (columns - others).T + used[:3, 3] - other[:3, 3], axis=1)
     slack = SAME_VOXELS * steps.min() + SAME_FRACTION * np.linalg.norm(corners @ columns.T, axis=1)
     slack += 2.0 * np.linalg.norm(corners @ shear.T, axis=1)
-    words = [f"place it differently, by up to {apart.max():.3g} mm"] * (apart > slack).any()
+    words = [f"place it differently, by up to {apart.max():.3g} mm"] * bool((apart > slack).any())
     if np.linalg.det(columns) * np.linalg.det(others) < 0.0:
         words.append("are mirror images of each other (left/right)")
     if words:

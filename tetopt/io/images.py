@@ -506,8 +506,7 @@ def folder_checksum(path: Path, is_read: Callable[[Path], bool]) -> str:
 
 def _digest_file(digest: Any, file: Path) -> None:
     with file.open("rb") as stream:
-        while block := stream.read(1 << 20):
-            digest.update(block)
+        hashlib.file_digest(stream, lambda: digest)
 
 
 def _raise_error(error: OSError) -> None:

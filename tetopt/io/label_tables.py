@@ -22,12 +22,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tetopt.contents.labels import LARGEST_LABEL, hex_colour
-from tetopt.errors import InputError
+from tetopt.errors import InputError, prefix_errors
 from tetopt.io.itk_headers import NRRD_SUFFIXES, read_header
 from tetopt.io.read_dicom import dicom_file, read_segments_table
 from tetopt.io.segments import segments_of, segments_table
 from tetopt.io.text import plain
-from tetopt.io.volumes import one_line
 from tetopt.model.label_names import NO_TABLE, LabelTable
 from tetopt.system.incoming import irregular, text_of
 
@@ -138,14 +137,12 @@ def own_label_table(path: Path) -> LabelTable:
     InputError
         The file is such a segmentation and cannot be read.
     """
-    try:
+    with prefix_errors(path):
         if (file := dicom_file(path)) is not None:
             return read_segments_table(file)
         if not path.name.lower().endswith(NRRD_SUFFIXES) or irregular(path) is not None:
             return NO_TABLE
         return segments_table(segments_of(read_header(path).texts))
-    except InputError as error:
-        raise InputError(f"{path}: {one_line(error)}") from error
 
 
 def _entries(path: Path, lines: list[tuple[int, str]]) -> Iterator[LabelEntry]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.errors import InputError
+from tetopt.errors import InputError, prefix_errors
 from tetopt.geometry.quadratic import numbered_edges
 from tetopt.interop.conversions import (
     CELL_DIMENSIONS,
@@ -81,15 +81,13 @@ def load_mesh(path: str | Path) -> MeshFile:
     units = STRESS_UNITS.get(text_in(raw.field_data, "units") or "kPa")
     if units is not None and units.mm != 1.0:
         raw = raw._replace(points=raw.points * units.mm)
-    try:
+    with prefix_errors(path):
         kind = kind_of_cells(raw.cells)
         n = CELL_DIMENSIONS[kind]
         points = half_turn(raw.points) if n == 3 and raw.space == "lps" else raw.points
         picked = simplices_of(points, raw.cells[kind], raw.middles.get(kind))
         middles, is_curved, of_edges = _middles(raw, kind)
         mesh = Mesh(picked.points, picked.cells, points[middles, :n] if is_curved else None)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
     used = picked.used
     sets, of_sets = (
         _sets_of_groups(raw, mesh, kind, used) if raw.groups else sets_in(raw.field_data, mesh)

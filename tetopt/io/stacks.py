@@ -20,7 +20,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.errors import InputError
+from tetopt.errors import InputError, prefix_errors
 from tetopt.io.apart import read_apart
 from tetopt.io.pictures import MOST_PIXELS, PICTURE_SUFFIXES, frame_of, read_picture
 from tetopt.io.read_dicom import is_dicom
@@ -268,14 +268,12 @@ def _slices_of(path: str, names: list[str], has_spacing: bool) -> Tiff:
     first = Tiff(None)
     for k, name in enumerate(names):
         file = str(Path(path) / name)
-        try:
+        with prefix_errors(plain(name)):
             tiff = _stack_of(file, True) if _is_for_tifffile(name) else Tiff(None)
             first = tiff if k == 0 else first
             if not has_spacing and (not tiff.is_calibrated or None in tiff.sizes):
                 break
             pixels = frame_of(file, None)
-        except InputError as error:
-            raise InputError(f"{plain(name)}: {error}") from error
         if data is None:
             check_room((*pixels.shape, len(names)), pixels.dtype.itemsize)
             data = np.empty((len(names), *pixels.shape), pixels.dtype)

@@ -23,7 +23,7 @@ from tetopt.contents.align import (
 from tetopt.contents.domain import INSIDE_FRACTION
 from tetopt.contents.labels import check_labels
 from tetopt.contents.probabilities import resample_tissue
-from tetopt.errors import InputError, Remark
+from tetopt.errors import InputError, Remark, prefix_errors
 from tetopt.image import Image
 from tetopt.io.images import load_image, parse_crop, parse_slice, part_of, reader_of
 from tetopt.io.label_tables import load_label_table
@@ -32,7 +32,7 @@ from tetopt.io.stacks import parse_spacing
 from tetopt.io.text import list_names
 from tetopt.job.events import note, warning
 from tetopt.job.option_values import file_and_volume
-from tetopt.job.options import WHOLE_BOX, BoxPart, ImagePart, MaskedPart, SourceOptions
+from tetopt.job.options import BoxPart, ImagePart, MaskedPart, SourceOptions
 from tetopt.model.file import MeshFile, count_of_other_voxels, own_mask
 from tetopt.model.label_names import label_words, labels_named
 
@@ -47,7 +47,7 @@ Beside = Callable[[Path, Align], Image]
 Originals = Mapping[tuple[Path, Align], Image]
 
 
-def read_image(path: Path, part: BoxPart = WHOLE_BOX) -> Image:
+def read_image(path: Path, part: BoxPart) -> Image:
     """Read the part of an image that the options select."""
     slice_ = part.slice_ if isinstance(part, ImagePart) else None
     return load_image(
@@ -249,16 +249,12 @@ def read_mask(
     mask, table = check_labels(str(path), mask, is_map=True), names_of
     if table is None and str(path).lower().endswith((".seg.nrrd", ".dcm")):
         table = path
-    names, present = (
-        {} if table is None else load_label_table(table).names,
-        np.unique(mask.data).astype(np.int64),
-    )
-    chosen: list[int] = []
+    names = {} if table is None else load_label_table(table).names
+    present = np.unique(mask.data).astype(np.int64)
+    chosen = list[int]()
     for word in words.split(","):
-        try:
+        with prefix_errors("`mask_label`"):
             labels = labels_named(word, names)
-        except InputError as error:
-            raise InputError(f"`mask_label`: {error}") from error
         if not np.isin(labels, present).any():
             listed_words = list_names(
                 [label_words(label, names) for label in present.tolist()], MASK_LABELS_LISTED

@@ -8,6 +8,7 @@ import numpy as np
 
 from tetopt.contents.align import SAME_BOX_VOXELS, SAME_GRID_VOXELS
 from tetopt.errors import InputError
+from tetopt.geometry.check import beyond_box
 from tetopt.image import Image
 from tetopt.io.images import sha256
 from tetopt.io.label_tables import LabelTable, load_label_table, own_label_table
@@ -15,6 +16,7 @@ from tetopt.io.meshes import load_mesh
 from tetopt.io.text import list_names
 from tetopt.job.events import note, warning
 from tetopt.job.option_values import file_and_volume
+from tetopt.mesh import Mesh
 from tetopt.model.file import MeshFile, words_of_other_box
 from tetopt.model.label_names import NO_TABLE, labels_of
 
@@ -34,6 +36,25 @@ def read_mesh(path: Path) -> MeshFile:
             f"{list_names(list(violated))}"
         )
     return loaded
+
+
+def check_place(what: str, mesh: Mesh, image: Image) -> None:
+    """Raise InputError for a mesh outside the image; warn of one partly outside."""
+    if mesh.ndim != image.ndim:
+        raise InputError(
+            f"{what}: expected a {image.ndim}-D mesh like the image, got a {mesh.ndim}-D one"
+        )
+    outside = float((beyond_box(mesh, image) > 1.0).mean())
+    if outside == 1.0:
+        raise InputError(
+            f"{what}: the mesh lies outside the image: no node lies in the image's box; do both "
+            "use the same world coordinates (mm, RAS+)?"
+        )
+    if outside > 0.0:
+        warning(
+            f"{what}: {outside:.1%} of the nodes lie outside the image or its mask: cells there "
+            "take the nearest voxel's value"
+        )
 
 
 def table_of_segmentation(path: Path | None) -> LabelTable:

@@ -73,7 +73,7 @@ def mesh_task(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
     def keep(mesh: Mesh, labels: Ints | None) -> None:
         if labels is None and task.source.labels is not None:
             labels = cell_labels(task.source.labels, mesh)
-        beside = islice(kept_places(job.output, ".vtu"), 1)
+        beside = islice(kept_places(job.output), 1)
         place = keep_early(mesh, labels, early[-1:] or (job.output, *beside))
         early.extend([] if place is None else [place])
 

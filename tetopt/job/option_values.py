@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 from typing import NamedTuple
 
-from tetopt.errors import InputError
+from tetopt.errors import InputError, prefix_errors
 from tetopt.io.images import file_shape
 from tetopt.io.label_tables import LabelTable
 from tetopt.io.text import list_names
@@ -17,6 +17,9 @@ from tetopt.system.incoming import rows_of
 
 # headings of the column of sizes in a table
 SIZE_HEADS = ("size", "size_mm", "mm", "edge", "length")
+
+
+SizesByName = dict[int | str, LabelSize]  # by labels' names or numbers
 
 
 def file_and_volume(path: Path) -> tuple[Path, int | None]:
@@ -79,7 +82,7 @@ def balance_of(options: SourceOptions) -> Balance:
     return Balance(weights, 1.0 if options.label_weight is None else options.label_weight)
 
 
-def label_sizes_of(text: str, table: LabelTable | None = None) -> dict[int | str, LabelSize]:
+def label_sizes_of(text: str, table: LabelTable | None = None) -> SizesByName:
     """Parse sizes by label, from an option or a file; a table of labels, if any, converts names
     to numbers.
     """
@@ -89,14 +92,12 @@ def label_sizes_of(text: str, table: LabelTable | None = None) -> dict[int | str
             f"{name}={''.join(cells[:1])}"
             for name, cells in rows_of(file, "table of sizes", SIZE_HEADS)
         )
-    try:
+    with prefix_errors(file or ""):
         sizes = parse_label_sizes(text)
         return sizes if table is None else _by_number(sizes, table)
-    except InputError as error:
-        raise error if file is None else InputError(f"{file}: {error}") from error
 
 
-def _by_number(sizes: dict[int | str, LabelSize], table: LabelTable) -> dict[int | str, LabelSize]:
+def _by_number(sizes: SizesByName, table: LabelTable) -> SizesByName:
     """Return the sizes by the labels' numbers instead of names."""
     numbers = {name: label for label, name in table.names.items()}
     known = {
@@ -109,7 +110,7 @@ def _by_number(sizes: dict[int | str, LabelSize], table: LabelTable) -> dict[int
             f'label_size: no label has the name "{unknown[0]}"; '
             f"{list_names([*numbers]) or 'the labels have no names'}"
         )
-    by_label: dict[int | str, LabelSize] = {}
+    by_label: SizesByName = {}
     for name, size in known.items():
         label = numbers.get(str(name), name)
         if label in by_label:

@@ -5,17 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numba
-import numpy as np
 
 from tetopt.errors import InputError
-from tetopt.geometry.box import box_sides
-from tetopt.geometry.simplex import centroids
-from tetopt.image import Image
 from tetopt.io.formats import format_of
 from tetopt.job.advice import tell_label_sizes
-from tetopt.job.events import note, start_stage, warning
+from tetopt.job.events import note, start_stage
 from tetopt.job.job import Job
-from tetopt.job.mesh_file import label_table, read_mesh, warn_of_other_image
+from tetopt.job.mesh_file import check_place, label_table, read_mesh, warn_of_other_image
 from tetopt.job.plan import (
     Plan,
     changed_options,
@@ -27,7 +23,6 @@ from tetopt.job.plan import (
 from tetopt.job.request import job_request
 from tetopt.job.source import read_source
 from tetopt.job.task import Task
-from tetopt.mesh import Mesh
 
 
 def read(job: Job) -> Task:
@@ -74,7 +69,7 @@ def read_planned(plan: Plan) -> Task:
     source = read_source(plan.job, plan.job.label_names, loaded=start)
     if start is not None:
         image, path = source.contrasts[0], Path(str(plan.job.start))
-        _check_place(start.mesh, image, str(path))
+        check_place(str(path), start.mesh, image)
         warn_of_other_image(start, path, source.paths[0], image, is_registered=True)
         if plan.job.order is None and start.order == 2 and format_of(plan.job.output).has_quadratic:
             plan = plan._replace(job=changed_options(plan.job, order=2))
@@ -87,27 +82,6 @@ def read_planned(plan: Plan) -> Task:
         note(f"sizes require about {needed} nodes")
     # With the files' current checksums.
     return Task(plan, source, start, sizes, job_request(plan.bare), by_label)
-
-
-def _check_place(mesh: Mesh, image: Image, path: str) -> None:
-    """Raise InputError for a mesh outside the image; warn of one partly outside."""
-    if mesh.ndim != image.ndim:
-        raise InputError(
-            f"{path}: expected a {image.ndim}-D mesh like the image, got a {mesh.ndim}-D one"
-        )
-    index = image.to_index(centroids(mesh.points, mesh.cells))
-    low, high = box_sides(image.shape).T
-    is_in = ((index >= low) & (index <= high)).all(axis=1)
-    if not is_in.any():
-        raise InputError(
-            f"{path}: the mesh lies outside the image; do both use the same world coordinates "
-            "(mm, RAS+)?"
-        )
-    if not is_in.all():
-        warning(
-            f"{path}: {np.mean(~is_in):.1%} of its cells lie outside the image, and are not "
-            "affected by it"
-        )
 
 
 def set_threads(threads: int | None) -> None:

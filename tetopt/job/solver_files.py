@@ -14,12 +14,11 @@ import numpy as np
 
 import tetopt
 from tetopt.errors import InputError, error_words
-from tetopt.geometry.check import beyond_box
 from tetopt.image import Image
 from tetopt.io.formats import FIELDS, FORMATS, file_bytes, format_of, save_mesh, save_model
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.events import note, warning, warnings_heard
-from tetopt.job.mesh_file import label_table
+from tetopt.job.mesh_file import check_place, label_table
 from tetopt.job.options import ModelOptions, SolverOptions
 from tetopt.mesh import Mesh
 from tetopt.model.averages import DEFAULT_AVERAGE, parse_average
@@ -258,7 +257,7 @@ def convert_model(
     implausible units.
     """
     if image is not None:
-        _check_place(loaded.mesh, image)
+        check_place("mesh and image", loaded.mesh, image)
         fields = loaded.cell_data | cell_fields(loaded.mesh, image)
         loaded = loaded._replace(cell_data=fields)
     table = label_table(options.label_names, loaded)
@@ -268,19 +267,6 @@ def convert_model(
     if has_units:
         warn_of_units(model)
     return model
-
-
-def _check_place(mesh: Mesh, image: Image) -> None:
-    """Raise InputError for a mesh outside the image; warn of one partly outside."""
-    outside = float((beyond_box(mesh, image) > 1.0).mean())
-    if outside == 1.0:
-        raise InputError(
-            "mesh and image: no node lies in the image's box; do both use the same world "
-            "coordinates?"
-        )
-    if outside > 0.0:
-        of_nodes = f"{outside:.1%} of the nodes lie outside the image or its mask"
-        warning(f"{of_nodes}: cells there take the nearest voxel's value")
 
 
 def check_early(
@@ -426,7 +412,7 @@ def save_anyway(
     InputError
         If the user can fix `error`; the message says where the mesh is.
     """
-    places = chain([] if early is None else [early], kept_places(output, ".vtu"))
+    places = chain([] if early is None else [early], kept_places(output))
     kept = _keep_mesh(
         places, (lambda path: save_model(path, build()), lambda path: save_mesh(path, mesh))
     )

@@ -22,7 +22,7 @@ from tetopt.contents.domain import INSIDE_FRACTION, mask_text
 from tetopt.contents.labels import BACKGROUND_LABEL, LARGEST_LABEL
 from tetopt.contents.probabilities import resample_tissue, tissue_labels
 from tetopt.energy.sampling import cell_moments
-from tetopt.errors import InputError
+from tetopt.errors import InputError, prefix_errors
 from tetopt.image import Image
 from tetopt.io.label_tables import NO_TABLE, LabelTable
 from tetopt.io.text import count_text, list_names
@@ -306,10 +306,8 @@ def _without_holes(
 
 def _label_of_holes(text: str, table: LabelTable) -> int:
     """Parse the label that holes get."""
-    try:
+    with prefix_errors("`fill_holes`"):
         (label, *others) = labels_named(text, table.names)
-    except InputError as error:
-        raise InputError(f"`fill_holes`: {error}") from error
     if others or not BACKGROUND_LABEL < label <= LARGEST_LABEL:
         raise InputError(
             f'`fill_holes`: expected one label from 1 to {LARGEST_LABEL}, got "{text}"'
@@ -406,10 +404,8 @@ def _merge_labels(
     if numbers is not None:
         return renumber_labels(labels, numbers), table, numbers
     if options.merge is not None:
-        try:
+        with prefix_errors(options.labels):
             merged = merge_labels(labels, options.merge, table.names)
-        except InputError as error:
-            raise InputError(f"{options.labels}: {error}") from error
         missing = [
             name for label, name in merged.names.items() if label not in merged.numbers.values()
         ]

@@ -105,9 +105,7 @@ def save_outcome(task: Task, outcome: Meshed, failed: dict[str, str]) -> tuple[M
         options["nodes"] = result.nodes
     about = {**source.about, "options": options}
     about |= {"violated": result.violated} if result.violated else {}
-    places = (
-        islice(kept_places(job.output, ".vtu"), 1) if outcome.early is None else [outcome.early]
-    )
+    places = islice(kept_places(job.output), 1) if outcome.early is None else [outcome.early]
     early = keep_early(result.mesh, result.labels, places)
     fields = _measured_fields(source, result, failed)
     try:

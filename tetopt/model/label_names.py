@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.contents.labels import BACKGROUND_LABEL, colours_by_number, hex_colour
-from tetopt.errors import InputError
+from tetopt.errors import InputError, prefix_errors
 from tetopt.model.sets import label_set_names
 from tetopt.system.arrays import Ints
 
@@ -120,10 +120,8 @@ def kept_labels(
         raise InputError("`keep_labels` and `drop_labels`: give only one of them")
     chosen: set[int] = set()
     for word in text.split(","):
-        try:
+        with prefix_errors(f"`{option}`"):
             labels = labels_named(word, names)
-        except InputError as error:
-            raise InputError(f"`{option}`: {error}") from error
         if not chosen.union(labels) & set(present).intersection(labels):
             listed = ", ".join(label_words(label, names) for label in present[:8]) + ", ..." * (
                 len(present) > 8

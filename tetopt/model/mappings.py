@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tetopt.errors import InputError
+from tetopt.errors import InputError, prefix_errors
 from tetopt.model.formula import parse_formula
-from tetopt.system.arrays import Floats
+from tetopt.system.arrays import Bools, Floats
 from tetopt.system.incoming import text_of, toml_of
 
 MAPPED_OPTIONS = ("young", "nu", "density")  # options of commands whose text is a mapping
@@ -264,37 +264,33 @@ def load_mapping(path: Path, quantity: str = "young") -> ModulusMapping | ByLabe
         not numbers; intensities do not increase.
     """
     try:
-        columns = _columns(path)
-        keys: list[str] = [name for name in ("intensity", "label") if name in columns]
-        if not keys and "name" in columns:
-            keys = ["name"]
-        if len(keys) != 1 or quantity not in columns:
-            raise InputError(
-                f'{path}: expected columns "{quantity}" and one of "intensity", "label" and '
-                '"name", found '
-                f"{', '.join(map(str, columns)) or 'none'}"
-            )
-        if len(columns[keys[0]]) != len(columns[quantity]):
-            counts = (
-                f"{len(columns[keys[0]])} of {keys[0]} and {len(columns[quantity])} of {quantity}"
-            )
-            raise InputError(f"{path}: expected columns of the same length, got {counts}")
-        values = [_number(value) for value in columns[quantity]]
-        if keys != ["intensity"]:
-            return _by_label(
-                [(str(label), value) for label, value in zip(columns[keys[0]], values, strict=True)]
-            )
-        return _check_pairs(
-            [(_number(h), value) for h, value in zip(columns["intensity"], values, strict=True)]
-        )
-    except InputError as error:
-        raise (
-            error if str(error).startswith(str(path)) else InputError(f"{path}: {error}")
-        ) from error
+        with prefix_errors(path):
+            return _mapping_in(path, quantity)
+    except InputError:
+        raise
     except (ValueError, TypeError, csv.Error, RecursionError) as error:
         raise InputError(
             f"{path}: expected columns of numbers ({' '.join(str(error).split())})"
         ) from error
+
+
+def _mapping_in(path: Path, quantity: str) -> ModulusMapping | ByLabel:
+    columns = _columns(path)
+    keys: list[str] = [name for name in ("intensity", "label") if name in columns]
+    if not keys and "name" in columns:
+        keys = ["name"]
+    if len(keys) != 1 or quantity not in columns:
+        raise InputError(
+            f'expected columns "{quantity}" and one of "intensity", "label" and "name", found '
+            f"{', '.join(map(str, columns)) or 'none'}"
+        )
+    if len(columns[keys[0]]) != len(columns[quantity]):
+        counts = f"{len(columns[keys[0]])} of {keys[0]} and {len(columns[quantity])} of {quantity}"
+        raise InputError(f"expected columns of the same length, got {counts}")
+    pairs = list(zip(columns[keys[0]], map(_number, columns[quantity]), strict=True))
+    if keys != ["intensity"]:
+        return _by_label([(str(label), value) for label, value in pairs])
+    return _check_pairs([(_number(h), value) for h, value in pairs])
 
 
 def _number(value: Any) -> float:
@@ -357,15 +353,25 @@ def _check_pairs(pairs: list[tuple[float, float]]) -> list[tuple[float, float]]:
 
 def check_young(young: Floats) -> Floats:
     """Return the moduli of cells, (M,); InputError unless all are above 0."""
-    bad = np.flatnonzero(~(np.isfinite(young) & (young > 0.0)))
+    hint = 'give empty space a small modulus, as in `young` "0:0.1,255:6"'
+    return check_cells("young", young, young > 0.0, "moduli above 0 kPa", hint)
+
+
+def check_nu(nu: Floats) -> Floats:
+    """Return the Poisson's ratios of cells, (M,); InputError unless a material can have them."""
+    hint = "for nearly incompressible tissue use 0.45 to 0.49"
+    return check_cells("nu", nu, (nu > -1.0) & (nu < 0.5), "-1 < nu < 0.5", hint)
+
+
+def check_cells(name: str, values: Floats, is_good: Bools, expected: str, hint: str) -> Floats:
+    """Return the values of cells, (M,); InputError unless all are good, (M,), and finite."""
+    bad = np.flatnonzero(~(np.isfinite(values) & is_good))
     if len(bad):
-        first = ", ".join(f"{young[j]:g} in cell {j}" for j in bad[:3])
+        first = ", ".join(f"{values[j]:g} in cell {j}" for j in bad[:3])
         raise InputError(
-            f"young: expected moduli above 0 kPa, got {len(bad)} invalid values, the first "
-            f"{first}; "
-            'give empty space a small modulus, as in `young` "0:0.1,255:6"'
+            f"{name}: expected {expected}, got {len(bad)} invalid values, the first {first}; {hint}"
         )
-    return young
+    return values
 
 
 def _check_table(mapping: ArrayLike) -> Floats:

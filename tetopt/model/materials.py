@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from tetopt.energy.sampling import ranges_of
 from tetopt.errors import InputError, Remark, warn
 from tetopt.model.label_names import label_words, labels_named
-from tetopt.model.mappings import ByLabel, check_young
+from tetopt.model.mappings import ByLabel, check_cells, check_nu, check_young
 from tetopt.system.arrays import Floats, Ints
 
 # Poisson's ratio of soft tissue that linear cells still represent: they lock closer to 0.5
@@ -100,29 +100,15 @@ def materials(
     """
     columns = [_of_cells("young", young, n_cells), _of_cells("nu", nu, n_cells)]
     check_young(columns[0])
-    outside = np.flatnonzero(~((columns[1] > -1.0) & (columns[1] < 0.5)))
-    if len(outside):
-        raise InputError(
-            f"nu: expected -1 < nu < 0.5, got other values in {len(outside)} cells, the first "
-            f"{columns[1][outside[0]]:g} in cell {outside[0]}; for nearly incompressible tissue "
-            "use 0.45 to 0.49"
-        )
+    check_nu(columns[1])
     if density is not None:
-        columns.append(_check_density(_of_cells("density", density, n_cells)))
-    kinds, of_cell = np.unique(np.column_stack(columns), axis=0, return_inverse=True)
-    values = [column.copy() for column in kinds.T]
-    masses = values[2] if len(values) == 3 else None
-    return Materials(values[0], values[1], of_cell.ravel().astype(np.int64), density=masses)
-
-
-def _check_density(density: Floats) -> Floats:
-    bad = np.flatnonzero(~(np.isfinite(density) & (density > 0.0)))
-    if len(bad):
-        raise InputError(
-            f"density: expected kg/m3 above 0, got other values in {len(bad)} cells, the first "
-            f"{density[bad[0]]:g} in cell {bad[0]}; water has 1000"
+        masses = _of_cells("density", density, n_cells)
+        columns.append(
+            check_cells("density", masses, masses > 0.0, "kg/m3 above 0", "water has 1000")
         )
-    return density
+    kinds, of_cell = np.unique(np.column_stack(columns), axis=0, return_inverse=True)
+    young, nu, *densities = (column.copy() for column in kinds.T)
+    return Materials(young, nu, of_cell.ravel().astype(np.int64), None, *densities)
 
 
 def without_moduli(table: Materials) -> Materials:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tetopt.contents.labels import LARGEST_LABEL, check_labels
-from tetopt.errors import InputError
+from tetopt.errors import InputError, prefix_errors
 from tetopt.image import Image
 from tetopt.model.label_names import labels_named
 from tetopt.model.mappings import named_file
@@ -146,12 +146,8 @@ def groups_of(merge: str) -> list[LabelGroup]:
         The text is invalid; a name or a number occurs twice; a file cannot be read.
     """
     if (file := named_file(merge)) is not None:
-        try:
+        with prefix_errors(file):
             return _of_rows(rows_of(file, "table of groups of labels", ("label", "labels")))
-        except InputError as error:
-            raise (
-                error if str(error).startswith(str(file)) else InputError(f"{file}: {error}")
-            ) from error
     if is_preset(merge):
         return _of_rows([(name, [labels]) for name, labels in _presets()[merge.strip()].items()])
     return _check_groups([_of_words(words) for words in merge.split(";") if words.strip()])
@@ -225,10 +221,8 @@ def _members(
 def _labels_of(word: str, names: Mapping[int, str], present: Ints) -> list[int]:
     """Return the labels that a number, a range or a name refers to."""
     if (match := RANGE.fullmatch(word)) is None:
-        try:
+        with prefix_errors("`merge`"):
             return labels_named(word, names)
-        except InputError as error:
-            raise InputError(f"`merge`: {error}") from error
     first, last = int(match[1]), int(match[2] or match[1])
     if not first <= last <= LARGEST_LABEL:
         raise InputError(

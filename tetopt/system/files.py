@@ -341,16 +341,16 @@ def save_json(path: Path, value: Any) -> None:
     save_text(path, json.dumps(_plain(value), indent=1, allow_nan=False) + "\n")
 
 
-def kept_places(path: Path, suffix: str) -> Iterator[Path]:
-    """Yield free names for an output that cannot be written to `path`: next to it, then in new
-    temporary folders.
+def kept_places(path: Path) -> Iterator[Path]:
+    """Yield free names of VTU files for a mesh that cannot be written to `path`: next to it, then
+    in new temporary folders.
     """
     names = chain([path.stem], (f"{path.stem}_optimised_{number}" for number in count(1)))
-    places = (path.with_name(f"{name}{suffix}") for name in names)
+    places = (path.with_name(f"{name}.vtu") for name in names)
     yield next(place for place in places if place != path and not os.path.lexists(place))
     for folder in (tempfile.gettempdir(), os.getcwd(), os.path.expanduser("~")):
         with suppress(OSError):  # the next one
-            yield Path(tempfile.mkdtemp(prefix="tetopt-", dir=folder)) / f"{path.stem}{suffix}"
+            yield Path(tempfile.mkdtemp(prefix="tetopt-", dir=folder)) / f"{path.stem}.vtu"
 
 
 def _absolute(path: Path) -> Path:
