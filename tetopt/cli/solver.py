@@ -22,7 +22,6 @@ from tetopt.io.text import count_text, list_names
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.options import SolverOptions
 from tetopt.model.fields import GAUSS_MODULI
-from tetopt.model.label_names import TABLE_TEXT, labels_of, table_of_words
 from tetopt.model.loads import SHOWN_LOAD_DIGITS, count_of_steps, load_words
 from tetopt.model.materials import Materials
 from tetopt.model.model import STRESS_UNITS, Model, element_facets, elements
@@ -65,10 +64,7 @@ def _materials_by_name(model: Model, materials: Materials) -> Iterator[str]:
     """Yield a line for each material with its labels, if labels have names and each has one
     material.
     """
-    labels, names = (
-        labels_of(model.cell_data, len(model.mesh.cells)),
-        table_of_words(model.about.get(TABLE_TEXT)).names,
-    )
+    labels, names = model.labels, model.label_names
     if labels is None or not names:
         return
     pairs = np.unique(np.column_stack([labels, materials.of_cell]), axis=0).tolist()

@@ -43,7 +43,7 @@ from tetopt.model.file import (
     without_results,
     without_stale_results,
 )
-from tetopt.model.label_names import kept_labels, labels_of
+from tetopt.model.label_names import kept_labels
 from tetopt.model.model import Model
 from tetopt.model.sets import (
     INTERFACE_PREFIX,
@@ -160,7 +160,7 @@ def _of_labels(loaded: MeshFile, choice: LabelChoice) -> MeshFile:
     """Return the mesh without the cells of labels that are left out; report it."""
     if choice == ALL_LABELS:
         return loaded
-    labels = labels_of(loaded.cell_data, len(loaded.mesh.cells))
+    labels = loaded.labels
     if labels is None:
         raise InputError("`keep_labels`, `drop_labels`: the cells have no labels; pass `labels`")
     present, names = np.unique(labels).tolist(), loaded.label_table.names

@@ -17,7 +17,7 @@ from scipy.sparse import csr_array
 from tetopt.contents.align import divide_voxels
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.errors import InputError
-from tetopt.fem.elasticity import Elements, elements_of, order_of, push_of
+from tetopt.fem.elasticity import elements_of, order_of, push_of
 from tetopt.fem.hexahedra import shape_gradients, solve_between_plates, stiffness_product
 from tetopt.geometry.box import upright_axis
 from tetopt.geometry.quadratic import shape_slopes, shape_values
@@ -178,12 +178,15 @@ def compare(
         there, strain = at_centres(exact.modulus, exact.u, voxels)
         index = np.stack(np.unravel_index(voxels, exact.modulus.shape), axis=1)
         places = places_in_cells(mesh, cell, exact.modulus.to_world(index))
-        error += _squares(_displacements(elements, order, u, cell, places) - there)
+        of_cells = u[elements.cells[cell]]
+        error += _squares(np.einsum("ka,kai->ki", shape_values(places, order), of_cells) - there)
         scale += _squares(there - at_centres(exact.modulus, exact.u_homogeneous, voxels)[0])
         size += _squares(there)
-        strain_error += _squares(
-            _strains(elements, order, u, cell[near], places[near]) - strain[near]
-        )
+        slopes = shape_slopes(places[near], order)
+        by_place = np.einsum("kai,kab->kib", of_cells[near], slopes)
+        slope = by_place @ elements.gradients[cell[near]]
+        own_strain = 0.5 * (slope + slope.transpose(0, 2, 1))
+        strain_error += _squares(own_strain - strain[near])
         strain_size += _squares(strain[near])
     is_homogeneous = scale <= 1e-14 * size  # only the solver's error remains
     return Errors(
@@ -284,28 +287,6 @@ def nearest(image: Image, grid: Image) -> Image:
         for new, old in zip(grid.shape, image.shape, strict=True)
     ]
     return Image(image.data[np.ix_(*places)], grid.affine)
-
-
-def _displacements(
-    elements: Elements,
-    order: int,
-    u: Floats,
-    cell: Ints,
-    places: Floats,
-) -> Floats:
-    return np.einsum("ka,kai->ki", shape_values(places, order), u[elements.cells[cell]])
-
-
-def _strains(
-    elements: Elements,
-    order: int,
-    u: Floats,
-    cell: Ints,
-    places: Floats,
-) -> Floats:
-    by_place = np.einsum("kai,kab->kib", u[elements.cells[cell]], shape_slopes(places, order))
-    slope = by_place @ elements.gradients[cell]
-    return 0.5 * (slope + slope.transpose(0, 2, 1))
 
 
 def _squares(values: Floats) -> float:

@@ -38,25 +38,11 @@ RATIOS = {  # by NRRD's encoding; others are bzip2
     **dict.fromkeys(("txt", "text", "ascii"), TEXT_RATIO),
     **dict.fromkeys(("gz", "gzip"), DEFLATE_RATIO),
 }
-VALUE_BYTES = {  # types of NRRD without "unsigned" and the like, and those of MetaImage
-    "char": 1,
-    "int8": 1,
-    "int8_t": 1,
-    "short": 2,
-    "short int": 2,
-    "int16": 2,
-    "int16_t": 2,
-    "int": 4,
-    "int32": 4,
-    "int32_t": 4,
-    "long": 4,
-    "longlong": 8,
-    "long long": 8,
-    "long long int": 8,
-    "int64": 8,
-    "int64_t": 8,
-    "float": 4,
-    "double": 8,
+VALUE_BYTES = {  # types of NRRD without "unsigned", "_t" and the like, and those of MetaImage
+    **dict.fromkeys(("char", "int8"), 1),
+    **dict.fromkeys(("short", "int16"), 2),
+    **dict.fromkeys(("int", "int32", "long", "float"), 4),
+    **dict.fromkeys(("longlong", "long long", "int64", "double"), 8),
 }
 
 
@@ -269,7 +255,7 @@ def _lines(head: bytes, names: Names) -> tuple[dict[str, str], dict[str, str], l
 def _value_bytes(kind: str) -> int:
     """Return the number of bytes of a value of a type."""
     name = kind[4:].replace("_", " ").lower() if kind.startswith("MET_") else kind
-    name = re.sub("^(unsigned |signed |u)", "", name)
+    name = re.sub("^(unsigned |signed |u)|(_t| int)$", "", name)
     if name not in VALUE_BYTES:
         raise InputError(f"{UNREADABLE_FILE} (unknown voxel type {kind[:80]})")
     return VALUE_BYTES[name]

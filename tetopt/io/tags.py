@@ -25,7 +25,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.topology import facets
 from tetopt.io.text import comment_lines, free_text
 from tetopt.mesh import Mesh
-from tetopt.model.label_names import LABEL_FIELD, TABLE_TEXT, labels_of, table_of_words
+from tetopt.model.label_names import LABEL_FIELD
 from tetopt.model.loads import load_words
 from tetopt.model.model import Model, header_lines
 from tetopt.model.sets import (
@@ -92,7 +92,7 @@ def tag_sets(sets: dict[str, Ints]) -> Tagged:
     return Tagged(items, rank[kind.ravel()], tags_of)
 
 
-def cell_tags(model: Model, labels: Ints | None = None) -> Tagged:
+def cell_tags(model: Model, labels: Ints | None) -> Tagged:
     """Return all cells, with one tag for each combination of label, material ("material_1", ...)
     and cell sets.
 
@@ -145,17 +145,15 @@ def group_labels(model: Model) -> Ints | None:
     """Return the numbers of the cells' labels (M,), if any: the labels, unless there are
     `renumbered_labels`.
     """
-    labels, renumbered = labels_of(model.cell_data, len(model.mesh.cells)), renumbered_labels(model)
-    return (
-        labels
-        if labels is None or not renumbered
-        else np.searchsorted([0, *renumbered.values()], labels)
-    )
+    labels = model.labels
+    if labels is None or not (renumbered := renumbered_labels(model)):
+        return labels
+    return np.searchsorted([0, *renumbered.values()], labels)
 
 
 def renumbered_labels(model: Model) -> dict[int, int]:
     """Return the label of each number from 1, if a label exceeds `LARGEST_GROUP`; else none."""
-    labels = labels_of(model.cell_data, len(model.mesh.cells))
+    labels = model.labels
     if labels is None or labels.max() <= LARGEST_GROUP:
         return {}
     return dict(enumerate(np.unique(labels[labels > 0]).tolist(), 1))
@@ -226,7 +224,7 @@ def _cell_groups(model: Model, labels: Ints | None) -> tuple[dict[int, str], Int
     if labels is not None:
         kinds = np.unique(labels).tolist()
         own = [renumbered_labels(model).get(kind, kind) for kind in kinds]
-        of_label = label_set_names(own, table_of_words(model.about.get(TABLE_TEXT)).names)
+        of_label = label_set_names(own, model.label_names)
         called = {kind: of_label[label] for kind, label in zip(kinds, own, strict=True)}
         zero = group_of_zero(labels)
         others = {
@@ -291,11 +289,8 @@ def material_names(model: Model, taken: dict[str, Ints]) -> list[str]:
     """Return names "material_1", ... of the model's materials; InputError if a set in `taken`
     has such a name.
     """
-    names = (
-        []
-        if model.materials is None
-        else [f"material_{k + 1}" for k in range(len(model.materials.young))]
-    )
+    count = 0 if model.materials is None else len(model.materials.young)
+    names = [f"material_{k}" for k in range(1, count + 1)]
     check_apart(names, taken)
     return names
 
@@ -308,12 +303,10 @@ def named_materials(model: Model) -> list[str]:
     its name and a number. The others, which are parts of several labels, are "material_1", ...
     """
     names = material_names(model, {})
-    labels = labels_of(model.cell_data, len(model.mesh.cells))
+    labels = model.labels
     if model.materials is None or labels is None:
         return names
-    called = label_set_names(
-        np.unique(labels).tolist(), table_of_words(model.about.get(TABLE_TEXT)).names
-    )
+    called = label_set_names(np.unique(labels).tolist(), model.label_names)
     labels_in: dict[int, list[int]] = {}
     for material, label in np.unique(
         np.column_stack([model.materials.of_cell, labels]), axis=0
@@ -351,14 +344,14 @@ def remarks(model: Model) -> list[str]:
     """
     lines = header_lines(model)
     if model.materials is not None:
-        pairs = zip(model.materials.young.tolist(), model.materials.nu.tolist(), strict=True)
-        density = [] if model.materials.density is None else model.materials.density.tolist()
-        masses = [f", density {each!r} kg/m3" for each in density] or [""] * len(
-            model.materials.young
-        )
+        young, nu, density = model.materials.young, model.materials.nu, model.materials.density
+        masses = [""] * len(young)
+        if density is not None:
+            masses = [f", density {each!r} kg/m3" for each in density.tolist()]
+        rows = zip(young.tolist(), nu.tolist(), masses, strict=True)
         lines += [
-            f"material_{k}: young {young!r} {model.units}, nu {nu!r}{mass}"
-            for k, ((young, nu), mass) in enumerate(zip(pairs, masses, strict=True), 1)
+            f"material_{k}: young {each!r} {model.units}, nu {ratio!r}{mass}"
+            for k, (each, ratio, mass) in enumerate(rows, 1)
         ]
     lines += [f"load (not supported by this format): {load_words(load)}" for load in model.loads]
     return lines
@@ -376,7 +369,7 @@ def without_data(model: Model) -> list[str]:
     ]
 
 
-def as_columns(fields: Arrays, shapes: Container[tuple[int, ...]] = ()) -> Arrays:
+def as_columns(fields: Arrays, shapes: Container[tuple[int, ...]]) -> Arrays:
     """Split cell or point data into scalars by name: columns are numbered NAME_0, NAME_1, ...
 
     Rows with one of the `shapes` are kept whole. A column with the name of another field is
@@ -427,10 +420,8 @@ def label_lines(model: Model, cells: Part, what: str) -> list[str]:
     if zero in cells.names and zero not in divided:
         lines.append(f"label 0 is {what} {zero}, because 0 means none")
     if divided:
-        first, names = (
-            min(cells.groups_of.keys() - cells.names),
-            ", ".join(cells.names[group] for group in divided),
-        )
+        first = min(cells.groups_of.keys() - cells.names)
+        names = ", ".join(cells.names[group] for group in divided)
         lines[0] += (
             f", unless a set or material divides it: then each part has a number from {first} on "
             f"({names})"

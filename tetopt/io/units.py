@@ -15,28 +15,15 @@ from tetopt.io.volumes import note
 from tetopt.system.arrays import Floats
 
 # NGFF's units of length, with names of UDUNITS-2, in mm.
+PREFIXES = "yocto zepto atto femto pico nano micro milli  kilo mega giga tera peta exa zetta yotta"
 MM_PER_LENGTH = {
-    "yoctometer": 1e-21,
-    "zeptometer": 1e-18,
-    "attometer": 1e-15,
-    "femtometer": 1e-12,
-    "picometer": 1e-9,
+    f"{prefix}meter": float(f"1e{power}")
+    for prefix, power in zip(PREFIXES.split(" "), range(-21, 30, 3), strict=True)
+} | {
     "angstrom": 1e-7,
-    "nanometer": 1e-6,
-    "micrometer": 1e-3,
-    "millimeter": 1.0,
     "centimeter": 10.0,
     "decimeter": 100.0,
-    "meter": 1e3,
     "hectometer": 1e5,
-    "kilometer": 1e6,
-    "megameter": 1e9,
-    "gigameter": 1e12,
-    "terameter": 1e15,
-    "petameter": 1e18,
-    "exameter": 1e21,
-    "zettameter": 1e24,
-    "yottameter": 1e27,
     "inch": 25.4,
     "foot": 304.8,
     "yard": 914.4,

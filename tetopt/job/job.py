@@ -71,8 +71,8 @@ class Job(JobOptions):
 
     def __post_init__(self) -> None:
         """Convert values to the types of their fields, and reject invalid ones."""
-        for name in kinds_of(Job):
-            object.__setattr__(self, name, _of_field(Job, name, getattr(self, name)))
+        for name, kind in kinds_of(Job).items():
+            object.__setattr__(self, name, of_option(name, kind, getattr(self, name)))
         plan_job(self, reads_files=False)
 
     def given(self) -> Json:
@@ -203,12 +203,8 @@ def in_kinds(record: Callable[..., Record], values: Json) -> Record:
     """Create a record of options, converting values to the fields' types; raise InputError for
     an invalid one.
     """
-    return record(**{name: _of_field(record, name, value) for name, value in values.items()})
-
-
-def _of_field(record: Any, name: str, value: Any) -> Any:
-    """Convert a value to the type of a record's field, and check its minimum."""
-    return of_option(name, kinds_of(record)[name], value)
+    kinds = kinds_of(record)
+    return record(**{name: of_option(name, kinds[name], value) for name, value in values.items()})
 
 
 def of_option(name: str, kind: Any, value: Any) -> Any:

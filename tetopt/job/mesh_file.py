@@ -18,7 +18,7 @@ from tetopt.job.events import note, warning
 from tetopt.job.option_values import file_and_volume
 from tetopt.mesh import Mesh
 from tetopt.model.file import MeshFile, words_of_other_box
-from tetopt.model.label_names import NO_TABLE, labels_of
+from tetopt.model.label_names import NO_TABLE
 
 
 def read_mesh(path: Path) -> MeshFile:
@@ -70,7 +70,7 @@ def label_table(
     """
     if path is not None:
         table = load_label_table(path)
-        labels = None if loaded is None else labels_of(loaded.cell_data, len(loaded.mesh.cells))
+        labels = None if loaded is None else loaded.labels
         if labels is not None and not np.isin(labels, [*table.names, *table.colours]).any():
             warning(
                 f"{path}: contains none of the mesh's labels, "

@@ -586,12 +586,11 @@ def stated_part(part: ImagePart) -> dict[str, int | str | None]:
 
 def has_model(options: SolverOptions) -> bool:
     """Return whether a file contains more than the mesh and the names of labels."""
-    own = {
-        each.name: getattr(options, each.name)
+    return any(
+        getattr(options, each.name) != each.default
         for each in fields(SolverOptions)
         if each.name != "label_names"
-    }
-    return SolverOptions(**own) != SolverOptions()
+    )
 
 
 def near_hint(name: str, names: Iterable[str]) -> str:
@@ -602,13 +601,9 @@ def near_hint(name: str, names: Iterable[str]) -> str:
     return f"; did you mean {near[0]}?" if near else ""
 
 
+@cache
 def kinds_of(record: Any) -> Json:
     """Return the fields of a record class with their annotations."""
-    return _known_kinds(record)
-
-
-@cache
-def _known_kinds(record: Any) -> Json:
     kinds = get_type_hints(record, include_extras=True)
     return {field.name: kinds[field.name] for field in fields(record)}
 

@@ -27,7 +27,7 @@ from tetopt.io.images import check_bounds, file_shape, parse_crop, parse_slice, 
 from tetopt.io.label_tables import NO_TABLE, LabelTable
 from tetopt.job.aligned import read_companion
 from tetopt.job.option_values import balance_of, label_sizes_of, number_of
-from tetopt.job.options import JobOptions, Method, stated_part
+from tetopt.job.options import JobOptions, Method
 from tetopt.job.solver_files import check_solver_options
 from tetopt.model.mappings import named_file
 from tetopt.model.tissues import groups_of
@@ -42,7 +42,19 @@ from tetopt.system.files import check_output, check_outputs, results_folder
 
 VOXEL_BYTES = 16.0  # of an image that is read whole, in addition to meshing
 FEWEST_NODES = 5  # of the smallest mesh, an octree in 2-D: a square's corners and its middle
-# of options
+EXCLUSIVE_OPTIONS = (("mask", "background"), ("keep_labels", "drop_labels"), ("labels", "tissues"))
+LABEL_OPTIONS = (  # without a meaning if there are no labels
+    "keep_labels",
+    "drop_labels",
+    "fill_holes",
+    "label_names",
+    "label_weight",
+    "cells_across",
+    "label_size",
+    "free_volumes",
+    "smooth_interfaces",
+)
+COUNT_OPTIONS = ("nodes", "spacing", "target_error")  # one of them states the number of nodes
 SIZE_NAMES = (
     "size_min",
     "edge_size",
@@ -51,6 +63,14 @@ SIZE_NAMES = (
     "sizing",
     "cells_across",
     "label_size",
+)
+
+
+# in this order, before those of the engine
+STATED_OPTIONS = (
+    *("nodes", "target_error", "nodes_max", "spacing", "lattice", "size_min", "edge_size"),
+    *("edge_max", "gradation", "cells_across", "label_size", "sizing", "volume", "crop", "slice"),
+    *("method", "max_seconds", "max_gb", "start"),
 )
 
 
@@ -137,26 +157,11 @@ def check_volume(plan: Plan) -> None:
 def stated_options(plan: Plan, ndim: int) -> Json:
     """Return the options as the mesh's file and run.json state them; files by their names."""
     job = plan.job
-    return {
-        "nodes": job.nodes,
-        "target_error": job.target_error,
-        "nodes_max": job.nodes_max,
-        "spacing": job.spacing,
-        "lattice": kind_of(plan, ndim),
-        "size_min": job.size_min,
-        "edge_size": job.edge_size,
-        "edge_max": job.edge_max,
-        "gradation": job.gradation,
-        "cells_across": job.cells_across,
-        "label_size": job.label_size,
-        "sizing": None if job.sizing is None else job.sizing.name,
-        **stated_part(job),
-        "method": job.method,
-        "max_seconds": job.max_seconds,
-        "max_gb": job.max_gb,
-        "start": None if job.start is None else job.start.name,
-        **plan.engine_options,
-    }
+    own = {"lattice": kind_of(plan, ndim), "slice": job.slice_}
+    files = {"sizing": job.sizing, "start": job.start}
+    own |= {name: None if file is None else file.name for name, file in files.items()}
+    stated = {name: own[name] if name in own else getattr(job, name) for name in STATED_OPTIONS}
+    return stated | plan.engine_options
 
 
 def plan(job: JobOptions) -> Plan:
@@ -238,32 +243,18 @@ def _check_source(job: JobOptions) -> None:
     """Raise InputError for contradictions among the options of mask and labels."""
     if job.mask_label is not None and job.mask is None:
         raise InputError("`mask_label`: needs `mask`")
-    if job.mask is not None and job.background is not None:
-        raise InputError("`mask` and `background`: give only one of them")
+    for names in EXCLUSIVE_OPTIONS:
+        if all(getattr(job, name) is not None for name in names):
+            raise InputError(f"`{names[0]}` and `{names[1]}`: give only one of them")
     if job.keep_components and not has_region(job):
         raise InputError("`keep_components`: needs `mask` or `background`; leave it out")
-    if job.keep_labels is not None and job.drop_labels is not None:
-        raise InputError("`keep_labels` and `drop_labels`: give only one of them")
-    if job.labels is not None and job.tissues is not None:
-        raise InputError("`labels` and `tissues`: give only one of them")
     if job.merge is not None and job.labels is None:
         raise InputError("`merge`: needs `labels`")
     if job.labels is None and job.tissues is None:
-        names = (
-            "keep_labels",
-            "drop_labels",
-            "fill_holes",
-            "label_names",
-            "label_weight",
-        )
-        for name in (*names, "cells_across", "label_size"):
-            if getattr(job, name) is not None and not (
-                name == "label_names" and job.mask_label is not None
-            ):
+        for name in LABEL_OPTIONS:
+            is_of_mask = name == "label_names" and job.mask_label is not None
+            if getattr(job, name) != getattr(JobOptions, name) and not is_of_mask:
                 raise InputError(f"`{name}`: needs `labels`")
-        if job.free_volumes or not job.smooth_interfaces:
-            name = "free_volumes" if job.free_volumes else "smooth_interfaces"
-            raise InputError(f"`{name}`: needs `labels`")
     if job.merge is not None and named_file(job.merge) is None:
         groups_of(job.merge)
 
@@ -297,9 +288,9 @@ def _check_numbers(job: JobOptions, reads_files: bool) -> None:
 
 def _mode(job: JobOptions) -> Mode:
     """Return the mode that the options select; a graded mesh is the default."""
-    numbers = {"`nodes`": job.nodes, "`spacing`": job.spacing, "`target_error`": job.target_error}
-    if len(names := [name for name, value in numbers.items() if value is not None]) > 1:
-        raise InputError(f"{' and '.join(names)}: give only one of them")
+    counts = [name for name in COUNT_OPTIONS if getattr(job, name) is not None]
+    if len(counts) > 1:
+        raise InputError(f"{' and '.join(f'`{name}`' for name in counts)}: give only one of them")
     is_paper = job.method == "paper"
     if job.lattice == "octree":
         if job.uniform:
@@ -311,18 +302,11 @@ def _mode(job: JobOptions) -> Mode:
                 "`lattice` octree: has no single spacing; use `nodes` instead of `spacing`"
             )
     if job.start is not None:
-        others = {
-            **numbers,
-            "`lattice`": job.lattice,
-            "`mask`": job.mask,
-            "`background`": job.background,
-            "`keep_labels`": job.keep_labels,
-            "`drop_labels`": job.drop_labels,
-        }
-        others["`uniform`"] = job.uniform or None
-        if names := [name for name, value in others.items() if value is not None]:
+        others = ("lattice", "mask", "background", "keep_labels", "drop_labels")
+        given = [*counts, *(name for name in others if getattr(job, name) is not None)]
+        if given := [*given, *["uniform"] * job.uniform]:
             raise InputError(
-                f"`start` and {names[0]}: {job.start} already has nodes and a boundary; leave "
+                f"`start` and `{given[0]}`: {job.start} already has nodes and a boundary; leave "
                 "one out"
             )
         if is_paper:
@@ -343,19 +327,13 @@ def _complete_options(job: JobOptions, mode: Mode) -> JobOptions:
     iterations = default.iterations if job.iterations is None else job.iterations
     if not 0.0 <= k_D < 1.0:
         raise InputError(f"`k_D`: expected 0 <= k_D < 1, got {k_D}")
-    if job.max_seconds is not None and not job.max_seconds > 0.0:
-        raise InputError(f"`max_seconds`: expected more than 0, got {job.max_seconds}")
-    if job.max_gb is not None and not job.max_gb > 0.0:
-        raise InputError(f"`max_gb`: expected more than 0, got {job.max_gb}")
+    for name, most in (("max_seconds", job.max_seconds), ("max_gb", job.max_gb)):
+        if most is not None and not most > 0.0:
+            raise InputError(f"`{name}`: expected more than 0, got {most}")
     boundary = job.boundary or default.boundary
-    nodes_max = (
-        TARGET_NODES_MAX
-        if job.nodes_max is None and job.target_error is not None
-        else job.nodes_max
-    )
-    job = changed_options(
-        job, k_D=k_D, iterations=iterations, boundary=boundary, nodes_max=nodes_max
-    )
+    job = changed_options(job, k_D=k_D, iterations=iterations, boundary=boundary)
+    if job.target_error is not None:
+        job = changed_options(job, nodes_max=job.nodes_max or TARGET_NODES_MAX)
     _check_method(job, "paper", ("n_t", "retessellate"))
     _check_method(job, "fast", ("shape_power", "min_dihedral"))
     if mode == "paper":

@@ -25,7 +25,7 @@ from tetopt.model.averages import DEFAULT_AVERAGE, parse_average
 from tetopt.model.build import Choices, model_of_file
 from tetopt.model.fields import cell_fields, is_result
 from tetopt.model.file import MeshFile
-from tetopt.model.label_names import LABEL_FIELD, TABLE_TEXT, labels_of, table_of_words
+from tetopt.model.label_names import LABEL_FIELD, TABLE_TEXT
 from tetopt.model.loads import FACET_FORCES, check_steps, known_set, parse_load
 from tetopt.model.mappings import MAPPED_OPTIONS, named_file, parse_any_mapping
 from tetopt.model.materials import Spacing
@@ -39,8 +39,8 @@ from tetopt.model.sets import (
     check_free_names,
     interface_names,
     label_set_names,
-    names_in,
     parse_set,
+    places_in,
     standard_names,
 )
 from tetopt.system.arrays import Ints, Json
@@ -211,9 +211,8 @@ def with_chosen_sets(model: Model, output: Path, options: ModelOptions) -> Model
     always written.
     """
     groups = set(parse_groups(options.written_sets))
-    labels = labels_of(model.cell_data, len(model.mesh.cells))
-    names = table_of_words(model.about.get(TABLE_TEXT)).names
-    of_label = {} if labels is None else label_set_names(np.unique(labels).tolist(), names)
+    labels = [] if model.labels is None else np.unique(model.labels).tolist()
+    of_label = label_set_names(labels, model.label_names)
     pairs = [(a, b) for a in of_label for b in of_label if a < b]
     between = {
         *interface_names(pairs, of_label).values(),
@@ -231,13 +230,9 @@ def with_chosen_sets(model: Model, output: Path, options: ModelOptions) -> Model
             "view derive them from the cells' labels"
         )
         groups.discard("interfaces")
-    left = set()
-    for group, members in (
-        ("labels", set(of_label.values())),
-        ("interfaces", interfaces),
-        ("boundary", standard_names(model.mesh.ndim)),
-    ):
-        left |= set() if group in groups else members
+    left = set() if "labels" in groups else set(of_label.values())
+    left |= set() if "interfaces" in groups else interfaces
+    left |= set() if "boundary" in groups else standard_names(model.mesh.ndim)
     left -= {load.set_name for load in model.loads}
     facets, cells = (
         {name: rows for name, rows in kind.items() if name not in left} for kind in model.sets
@@ -304,7 +299,7 @@ def check_early(
     for request in requests:
         check_free_names(request, known)
         if request.difference and INTERFACE_PREFIX not in request.difference.lower():
-            names_in(request, known)
+            places_in(request, known)
         known = Sets(
             known.facets | dict.fromkeys(request.names(), known.facets[BOUNDARY_SET]), known.cells
         )

@@ -99,6 +99,11 @@ class MeshFile(NamedTuple):
     order: int = 1
     point_data: Arrays = {}  # noqa: RUF012 - never changed
 
+    @property
+    def labels(self) -> Ints | None:
+        """Labels of the cells, (M,), if there are any."""
+        return labels_of(self.cell_data, len(self.mesh.cells))
+
     def text(self, name: str) -> str | None:
         """Return a string from the field data, if present.
 
@@ -341,10 +346,10 @@ def complete_model(model: Model, loaded: MeshFile, *, is_of_file: bool) -> Model
 def _binning_error(loaded: MeshFile) -> BinningError | None:
     """Return the binning error in a file of tetopt's, None if there is none."""
     try:
-        words = json_of(loaded.text("binning") or "{}")
+        words = loaded.table("binning")
         return BinningError(float(words["mean"]), float(words["largest"]))
     # missing, or written by another program
-    except (ValueError, TypeError, KeyError, RecursionError):
+    except (ValueError, TypeError, KeyError):
         return None
 
 

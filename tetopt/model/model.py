@@ -20,6 +20,7 @@ from tetopt.model.fields import (
     node_field,
     scaled_fields,
 )
+from tetopt.model.label_names import TABLE_TEXT, labels_of, table_of_words
 from tetopt.model.loads import FACET_FORCES, SHOWN_LOAD_DIGITS, Load, facet_forces, load_words
 from tetopt.model.materials import Materials
 from tetopt.model.sets import Sets, facet_triples
@@ -121,6 +122,16 @@ class Model(NamedTuple):
     is_nonlinear: bool = False
     about: Json = {}  # noqa: RUF012 - never changed
     point_data: Arrays = {}  # noqa: RUF012 - never changed
+
+    @property
+    def labels(self) -> Ints | None:
+        """Labels of the cells, (M,), if there are any."""
+        return labels_of(self.cell_data, len(self.mesh.cells))
+
+    @property
+    def label_names(self) -> dict[int, str]:
+        """Names of labels."""
+        return table_of_words(self.about.get(TABLE_TEXT)).names
 
     def _repr_html_(self) -> str:
         """Show the model in a notebook, with the middle section shaded by mean or modulus."""

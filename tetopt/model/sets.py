@@ -461,12 +461,15 @@ def enclosing_facets(mesh: Mesh, cells: Ints) -> Ints:
 
 def _of_sets(mesh: Mesh, request: SetRequest, sets: Sets) -> Ints:
     """Return the facets (K, 2) of a difference of sets, or of its outer or inner parts."""
-    first, *others = (_facets_named(mesh, name, request, sets) for name in names_in(request, sets))
-    n_local = mesh.ndim + 1
-    gone = np.concatenate(
-        [rows[:, 0] * n_local + rows[:, 1] for rows in [np.empty((0, 2), dtype=np.int64), *others]]
+    first, *others = (
+        rows_of(mesh, facet_triples(mesh.cells, sets.facets[name])[:, ::-1])
+        if is_turned
+        else sets.facets[name]
+        for name, is_turned in places_in(request, sets)
     )
-    rows = first[~np.isin(first[:, 0] * n_local + first[:, 1], gone)]
+    number = (mesh.ndim + 1, 1)
+    gone = np.concatenate([first[:0] @ number, *(rows @ number for rows in others)])
+    rows = first[~np.isin(first @ number, gone)]
     if request.kind and len(rows):
         rows = rows[_is_inner(mesh, rows) == (request.kind == "inner")]
     if len(rows) == 0:
@@ -477,24 +480,21 @@ def _of_sets(mesh: Mesh, request: SetRequest, sets: Sets) -> Ints:
     return rows
 
 
-def names_in(request: SetRequest, sets: Sets) -> list[str]:
-    """Return the names in "A-B-C"; as a name may contain "-", the longest known ones."""
-    parts, names = request.difference.split("-"), []
+def places_in(request: SetRequest, sets: Sets) -> list[tuple[str, bool]]:
+    """Return `place_of` the sets in "A-B-C"; as a name may contain "-", the longest known ones."""
+    parts, places = request.difference.split("-"), []
     while parts:
-        known = (
-            k
-            for k in range(len(parts), 0, -1)
-            if place_of("-".join(parts[:k]).strip(), sets) is not None
-        )
-        if (k := next(known, None)) is None:
+        for k in range(len(parts), 0, -1):
+            if (place := place_of("-".join(parts[:k]).strip(), sets)) is not None:
+                break
+        else:
             raise InputError(
                 f'set {request.name}: no set of facets begins "{"-".join(parts).strip()}"; the '
-                "mesh has "
-                f"{', '.join(sets.facets)}"
+                f"mesh has {', '.join(sets.facets)}"
             )
-        names.append("-".join(parts[:k]).strip())
+        places.append(place)
         parts = parts[k:]
-    return names
+    return places
 
 
 def place_of(name: str, sets: Sets) -> tuple[str, bool] | None:
@@ -519,13 +519,6 @@ def _turned_names(name: str) -> list[str]:
     """
     parts = name.removeprefix(INTERFACE_PREFIX).split("_")
     return [f"{INTERFACE_PREFIX}{'_'.join([*parts[k:], *parts[:k]])}" for k in range(1, len(parts))]
-
-
-def _facets_named(mesh: Mesh, name: str, request: SetRequest, sets: Sets) -> Ints:
-    place = place_of(name, sets)
-    assert place is not None, f"{request.name}: {name} is split by known names"
-    rows = sets.facets[place[0]]
-    return rows_of(mesh, facet_triples(mesh.cells, rows)[:, ::-1]) if place[1] else rows
 
 
 def _is_inner(mesh: Mesh, rows: Ints) -> Bools:
