@@ -32,7 +32,7 @@ from test_mfem import Read as Mfem
 from test_xdmf import facet_set, fields, grids, item, named
 
 import tetopt.io.gmsh
-from tetopt.io.formats import FORMATS, save_model
+from tetopt.io.formats import file_bytes, save_model
 from tetopt.io.meshes import load_mesh
 from tetopt.io.tags import named_materials
 from tetopt.model.loads import load_words
@@ -251,7 +251,7 @@ SUFFIXES = [*READERS, ".vtu", ".vtk"]
 
 
 def contents(path, model):
-    path.write_bytes(FORMATS[path.suffix].write(model))
+    path.write_bytes(file_bytes(path, model))
     if path.suffix in READERS:
         return READERS[path.suffix](path.read_bytes(), model)
     return of_vtk(path, model)
@@ -351,7 +351,7 @@ def test_meshio_reads_it(suffix, n, bins, order, tmp_path):
         tmp_path / f"a{suffix}",
     )
     (points, own), table = elements(model), model.materials
-    path.write_bytes(FORMATS[suffix].write(model))
+    path.write_bytes(file_bytes(path, model))
     read = meshio.read(path, "gmsh" if suffix == ".msh2" else None)
     assert_array_equal(read.points[:, :n], points)
     kind = {3: "triangle", 4: "tetra", 6: "triangle6", 10: "tetra10"}[own.shape[1]]

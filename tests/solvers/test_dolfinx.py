@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import textwrap
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from scipy.spatial import KDTree
 
 import tetopt.io.xdmf
 from tetopt.fem.solution import solve
-from tetopt.io.xdmf import xdmf
+from tetopt.io.formats import file_bytes
 from tetopt.model.model import elements
 from tetopt.model.sets import facet_triples
 
@@ -104,7 +105,7 @@ def snippet(first="from xml.etree", then="Before 0.7"):
 def answer(request, tmp_path_factory):
     """The model and what dolfinx made of its file."""
     folder, model = tmp_path_factory.mktemp("dolfinx"), pressed_model(request.param)
-    folder.joinpath("model.xdmf").write_bytes(xdmf(model))
+    folder.joinpath("model.xdmf").write_bytes(file_bytes(Path("model.xdmf"), model))
     program = snippet().replace('"superior"', f'"{model.loads[0].set_name}"')
     run(BEFORE + program + READ, folder)
     with np.load(folder / "read.npz") as read:
@@ -231,7 +232,7 @@ def solved_cases(tmp_path_factory):
     for number, (case, n, order, moduli) in enumerate(CASES):
         (folder / str(number)).mkdir()
         model = loaded_model(case, n, 1, moduli)
-        (folder / str(number) / "model.xdmf").write_bytes(xdmf(model))
+        (folder / str(number) / "model.xdmf").write_bytes(file_bytes(Path("model.xdmf"), model))
         reading = snippet().replace('"superior"', '"boundary"')
         applying = snippet("import ufl", "Moduli that are linear")
         loaded = LOADED.format(order=order, is_nodal=moduli == "nodes")

@@ -34,10 +34,10 @@ def write_on_image(
     output: Path,
     options: VoxelOptions,
     *,
-    like: Path | None = None,
-    results: Path | None = None,
-    space: str = "ras",
-    is_registered: bool = False,
+    like: Path | None,
+    results: Path | None,
+    space: str,
+    is_registered: bool,
 ) -> Json:
     """Write a field of a mesh's file on the voxels of an image or, with `options.warp`, that image
     moved by it.

@@ -18,7 +18,7 @@ import numpy as np
 
 from tetopt.errors import InputError
 from tetopt.fem.solution import von_mises
-from tetopt.geometry.quadratic import quadratic
+from tetopt.geometry.quadratic import of_order, quadratic
 from tetopt.io.apart import read_apart
 from tetopt.mesh import Mesh
 from tetopt.model.fields import half_turned_fields, scaled_fields
@@ -155,7 +155,7 @@ def read_frd(path: str | Path, mesh: Mesh) -> Results:
     )
     notes = [] if stated else [f"{path.name} does not state its units: assuming mm and kPa"]
     point_data: dict[str, Floats] = {}
-    for step, number in sorted(of_steps.items()):
+    for (step, number), of_step in zip(sorted(of_steps.items()), grid.arrays, strict=True):
         if stages[number].n_nodes != len(grid.points):
             raise InputError(
                 f"{path}: has results at {stages[number].n_nodes} of {len(grid.points)} nodes in "
@@ -163,10 +163,8 @@ def read_frd(path: str | Path, mesh: Mesh) -> Results:
                 "them at all nodes (*NODE FILE and *EL FILE without NSET)"
             )
         suffix = "" if step == 1 else f"_step{step}"
-        arrays = _on_mesh(
-            _results_of_step(path, grid.arrays[sorted(of_steps.values()).index(number)], step)
-        )
-        point_data |= {f"{name}{suffix}": values for name, values in arrays.items()}
+        fields = _fields_of_step(path, of_step, step)
+        point_data |= {f"{name}{suffix}": values for name, values in fields.items()}
         if stages[number].increment > 1:
             notes.append(f"step {step}: increment {stages[number].increment}, the last in the file")
     point_data = scaled_fields(point_data, units.kPa, units.mm, mesh.ndim)
@@ -227,21 +225,15 @@ def _check_mesh(path: Path, mesh: Mesh, grid: _Grid, spaces: tuple[str, ...]) ->
         raise InputError(
             f"{path}: expected a tetrahedral mesh for CalculiX's results, got triangles"
         )
-    nodes_of_order = {
-        1: (mesh.points, mesh.cells),
-        2: quadratic(mesh.points, mesh.cells, mesh.midpoints),
-    }
-    order = next(
-        (k for k, (points, _) in nodes_of_order.items() if len(points) == len(grid.points)), None
-    )
-    if order is None or sum(map(len, grid.cells)) != len(mesh.cells):
+    points, cells = quadratic(mesh.points, mesh.cells, mesh.midpoints)
+    counts, n_cells = (len(mesh.points), len(points)), sum(map(len, grid.cells))
+    if len(grid.points) not in counts or n_cells != len(mesh.cells):
         raise InputError(
-            f"{path}: belongs to another mesh: expected {len(mesh.cells)} cells and "
-            f"{len(mesh.points)} nodes (order 2: "
-            f"{len(nodes_of_order[2][0])}), got {sum(map(len, grid.cells))} cells and "
-            f"{len(grid.points)} nodes"
+            f"{path}: belongs to another mesh: expected {len(mesh.cells)} cells and {counts[0]} "
+            f"nodes (order 2: {counts[1]}), got {n_cells} cells and {len(grid.points)} nodes"
         )
-    points, cells = nodes_of_order[order]
+    order = 1 + counts.index(len(grid.points))
+    points, cells = of_order(mesh.points, mesh.cells, order, mesh.midpoints)
     if not np.array_equal(grid.ids, np.arange(1, len(points) + 1)):
         raise InputError(
             f"{path}: belongs to another mesh: its nodes are not numbered from 1 to {len(points)}"
@@ -281,9 +273,9 @@ def _stages(path: Path, whole: bytes) -> list[_Stage]:
     return [_Stage(*key, count) for key, count in sorted(stages.items())]
 
 
-def _results_of_step(path: Path, arrays: Arrays, step: int) -> dict[str, Floats]:
-    """Return the file's arrays of this step after checking them; InputError unless they are
-    usable.
+def _fields_of_step(path: Path, arrays: Arrays, step: int) -> dict[str, Floats]:
+    """Return the file's arrays of a step under tetopt's names, in the file's axes and units;
+    InputError unless they are usable.
     """
     if "DISP" not in arrays:
         raise InputError(f"{path}: has no displacements in step {step}; request U (*NODE FILE)")
@@ -292,18 +284,13 @@ def _results_of_step(path: Path, arrays: Arrays, step: int) -> dict[str, Floats]
             raise InputError(
                 f"{path}: {name} of step {step} is not finite at some nodes; the solution diverged"
             )
-    return arrays
-
-
-def _on_mesh(arrays: dict[str, Floats]) -> dict[str, Floats]:
-    """Return CalculiX's arrays under tetopt's names, in the file's axes and units."""
-    point_data = {"displacement": arrays["DISP"]}
+    fields = {"displacement": arrays["DISP"]}
     if "TOSTRAIN" in arrays:
-        point_data["strain_nodes"] = arrays["TOSTRAIN"][:, TENSOR_ROWS]
+        fields["strain_nodes"] = arrays["TOSTRAIN"][:, TENSOR_ROWS]
     if "STRESS" in arrays:
         stress = arrays["STRESS"][:, TENSOR_ROWS]
-        point_data |= {
+        fields |= {
             "stress_nodes": stress,
             "von_mises_nodes": von_mises(stress.reshape(-1, 3, 3)),
         }
-    return point_data
+    return fields

@@ -12,6 +12,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -529,10 +530,9 @@ def reader_of(path: Path) -> Reader:
     with errors_named(path):
         if not path.is_dir():
             _check_beginning(path)
-        readers = (*_named_readers(path), *READERS)
-        for k, reader in enumerate(readers):
-            if k < len(readers) - len(READERS) or reader.is_this(path):
-                return reader
+        recognised = (reader for reader in READERS if reader.is_this(path))
+        if (reader := next(chain(_named_readers(path), recognised), None)) is not None:
+            return reader
         known = ", ".join(suffix for reader in READERS for suffix in reader.suffixes)
         raise InputError(
             f"unknown image format; expected {known}, or a folder of DICOM files or of slices"

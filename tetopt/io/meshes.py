@@ -146,18 +146,15 @@ def _numbers(
         if others := ", ".join(name for name in values_of if name not in numbers):
             notes.append(f"dropped {what} data that are not numbers: {others}")
         fields.append(numbers)
-    units = text_in(raw.field_data, "units") or "kPa"
-    if units in STRESS_UNITS:
-        fields = [
-            scaled_fields(each, STRESS_UNITS[units].kPa, STRESS_UNITS[units].mm, ndim)
-            for each in fields
-        ]
+    name = text_in(raw.field_data, "units") or "kPa"
+    if (units := STRESS_UNITS.get(name)) is not None:
+        fields = [scaled_fields(each, units.kPa, units.mm, ndim) for each in fields]
     elif lost := [name for each in fields for name in each if is_stress(name)]:
         lost += ["nu", "material", "density"] if "young" in lost else []
         fields = [
             {name: values for name, values in each.items() if name not in lost} for each in fields
         ]
-        words = f'unit is none of {", ".join(STRESS_UNITS)}: "{units}"'
+        words = f'unit is none of {", ".join(STRESS_UNITS)}: "{name}"'
         notes.append(f"dropped moduli and stresses, as their {words}")
     if raw.space == "lps" and ndim == 3:
         fields = [half_turned_fields(each) for each in fields]

@@ -100,23 +100,19 @@ def _label_cells(raw: Raw, comments: OwnComments | None) -> Raw:
         return raw
     zero = None if comments is None else comments.zero
     of_group = {} if comments is None else comments.labels
-    if of_group:
-        labels = np.array(
-            [of_group.get(number, number) for number in labels.tolist()], dtype=np.int64
-        )
+    labels = np.array([of_group.get(number, number) for number in labels.tolist()], dtype=np.int64)
     labels[labels == zero] = 0
     if LABEL_FIELD in raw.cell_data and not np.array_equal(
         raw.cell_data[LABEL_FIELD][kind], labels
     ):
         return raw
-    names = {of_group.get(group.number, group.number): group.label for group in groups}
-    names = {number: name for number, name in names.items() if name != f"label_{number}"}
-    names = {
-        0 if number == zero else number: name for number, name in names.items() if name != "label_0"
-    }
-    table = (
-        {TABLE_TEXT: np.array([json.dumps(table_words(LabelTable(names, {})))])} if names else {}
-    )
+    names = {}
+    for group in groups:
+        label = of_group.get(group.number, group.number)
+        if group.label not in (f"label_{label}", "label_0"):
+            names[0 if label == zero else label] = group.label
+    words = json.dumps(table_words(LabelTable(names, {})))
+    table = {TABLE_TEXT: np.array([words])} if names else {}
     cell_data = raw.cell_data | {LABEL_FIELD: {kind: labels}}
     return raw._replace(cell_data=cell_data, field_data=raw.field_data | table)
 

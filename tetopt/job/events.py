@@ -90,7 +90,7 @@ def warnings_heard() -> Iterator[None]:
             (note if issubclass(each.category, Note) else warning)(str(each.message))
 
 
-def ended_words(ended: str, kept: str, followed: str = "") -> str:
+def ended_words(ended: str, kept: str, followed: str) -> str:
     """Return why a run ended before its last iteration, and what is kept; `followed` names
     surfaces.
     """

@@ -87,7 +87,7 @@ def warn_of_other_image(
     image_path: Path,
     image: Image,
     *,
-    is_registered: bool = False,
+    is_registered: bool,
     is_exact: bool = False,
 ) -> bool:
     """Warn if the mesh's file names another source image than this one; return whether it does.

@@ -28,7 +28,6 @@ from tetopt.model.mappings import ModulusMapping, mapped_values, young_from
 from tetopt.system.arrays import Bools, Floats, Ints
 
 DEFAULT_AVERAGE = "gauss"  # of moduli (docs/understand/moduli.md); the paper's figures keep Eq. (2)
-POWER_WORDS = {"mean": 1.0, "geometric": 0.0, "harmonic": -1.0}
 # in absolute value; beyond it a power mean is almost the largest or the smallest value
 LARGEST_POWER = 10.0
 VOXELS_PER_CHUNK = 2**20  # whose positions in their cells are computed at once, 100 MB
@@ -42,6 +41,19 @@ class Average(NamedTuple):
     power: float | None
     # one average per cell, per node, or per Gauss point of a cell
     place: Literal["cells", "nodes", "gauss"] = "cells"
+
+
+AVERAGES = {
+    each.words: each
+    for each in (
+        Average("mean", 1.0),
+        Average("geometric", 0.0),
+        Average("harmonic", -1.0),
+        Average("hill", None),
+        Average("gauss", 0.0, "gauss"),
+        Average("nodes", 0.0, "nodes"),
+    )
+}
 
 
 def parse_average(text: str) -> Average:
@@ -65,22 +77,18 @@ def parse_average(text: str) -> Average:
     >>> parse_average("power:-0.5").power
     -0.5
     """
-    word, colon, number = text.strip().partition(":")
-    if not colon and word in POWER_WORDS:
-        return Average(word, POWER_WORDS[word])
-    if not colon and word == "hill":
-        return Average(word, None)
-    if not colon and word in ("nodes", "gauss"):
-        return Average(word, 0.0, "nodes" if word == "nodes" else "gauss")
+    text = text.strip()
+    if text in AVERAGES:
+        return AVERAGES[text]
+    word, _, number = text.partition(":")
     try:
         power = float(number) if word == "power" else np.nan
     except ValueError:
         power = np.nan
     if not abs(power) <= LARGEST_POWER:
         raise InputError(
-            f"average: expected {', '.join(POWER_WORDS)}, hill, gauss, nodes, or power:P with P "
-            "from "
-            f'{-LARGEST_POWER:g} to {LARGEST_POWER:g}, such as power:0.5, got "{text}"'
+            f"average: expected {', '.join(AVERAGES)}, or power:P with P from {-LARGEST_POWER:g} "
+            f'to {LARGEST_POWER:g}, such as power:0.5, got "{text}"'
         )
     return Average(f"power:{power:g}", power)
 

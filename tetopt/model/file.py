@@ -159,16 +159,15 @@ class MeshFile(NamedTuple):
         means.
         """
         mesh = self.mesh
-        rows = notebook.mesh_rows(mesh.points, mesh.cells)
-        rows += [("data of cells", ", ".join(self.cell_data) or "none")]
-        rows += [("data of nodes", ", ".join(self.point_data) or "none")]
-        rows += [("sets", ", ".join([*self.sets.facets, *self.sets.cells]) or "none")]
-        rows += (
-            [("labels", ", ".join(self.label_table.names.values()))]
-            if self.label_table.names
-            else []
-        )
-        rows += [("note", note) for note in self.notes]
+        labels = ", ".join(self.label_table.names.values())
+        rows = [
+            *notebook.mesh_rows(mesh.points, mesh.cells),
+            ("data of cells", ", ".join(self.cell_data) or "none"),
+            ("data of nodes", ", ".join(self.point_data) or "none"),
+            ("sets", ", ".join([*self.sets.facets, *self.sets.cells]) or "none"),
+            *[("labels", labels)] * bool(labels),
+            *(("note", note) for note in self.notes),
+        ]
         return notebook.card_html(
             "MeshFile",
             rows,

@@ -366,7 +366,7 @@ def _check_apart(loads: list[Load], mesh: Mesh, sets: Sets) -> None:
 # Forces on facets
 
 
-def facet_weights(mesh: Mesh, rows: Ints, order: int = 1) -> tuple[Ints, Floats]:
+def facet_weights(mesh: Mesh, rows: Ints, order: int) -> tuple[Ints, Floats]:
     """Return the nodes of facets and the integrals of their shape functions over the facets, (K, w)
     each.
 

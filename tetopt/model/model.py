@@ -136,26 +136,22 @@ class Model(NamedTuple):
     def _repr_html_(self) -> str:
         """Show the model in a notebook, with the middle section shaded by mean or modulus."""
         mesh, table = self.mesh, self.materials
-        rows = notebook.mesh_rows(mesh.points, mesh.cells)
-        rows += [
+        moduli = []
+        if table is not None:
+            young = f"{table.young.min():.4g} to {table.young.max():.4g} {self.units}"
+            moduli = [
+                ("materials", str(len(table.young))),
+                ("Young's modulus", young),
+                ("Poisson's ratio", f"{table.nu.min():.4g} to {table.nu.max():.4g}"),
+            ]
+        loads = ", ".join(load_words(load, SHOWN_LOAD_DIGITS) for load in self.loads)
+        rows = [
+            *notebook.mesh_rows(mesh.points, mesh.cells),
             ("order", str(self.order)),
             ("sets of facets", ", ".join(self.sets.facets) or "none"),
-        ]
-        rows += [("sets of cells", ", ".join(self.sets.cells) or "none")]
-        if table is not None:
-            rows += [("materials", str(len(table.young)))]
-            rows += [
-                (
-                    "Young's modulus",
-                    f"{table.young.min():.4g} to {table.young.max():.4g} {self.units}",
-                )
-            ]
-            rows += [("Poisson's ratio", f"{table.nu.min():.4g} to {table.nu.max():.4g}")]
-        rows += [
-            (
-                "loads",
-                ", ".join(load_words(load, SHOWN_LOAD_DIGITS) for load in self.loads) or "none",
-            )
+            ("sets of cells", ", ".join(self.sets.cells) or "none"),
+            *moduli,
+            ("loads", loads or "none"),
         ]
         values = self.cell_data.get("mean") if table is None else table.young[table.of_cell]
         return notebook.card_html(

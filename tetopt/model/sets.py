@@ -178,16 +178,14 @@ def standard_sets(
         if len(faces[name]) == 0:
             faces[name] = (own or {}).get(name, rows)
     named = {BOUNDARY_SET: boundary, **faces}
-    of_labels = Sets({}, {}) if labels is None else label_sets(mesh, labels, names)
+    of_labels = Sets({}, {}) if labels is None else label_sets(mesh, labels, names or {})
     return Sets(
         {name: rows for name, rows in named.items() if len(rows)} | of_labels.facets,
         of_labels.cells,
     )
 
 
-def label_sets(
-    mesh: Mesh, labels: NDArray[np.integer], names: Mapping[int, str] | None = None
-) -> Sets:
+def label_sets(mesh: Mesh, labels: NDArray[np.integer], names: Mapping[int, str]) -> Sets:
     """Return the cells of each label, and the facets between two labels, as rows of cells with the
     smaller label.
 
@@ -200,7 +198,7 @@ def label_sets(
         Labels are not one whole number from 0 for each cell.
     """
     labels = _check_labels(labels, mesh)
-    of_label = label_set_names(np.unique(labels).tolist(), names or {})
+    of_label = label_set_names(np.unique(labels).tolist(), names)
     facet_rows = _interfaces(mesh, labels)
     of_pair = interface_names(facet_rows, of_label)
     return Sets(
