@@ -263,9 +263,8 @@ def _check_environment() -> None:
     threads = os.environ.get(THREADS_NAME, "").strip()
     if threads and not (threads.isdecimal() and len(threads) <= MOST_DIGITS and int(threads) >= 1):
         raise InputError(
-            f"{THREADS_NAME}: expected a whole number of threads from 1 to "
-            f"{10**MOST_DIGITS - 1}, got "
-            f"{threads[:20]}; set a valid number, or unset it"
+            f"{THREADS_NAME}: expected a whole number of threads from 1 to {10**MOST_DIGITS - 1}, "
+            f"got {threads[:20]}; set a valid number, or unset it"
         )
     names = [
         name

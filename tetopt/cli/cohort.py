@@ -72,7 +72,9 @@ def cohort_command(
 
 def _say_estimate(plan: CohortPlan) -> None:
     """Print which subjects would be run, with their memory."""
-    to_run, estimate, cohort = plan.to_run, plan.estimate, plan.cohort
+    to_run = plan.to_run
+    estimate = plan.estimate
+    cohort = plan.cohort
     for entry in to_run:
         if (one := estimate.get(entry.key)) is None:
             print_line(f"{entry.key}: size unknown because its image cannot be read")
@@ -141,7 +143,8 @@ class _CohortDisplay:
 
     def _close(self, rows: Sequence[Row]) -> None:
         """Print the summary of all subjects."""
-        place, keys = self._plan.cohort.output, set(self._plan.keys)
+        place = self._plan.cohort.output
+        keys = set(self._plan.keys)
         own = [row for row in rows if row.key in keys]
         counts = Counter[str](row.status for row in own)
         for row in [row for row in own if row.status == "failed"][:NAMED_FAILURES]:

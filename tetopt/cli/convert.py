@@ -59,7 +59,8 @@ def convert_command(
     if len(paths) < 2:
         raise InputError(f"expected MESH and OUT, the file to write, got only {paths[0]}")
     mesh_path, image_path = mesh_and_image(paths[:-1], image_path)
-    output, is_image = paths[-1], is_image_name(paths[-1])
+    output = paths[-1]
+    is_image = is_image_name(paths[-1])
     _check_options(output, voxels if not is_image else None, part, choice, solver)
     output = check_output(output, OUTPUT_SUFFIXES if is_image else tuple(FORMATS), numbers.force)
     numbers.check()
@@ -103,7 +104,8 @@ def _check_options(
     """
     if voxels is not None:
         format_of(output)  # raises InputError for an unknown format
-        wrong, what = given_options(voxels), "a mesh's file; name an image, such as field.nii.gz"
+        wrong = given_options(voxels)
+        what = "a mesh's file; name an image, such as field.nii.gz"
     else:
         wrong = given_options(replace(part, registered=False)) | given_options(choice)
         wrong |= given_options(replace(solver, space="ras"))

@@ -91,7 +91,8 @@ def is_ended() -> bool:
 
 def tell_end() -> int:
     """Print, once, which signal ended the command and which outputs exist; return the exit code."""
-    code, outputs = signal_code(), present_outputs()
+    code = signal_code()
+    outputs = present_outputs()
     if not _ending.is_told:
         _ending.is_told = True
         name = "Ctrl-C" if code == INTERRUPTED_CODE else signal.Signals(code - SIGNAL_CODE).name

@@ -85,7 +85,9 @@ def fem_command(
 
 def _of_what(solved: SolvedModel) -> Iterator[tuple[str, str]]:
     """Yield rows on the moduli: the mapping, its average, Poisson's ratios."""
-    model, options, nu = solved.model, solved.options, solved.numbers["materials"]["nu"]
+    model = solved.model
+    options = solved.options
+    nu = solved.numbers["materials"]["nu"]
     yield (
         "modulus mapping",
         "from the mesh's file" if options.young is None else escape(options.young),
@@ -105,11 +107,9 @@ def _print(name: str, solved: SolvedModel, shown: slice) -> None:
     """Print a table with a column for each of some steps; that of the first ones describes the
     model, too.
     """
-    model, solutions, extremes = (
-        solved.model,
-        solved.solutions[shown],
-        solved.extremes if shown.start == 0 else None,
-    )
+    model = solved.model
+    solutions = solved.solutions[shown]
+    extremes = solved.extremes if shown.start == 0 else None
     names = [f"step {step}" for step in range(1, len(solved.solutions) + 1)]
     table = new_table(escape(name), *(names[shown] if len(names) > 1 else [""]))
     if shown.start == 0:

@@ -44,7 +44,9 @@ def _print(result: Result) -> None:
 
     All files are written before, as standard output may be a pipe that closes.
     """
-    task, model, measured = result.task, result.model, result.measured
+    task = result.task
+    model = result.model
+    measured = result.measured
     job = task.plan.job
     _print_comparison(result, measured.get("cells_without_voxel", 0))
     print_fidelity(measured, model.mesh.ndim, task.source.mask_word)
@@ -57,7 +59,8 @@ def _print(result: Result) -> None:
 
 
 def _print_comparison(result: Result, n_empty: int) -> None:
-    content, order = result.task.source.content, result.model.order
+    content = result.task.source.content
+    order = result.model.order
     first = result.optimized.history[0]
     table = new_table("", result.task.start_name, "optimised")
     names = ("E_D_fraction_of_variance_initial", "E_D_fraction_of_variance")

@@ -28,8 +28,7 @@ def quality_command(
         Option(
             None,
             "Check that the mesh is valid with a manifold boundary and, with the `image` of its "
-            "run, fills the box "
-            "and meets the run's requirements; exit 1 if not.",
+            "run, fills the box and meets the run's requirements; exit 1 if not.",
         ),
     ] = False,
     label_names: LabelNamesOption = None,
@@ -43,7 +42,8 @@ def quality_command(
     mesh, image = mesh_and_image(paths, image)
     judgement = judge(mesh, image, labels, part=part, label_names=label_names, check=check)
     numbers.save(judgement.numbers)
-    size, source = judgement.numbers["size"], judgement.source
+    size = judgement.numbers["size"]
+    source = judgement.source
     table = new_table("", escape(mesh.name))
     in_all = [size["n_nodes_in_all"]] if judgement.loaded.order == 2 else []
     jacobian = judgement.numbers.get("min_scaled_jacobian")

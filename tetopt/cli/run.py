@@ -113,7 +113,8 @@ def compiling(title: str) -> Iterator[Callable[[str], None]]:
 @contextlib.contextmanager
 def waiting(words: str) -> Iterator[None]:
     """Show that work is in progress: a terminal's status, else occasional lines."""
-    begin, is_done = time.perf_counter(), threading.Event()
+    begin = time.perf_counter()
+    is_done = threading.Event()
 
     def lines() -> None:
         while not is_done.wait(LINE_SECONDS):

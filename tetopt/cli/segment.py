@@ -50,11 +50,13 @@ def segment_command(
         raise InputError(f"{mesh_path}: which image is to be segmented? pass `image`")
     loaded = read_mesh(mesh_path)
     what, _ = image_voxels(loaded, mesh_path, image_path, part)
-    image, mesh = what.given, loaded.mesh
+    image = what.given
+    mesh = loaded.mesh
     truth = None if truth_path is None else read_labels(truth_path, image, part)
     inside = _voxels_in(mesh, what, mesh_path, image_path)
     labels = segment(what, mesh, classes)
-    of_class, h = labels.data[inside].astype(np.int64), image.data[inside]
+    of_class = labels.data[inside].astype(np.int64)
+    h = image.data[inside]
     fractions = np.bincount(of_class, minlength=classes) / len(of_class)
     means = [
         float(h[of_class == number].mean()) if fraction else None
@@ -95,7 +97,8 @@ def segment_command(
 
 def _overlaps_table(overlap: dict[str, dict[int, float]], names: dict[int, int]) -> Table:
     """Return a table of Dice by true label; warn of labels that no class matches."""
-    by_mesh, by_voxels = overlap["mesh"], overlap["voxels"]
+    by_mesh = overlap["mesh"]
+    by_voxels = overlap["voxels"]
     if lost := [str(label) for label in by_mesh if label not in names.values()]:
         show_warning(f"no class matches label {', '.join(lost)}: its Dice is 0; try more --classes")
     table = new_table("label", "Dice, mesh", "Dice, thresholded voxels")

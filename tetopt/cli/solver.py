@@ -43,11 +43,9 @@ def print_model(output: Path, model: Model, solver: SolverOptions) -> None:
         print_line(line)
 
     size = "area, mm2" if model.mesh.ndim == 3 else "length, mm"
-    table, cells, sets = (
-        new_table("set", "facets", size, "nodes", "cells"),
-        elements(model)[1],
-        model.sets,
-    )
+    table = new_table("set", "facets", size, "nodes", "cells")
+    cells = elements(model)[1]
+    sets = model.sets
     standard = standard_names(model.mesh.ndim)  # the user's sets first
     for name, rows in sorted(sets.facets.items(), key=lambda item: item[0] in standard)[:MOST_SETS]:
         area = np.linalg.norm(area_vectors(model.mesh, rows), axis=1).sum()
@@ -64,7 +62,8 @@ def _materials_by_name(model: Model, materials: Materials) -> Iterator[str]:
     """Yield a line for each material with its labels, if labels have names and each has one
     material.
     """
-    labels, names = model.labels, model.label_names
+    labels = model.labels
+    names = model.label_names
     if labels is None or not names:
         return
     pairs = np.unique(np.column_stack([labels, materials.of_cell]), axis=0).tolist()
@@ -119,7 +118,8 @@ def _moduli_lines(output: Path, model: Model) -> Iterator[str]:
             mean, largest = table.binning
             yield f"bins: modulus error {mean:.2%} on average by volume, {largest:.2%} at most"
     if model.node_young is not None:
-        low, high = model.node_young.min(), model.node_young.max()
+        low = model.node_young.min()
+        high = model.node_young.max()
         yield (
             f"the modulus is linear within cells, {low:.4g} to {high:.4g} kPa at their corners"
             if format_of(output).has_node_moduli
@@ -142,7 +142,8 @@ def _load_lines(output: Path, model: Model) -> Iterator[str]:
 
 
 def _lines(output: Path, model: Model, solver: SolverOptions) -> Iterator[str]:
-    form, suffix = format_of(output), output.suffix.lower()
+    form = format_of(output)
+    suffix = output.suffix.lower()
     yield from _moduli_lines(output, model)
     yield from _load_lines(output, model)
     if suffix in GMSH_SUFFIXES:
@@ -152,7 +153,8 @@ def _lines(output: Path, model: Model, solver: SolverOptions) -> Iterator[str]:
         yield from lines[:MOST_LABEL_LINES]
         if len(lines) > MOST_LABEL_LINES:
             yield f"and {len(lines) - MOST_LABEL_LINES} more; the file's header lists all"
-    low, high = model.mesh.points.min(axis=0), model.mesh.points.max(axis=0)
+    low = model.mesh.points.min(axis=0)
+    high = model.mesh.points.max(axis=0)
     ranges = zip("xyz", low, high, strict=False)
     yield (
         "the mesh lies at "

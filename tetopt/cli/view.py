@@ -48,12 +48,14 @@ def view_command(
     counted = MaskedPart(**vars(part), **vars(region))
     check_part(image_path, counted)
     loaded = read_mesh(mesh_path)
-    mesh, fields = loaded.mesh, dict(loaded.cell_data)
+    mesh = loaded.mesh
+    fields = dict(loaded.cell_data)
     what = voxels_of(loaded, mesh_path, image_path, counted).content
     image = None if what is None else what.given
     if what is not None and "mean" not in fields:
         fields = cell_fields(mesh, what) | fields
-    table, former = label_table(how.label_names, loaded), label_table(None, loaded).names
+    table = label_table(how.label_names, loaded)
+    former = label_table(None, loaded).names
     sets = sets_beside(mesh, loaded.box, fields, loaded.sets, table.names, former)[0].facets
     triples = {name: facet_triples(mesh.cells, rows) for name, rows in sets.items()}
     # matplotlib and pyvista load slowly and are needed only here

@@ -52,8 +52,7 @@ def read_labels(path: Path, image: Image, part: BoxPart) -> Image:
     if labels.shape != image.shape or not np.allclose(labels.affine, image.affine, atol=AFFINE_MM):
         raise InputError(
             f"{path}: expected labels on the image's grid, {image.shape} with its affine, got "
-            f"{labels.shape}; "
-            "resample them to the image first"
+            f"{labels.shape}; resample them to the image first"
         )
     return check_labels(str(path), labels, is_map=True)
 
@@ -104,7 +103,9 @@ def voxels_of(
     InputError
         As for `image_voxels`; the dimension of the labels differs from the mesh's.
     """
-    content, is_other, masks = None, False, cache(partial(read_mask, part))
+    content = None
+    is_other = False
+    masks = cache(partial(read_mask, part))
     if image is not None:
         content, is_other = image_voxels(loaded, mesh, image, part, masks)
     if labels is not None:

@@ -101,8 +101,7 @@ def _check_part(part: SurfacePart, output: Path) -> None:
     if sum([*chosen, part.boundary or part.interfaces]) != 1:
         raise InputError(
             "surface: give exactly one of `below`, `label`, `cell_set`, `boundary`, `interface` "
-            "and `interfaces` "
-            "(`boundary` may be added to `interfaces`)"
+            "and `interfaces` (`boundary` may be added to `interfaces`)"
         )
     if part.interfaces and output.suffix.lower() not in LABELLED_SUFFIXES:
         raise InputError(
@@ -214,7 +213,8 @@ def _of_interfaces(
         )
     if len(pairs) > 1:
         rows.append((f"all {len(pairs)}", str(len(areas)), f"{areas.sum():.6g}"))
-    rim, seam = int((n_facets == 1).sum()), int((n_facets > 2).sum())
+    rim = int((n_facets == 1).sum())
+    seam = int((n_facets > 2).sum())
     last = (
         f"{rim} edges in one triangle, {seam} in more than two; area in the file: "
         f"{written.area:.6g} mm2"
@@ -240,7 +240,8 @@ def _two_sides(text: str, names: dict[int, str]) -> tuple[list[int], list[int]]:
         raise InputError(
             f'`interface`: expected two labels as J,K, by number or name, got "{text}"'
         )
-    one, other = labels_named(sides[0], names), labels_named(sides[1], names)
+    one = labels_named(sides[0], names)
+    other = labels_named(sides[1], names)
     if set(one) & set(other):
         raise InputError(f'`interface`: expected two different labels, got "{text}"')
     return one, other

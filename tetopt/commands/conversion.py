@@ -127,7 +127,8 @@ def convert_file(
     if image is not None and what is not None:
         about = texts_of(loaded, is_other=True) if is_other else about
         about |= {"image": image.name, "image_sha256": sha256(image)}
-        voxels, box = what.image, box_of(what.given) if box is None else box
+        voxels = what.image
+        box = box_of(what.given) if box is None else box
     if box is not None:
         about["box"] = box_text(box)
 
@@ -163,7 +164,8 @@ def _of_labels(loaded: MeshFile, choice: LabelChoice) -> MeshFile:
     labels = loaded.labels
     if labels is None:
         raise InputError("`keep_labels`, `drop_labels`: the cells have no labels; pass `labels`")
-    present, names = np.unique(labels).tolist(), loaded.label_table.names
+    present = np.unique(labels).tolist()
+    names = loaded.label_table.names
     kept = kept_labels(choice.keep_labels, choice.drop_labels, present, names)
     is_kept = _without_crumbs(loaded.mesh, labels, np.isin(labels, kept))
     part = with_cells(loaded, labels, is_kept)
@@ -189,7 +191,8 @@ def _without_crumbs(mesh: Mesh, labels: Ints, is_kept: Bools) -> Bools:
 
     No load or support would hold them: they hung on cells that are left out.
     """
-    cells, volumes = np.flatnonzero(is_kept), mesh.cell_volumes
+    cells = np.flatnonzero(is_kept)
+    volumes = mesh.cell_volumes
     number = components(mesh.cells[cells])
     share = np.zeros(number.max() + 1)
     for label in np.unique(labels[cells]):
@@ -198,7 +201,8 @@ def _without_crumbs(mesh: Mesh, labels: Ints, is_kept: Bools) -> Bools:
         share = np.maximum(share, of_component / of_component.sum())
     crumbs = cells[share[number] < SMALL_COMPONENT_FRACTION]
     if len(crumbs):
-        count, volume = int((share < SMALL_COMPONENT_FRACTION).sum()), float(volumes[crumbs].sum())
+        count = int((share < SMALL_COMPONENT_FRACTION).sum())
+        volume = float(volumes[crumbs].sum())
         words = f"less than {SMALL_COMPONENT_FRACTION:.0%} of any label, are left out with them"
         note(
             f"{count_text(count, 'component')} ({count_text(len(crumbs), 'cell')}, {volume:.4g} "

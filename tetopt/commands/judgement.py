@@ -90,10 +90,8 @@ class Judgement(NamedTuple):
         """Inputs of the run that built the mesh which are missing here."""
         if self.source is None:
             return []
-        inputs, there = (
-            self.loaded.table("inputs"),
-            {"mask": self.source.mask, "labels": self.source.labels},
-        )
+        inputs = self.loaded.table("inputs")
+        there = {"mask": self.source.mask, "labels": self.source.labels}
         left_out = [
             name for name, image in there.items() if image is None and inputs.get(name) is not None
         ]
@@ -123,7 +121,8 @@ class Judgement(NamedTuple):
         wrong: list[str] = self.numbers.get("problems", [])
         if wrong and not {"box", "cover", "manifold"}.isdisjoint(self.violated):
             # these sentences name the rest
-            mesh, is_whole = self.loaded.mesh, not self.is_masked
+            mesh = self.loaded.mesh
+            is_whole = not self.is_masked
             wrong = check_mesh(mesh, is_whole=is_whole, is_manifold=False)
         is_named = self.fit is None or (self.is_checked and "overlap" in self.violated)
         overlap = None if is_named else cast(ImageFit, self.fit).overlap
@@ -133,7 +132,8 @@ class Judgement(NamedTuple):
         problems = [
             Problem(f"{self.path}: {each}", name=name, is_failure=True) for name, each in named
         ]
-        requirements, measured = self.violated, self.measured
+        requirements = self.violated
+        measured = self.measured
         if not self.is_checked:  # only what makes the numbers meaningless
             requirements = {name: each for name, each in requirements.items() if name == "mask"}
             measured = {}
@@ -197,7 +197,8 @@ def judge(
     judgement = Judgement(mesh, loaded, shape, numbers, check)
     if image is not None:
         source = _source(loaded, image, labels, part, label_names)
-        first, is_registered = source.contrasts[0], part.registered
+        first = source.contrasts[0]
+        is_registered = part.registered
         is_other = warn_of_other_image(
             loaded, mesh, image, first, is_registered=is_registered, is_exact=check
         )
@@ -226,7 +227,8 @@ def _source(
 ) -> Source:
     """Read the files that the mesh is measured on, with the weights stated in the mesh's file."""
     inputs = loaded.table("inputs")
-    weight, weights = _number(inputs.get("label_weight")), inputs.get("weights")
+    weight = _number(inputs.get("label_weight"))
+    weights = inputs.get("weights")
     filled = inputs.get("filled_holes")
     own = _number(weights[0]) if isinstance(weights, list) and len(weights) == 1 else None
     options = SourceOptions(
@@ -275,7 +277,8 @@ def _merged_numbers(inputs: Mapping[str, Any], labels: Path, part: ImagePart) ->
     """Return the numbers that the mesh's run gave to merged labels; none if the labels have them
     already.
     """
-    table, sums = inputs.get("merged"), inputs.get("sha256")
+    table = inputs.get("merged")
+    sums = inputs.get("sha256")
     numbers = {
         int(old): new
         for old, new in (table.items() if isinstance(table, dict) else ())
@@ -292,8 +295,10 @@ def _merged_numbers(inputs: Mapping[str, Any], labels: Path, part: ImagePart) ->
 
 def _measure_fit(judgement: Judgement, names: Mapping[int, str]) -> Judgement:
     """Measure the fit of the cells to the image, mask and labels, and judge it."""
-    source, loaded = cast(Source, judgement.source), judgement.loaded
-    mesh, of_cell = loaded.mesh, loaded.cell_data.get(LABEL_FIELD)
+    source = cast(Source, judgement.source)
+    loaded = judgement.loaded
+    mesh = loaded.mesh
+    of_cell = loaded.cell_data.get(LABEL_FIELD)
     fit = image_fit(source.contrasts[0], mesh)
     measured = fidelity(source.labels, source.mask, mesh, of_cell, what=source.content)
     measured |= _names(measured.get("labels", []), names)
@@ -330,14 +335,13 @@ def _mesh_problems(judgement: Judgement) -> tuple[list[str], list[str]]:
 
     Non-manifold interfaces of labels are remarks, but problems of a run that smoothed interfaces.
     """
-    mesh, image = (
-        judgement.loaded.mesh,
-        None if judgement.source is None else judgement.source.contrasts[0],
-    )
+    mesh = judgement.loaded.mesh
+    image = None if judgement.source is None else judgement.source.contrasts[0]
     problems = check_mesh(
         mesh, image, is_whole=not judgement.is_masked, is_filled=judgement.is_filled
     )
-    labels, touching = judgement.loaded.cell_data.get(LABEL_FIELD), []
+    labels = judgement.loaded.cell_data.get(LABEL_FIELD)
+    touching = []
     if problems or labels is None:
         return problems, []
     if labels.ndim == 1 and ((np.rint(labels) == labels) & (labels >= 0)).all():

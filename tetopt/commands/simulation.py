@@ -167,9 +167,13 @@ def _model(
     loaded, what, is_other = voxels_of(
         without_results(read_mesh(path)), path, image, part, part.labels
     )
-    about, box, whole, voxels = texts_of(loaded, is_other=is_other), loaded.box, None, None
+    about = texts_of(loaded, is_other=is_other)
+    box = loaded.box
+    whole = None
+    voxels = None
     if what is not None:
-        whole, voxels = what.given, what.image
+        whole = what.given
+        voxels = what.image
         if not model.loads:
             _check_box(whole, loaded)
         box = box_of(whole)
@@ -198,7 +202,9 @@ def _with_results(model: Model, solutions: list[Solution]) -> Model:
     """Return the model with the solutions' fields, and the reactions among its texts."""
     from tetopt.fem.solution import solution_fields
 
-    cell_data, point_data, about = dict(model.cell_data), dict(model.point_data), dict(model.about)
+    cell_data = dict(model.cell_data)
+    point_data = dict(model.point_data)
+    about = dict(model.about)
     for step, solution in enumerate(solutions, start=1):
         fields = solution_fields(model.mesh, solution, step)
         cell_data |= fields.cell_data

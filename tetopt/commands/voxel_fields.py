@@ -89,16 +89,15 @@ def write_on_image(
         _check_any(inside, f"{mesh} and {path}")
         on_voxels[~inside] = outside
         save_voxels(output, on_voxels, image)
-        words, space_of = name, space if has_axes else None
+        words = name
+        space_of = space if has_axes else None
         words += f", {values[0].size} components" if values.ndim > 1 else ""
         words += "" if space_of is None else f" ({space.upper()}+)"
     else:
         outside = 0.0 if options.outside is None else options.outside
-        other, words, space_of = (
-            _read(loaded, mesh, options.warp, is_registered),
-            f"{options.warp} moved by {name}",
-            None,
-        )
+        other = _read(loaded, mesh, options.warp, is_registered)
+        words = f"{options.warp} moved by {name}"
+        space_of = None
         if not options.nearest and is_label_map(other):
             warning(
                 f"{options.warp}: seems to be a label image, whose values are interpolated; "
@@ -114,7 +113,8 @@ def write_on_image(
         on_voxels = moved.data.astype(np.float64)
         words += ", nearest voxels" if options.nearest else ", linear between voxels"
         numbers["warp"] = options.warp.name
-    least, most = float(on_voxels[inside].min()), float(on_voxels[inside].max())
+    least = float(on_voxels[inside].min())
+    most = float(on_voxels[inside].max())
     rest = "NaN" if np.isnan(outside) else f"{outside:g}"
     where = f"on {np.count_nonzero(inside)} of {inside.size} voxels of {path}, {rest} elsewhere"
     progress(f"{output}: {words}; {least:.4g} to {most:.4g} {where}")

@@ -149,7 +149,8 @@ def _by_lobpcg(K_ff: csr_array, preconditioner: LinearOperator) -> float:
             values, vectors = lobpcg(
                 K_ff, vectors, M=preconditioner, largest=False, tol=1e-5 * scale, maxiter=60
             )
-        estimate, vector = float(values[0]), vectors[:, 0]
+        estimate = float(values[0])
+        vector = vectors[:, 0]
         residual = float(np.linalg.norm(K_ff @ vector - estimate * vector) / np.linalg.norm(vector))
         # The eigenvalue's error is about residual^2 over the gap to the next eigenvalue.
         if residual <= 1e-4 * estimate:

@@ -359,16 +359,16 @@ def box_faces(image: Image, mesh: Mesh) -> tuple[Ints, Ints]:
             "image"
         )
     axis = upright_axis(image.affine)
-    index, sides = image.to_index(mesh.points), box_sides(image.shape)
+    index = image.to_index(mesh.points)
+    sides = box_sides(image.shape)
     is_on = is_on_sides(index, sides)[:, axis].T  # (2, N)
     place = index[:, axis]
     for side, is_there in zip(sides[axis], is_on, strict=True):
         if not is_there.any():
             raise InputError(
                 f"mesh: no node lies on the image's face at index {side:g} of axis {axis}; the "
-                "mesh extends from "
-                f"{place.min():g} to {place.max():g}, not the whole box; is it of the same "
-                "image, crop and slice?"
+                f"mesh extends from {place.min():g} to {place.max():g}, not the whole box; is it "
+                "of the same image, crop and slice?"
             )
     low, high = (
         np.flatnonzero(is_there)
@@ -404,10 +404,9 @@ def check_fills_box(image: Image, mesh: Mesh) -> None:
     if not on_box.all():
         inner = np.flatnonzero(~on_box)
         raise InputError(
-            f"mesh: {len(inner)} of its boundary facets lie off the faces of the image's box; "
-            "the first has nodes "
-            f"{outer[inner[0]].tolist()}; the mesh has a crack or several components, or is of "
-            "another image or crop"
+            f"mesh: {len(inner)} of its boundary facets lie off the faces of the image's box; the "
+            f"first has nodes {outer[inner[0]].tolist()}; the mesh has a crack or several "
+            "components, or is of another image or crop"
         )
     filled = filled_fraction(mesh, image)
     if abs(filled - 1.0) > 1e-5:
@@ -453,11 +452,10 @@ def constrain_nodes(
     n = mesh.ndim
     frame = np.eye(n) if frame is None else frame
     elements = elements_of(mesh, order)
-    young, nu = _check_young(young, elements), _check_nu(nu, mesh)
-    is_prescribed, prescribed = (
-        np.asarray(is_prescribed, dtype=bool),
-        np.asarray(prescribed, dtype=np.float64),
-    )
+    young = _check_young(young, elements)
+    nu = _check_nu(nu, mesh)
+    is_prescribed = np.asarray(is_prescribed, dtype=bool)
+    prescribed = np.asarray(prescribed, dtype=np.float64)
     for name, array in (("is_prescribed", is_prescribed), ("prescribed", prescribed)):
         if array.shape != elements.points.shape:
             raise InputError(
@@ -571,8 +569,7 @@ def compression(
     if len(both):
         raise InputError(
             f"fixed_nodes and pushed_nodes: {len(both)} nodes are in both, the first "
-            f"{both[:5].tolist()}; "
-            "a node cannot be both fixed and displaced"
+            f"{both[:5].tolist()}; a node cannot be both fixed and displaced"
         )
     points, cells = of_order(mesh.points, mesh.cells, order, mesh.midpoints)
     if order == 2:
@@ -659,7 +656,8 @@ def solve_in_steps(system: System, method: Method = "auto") -> tuple[Floats, int
     """The result of `solve_system`, and the number of conjugate gradient steps: 0 if the matrix was
     factorised.
     """
-    n, n_steps = len(system.frame), 0
+    n = len(system.frame)
+    n_steps = 0
 
     def count(_: Floats) -> None:
         nonlocal n_steps
@@ -724,7 +722,8 @@ def multigrid(system: System) -> LinearOperator:
     from pyamg.multilevel import MultilevelSolver  # type: ignore[import-untyped]
     from pyamg.relaxation.smoothing import change_smoothers  # type: ignore[import-untyped]
 
-    n, n_dofs = len(system.frame), system.K.shape[0]
+    n = len(system.frame)
+    n_dofs = system.K.shape[0]
     is_free = np.zeros(n_dofs)
     is_free[system.free] = 1.0
     alone = system.K.diagonal().mean()  # diagonal entry of a prescribed dof
@@ -783,7 +782,8 @@ def _check_young(young: ArrayLike, elements: Elements) -> Floats:
         young = np.asarray(young, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(f"young: expected one modulus for each cell, got {young!r}") from error
-    n_cells, n_places = len(elements.cells), len(elements.weights)
+    n_cells = len(elements.cells)
+    n_places = len(elements.weights)
     if young.ndim == 0:
         young = np.full(n_cells, float(young))
     if young.shape == (n_cells,):

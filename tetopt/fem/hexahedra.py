@@ -64,7 +64,8 @@ def shape_gradients(at: Floats, corners: Ints) -> Floats:
 
 def stiffness_product(modulus: Image, nu: float, u: Floats) -> Floats:
     """The stiffness of the grid times displacements of its nodes, (*shape + 1, n), mN."""
-    n, out = modulus.ndim, np.zeros_like(u)
+    n = modulus.ndim
+    out = np.zeros_like(u)
     of_corners = [_of_voxels(corner, modulus.shape) for corner in _corners(n)]
     for at, blocks in zip(of_corners, element_stiffness(modulus.affine[:n, :n], nu), strict=True):
         force = sum(
@@ -103,7 +104,8 @@ def solve_between_plates(modulus: Image, nu: float, u: Floats) -> int:
     check_memory(
         DOF_BYTES * u.size, what, lambda room: f"{at_most(room / DOF_BYTES)} (`reference_dofs`)"
     )
-    n, inside = modulus.ndim, _between_plates(modulus)
+    n = modulus.ndim
+    inside = _between_plates(modulus)
     u[inside] = 0.0
     load = -stiffness_product(modulus, nu, u)[inside].ravel()
     if len(load) == 0:
@@ -120,8 +122,10 @@ def solve_between_plates(modulus: Image, nu: float, u: Floats) -> int:
 
 def free_stiffness(modulus: Image, nu: float) -> csr_array:
     """Stiffness between the nodes that are not on the plates, numbered in C order."""
-    n, shape = modulus.ndim, modulus.shape
-    corners, element = _corners(n), element_stiffness(modulus.affine[:n, :n], nu)
+    n = modulus.ndim
+    shape = modulus.shape
+    corners = _corners(n)
+    element = element_stiffness(modulus.affine[:n, :n], nu)
     steps = list(combinations_of((-1, 0, 1), repeat=n))  # from a node to its neighbours and itself
     inside = _between_plates(modulus)
     # of nodes, with one row more around them

@@ -105,7 +105,8 @@ def reference(modulus: Image, nu: float, percent: float = 1.0) -> Reference:
     even = u
     if modulus.data.min() < modulus.data.max():
         even, _ = _compress_grid(Image(np.ones(modulus.shape), modulus.affine), nu, push)
-    energy, half_energy = _strain_energy(modulus, nu, u), _strain_energy(half, nu, u_half)
+    energy = _strain_energy(modulus, nu, u)
+    half_energy = _strain_energy(half, nu, u_half)
     error, scale = (
         _squares(u - other) for other in (interpolate_nodes(u_half, modulus.shape), even)
     )
@@ -120,7 +121,8 @@ def _compress_grid(modulus: Image, nu: float, push: Floats) -> tuple[Floats, int
     """Displacements of the nodes with the bottom pushed in and the top fixed, and the number of
     iterations.
     """
-    n, axis = modulus.ndim, upright_axis(modulus.affine)
+    n = modulus.ndim
+    axis = upright_axis(modulus.affine)
     u = np.zeros((*(s + 1 for s in modulus.shape), n))
     bottom = 0 if modulus.affine[n - 1, axis] > 0.0 else -1
     np.moveaxis(u, axis, 0)[bottom] = push
@@ -170,11 +172,13 @@ def compare(
     if len(inside) == 0:
         raise InputError("mesh: no voxel centre of the reference lies inside the mesh")
     is_near = near_interface(np.asarray(labels)).ravel()
-    elements, order = elements_of(mesh, order_of(mesh, u)), order_of(mesh, u)
+    elements = elements_of(mesh, order_of(mesh, u))
+    order = order_of(mesh, u)
     error, scale, size, strain_error, strain_size = np.zeros(5)
     for begin in range(0, len(inside), VOXELS_AT_ONCE):
         voxels = inside[begin : begin + VOXELS_AT_ONCE]
-        cell, near = owner[voxels], is_near[voxels]
+        cell = owner[voxels]
+        near = is_near[voxels]
         there, strain = at_centres(exact.modulus, exact.u, voxels)
         index = np.stack(np.unravel_index(voxels, exact.modulus.shape), axis=1)
         places = places_in_cells(mesh, cell, exact.modulus.to_world(index))
@@ -204,7 +208,8 @@ def at_centres(image: Image, u: Floats, voxels: Ints) -> tuple[Floats, Floats]:
     corners = np.array(list(combinations_of((0, 1), repeat=n)))
     gradients = shape_gradients(np.full(n, 0.5), corners) @ np.linalg.inv(image.affine[:n, :n])
     place = np.unravel_index(voxels, image.shape)
-    value, slope = np.zeros((len(voxels), n)), np.zeros((len(voxels), n, n))
+    value = np.zeros((len(voxels), n))
+    slope = np.zeros((len(voxels), n, n))
     for corner, g in zip(corners, gradients, strict=True):
         part = u[tuple(axis + c for axis, c in zip(place, corner, strict=True))]
         value += part / 2**n
@@ -237,7 +242,8 @@ def average_voxels(image: Image, shape: tuple[int, ...]) -> Image:
         rows = np.moveaxis(data, axis, 0)
         means = _fractions(new, old) @ rows.reshape(old, -1)
         data = np.moveaxis(means.reshape(new, *rows.shape[1:]), 0, axis)
-    n, size = image.ndim, np.array(image.shape) / np.array(shape)
+    n = image.ndim
+    size = np.array(image.shape) / np.array(shape)
     scaling = np.diag([*size, 1.0])
     scaling[:n, n] = (size - 1.0) / 2.0
     return Image(data, image.affine @ scaling)
@@ -246,7 +252,8 @@ def average_voxels(image: Image, shape: tuple[int, ...]) -> Image:
 def _fractions(new: int, old: int) -> csr_array:
     """Fraction of each new voxel's length in each old one, (new, old)."""
     ends = np.union1d(np.arange(new + 1) * old / new, np.arange(old + 1.0))
-    middle, length = 0.5 * (ends[1:] + ends[:-1]), np.diff(ends)
+    middle = 0.5 * (ends[1:] + ends[:-1])
+    length = np.diff(ends)
     row = np.minimum((middle * new / old).astype(np.int64), new - 1)
     return csr_array((length * new / old, (row, middle.astype(np.int64))), shape=(new, old))
 

@@ -69,9 +69,8 @@ def check_held(points: Floats, cells: Ints, is_prescribed: Bools) -> None:
         )
     if not is_prescribed.any():
         raise InputError(
-            "mesh: no displacement or spring constrains it, so it can move freely; fix or "
-            "support at least one set, "
-            "for example with hold:SET or spring:SET:K"
+            "mesh: no displacement or spring constrains it, so it can move freely; fix or support "
+            "at least one set, for example with hold:SET or spring:SET:K"
         )
     body = components(cells[:, : points.shape[1] + 1])
     _check_pieces(cells, body, is_prescribed)
@@ -80,9 +79,8 @@ def check_held(points: Floats, cells: Ints, is_prescribed: Bools) -> None:
         inside = np.flatnonzero(body == loose)
         raise InputError(
             f"mesh: {len(inside)} cells around cell {inside[0]} (node {cells[inside[0], 0]}) can "
-            "still rotate or slide "
-            "as a whole, as too few nodes connect them; fix more nodes or keep the largest "
-            "facet-connected set"
+            "still rotate or slide as a whole, as too few nodes connect them; fix more nodes or "
+            "keep the largest facet-connected set"
         )
 
 
@@ -100,9 +98,8 @@ def _check_pieces(cells: Ints, body: Ints, is_prescribed: Bools) -> None:
         n_pieces = len(np.unique(label[cells[loose, 0]]))
         raise InputError(
             f"mesh: {n_pieces} components have no node that is fixed, displaced or on a spring; "
-            "the first has "
-            f"{len(piece)} cells around cell {piece[0]} (node {cells[piece[0], 0]}); fix it or "
-            "remove it"
+            f"the first has {len(piece)} cells around cell {piece[0]} (node {cells[piece[0], 0]}); "
+            "fix it or remove it"
         )
 
 

@@ -167,7 +167,8 @@ def solve(model: Model, step: int = 1, method: Method = "auto") -> Solution:
     if model.materials is None:
         raise InputError("model: the cells have no moduli; give `young`")
     task = _task(model, in_step(model.loads, step))
-    young, nu = gauss_moduli(model), model.materials.nu[model.materials.of_cell]
+    young = gauss_moduli(model)
+    nu = model.materials.nu[model.materials.of_cell]
     system = constrain_nodes(
         model.mesh,
         young,
@@ -351,7 +352,8 @@ def node_means(mesh: Mesh, values: Floats) -> Floats:
     Within a cell they are linear, like strains of order 2, or fitted by least squares in a curved
     cell. A node has the mean over the cells around it, weighted by (straight) volume.
     """
-    n, n_places = mesh.ndim, values.shape[1]
+    n = mesh.ndim
+    n_places = values.shape[1]
     order = 1 if n_places == 1 else 2
     cells = of_order(mesh.points, mesh.cells, order)[1]
     if order == 2:
@@ -361,7 +363,8 @@ def node_means(mesh: Mesh, values: Floats) -> Floats:
         at_nodes = np.concatenate([at_corners, at_corners[cell_edges(n)].mean(axis=1)])
     else:
         at_nodes = np.ones((n + 1, 1))
-    n_nodes, flat = int(cells.max()) + 1, values.reshape(len(cells), n_places, -1)
+    n_nodes = int(cells.max()) + 1
+    flat = values.reshape(len(cells), n_places, -1)
     weight = np.repeat(volumes(mesh.points, mesh.cells)[:, None], cells.shape[1], axis=1)
     around = np.bincount(cells.ravel(), weights=weight.ravel(), minlength=n_nodes)
     columns = [
@@ -440,10 +443,8 @@ def solution_fields(mesh: Mesh, solution: Solution, step: int = 1) -> SolutionFi
     """
     suffix = "" if step == 1 else f"_step{step}"
     n = mesh.ndim
-    strain_nodes, stress_nodes = (
-        node_means(mesh, solution.strain),
-        node_means(mesh, solution.stress),
-    )
+    strain_nodes = node_means(mesh, solution.strain)
+    stress_nodes = node_means(mesh, solution.stress)
     cell_data = {
         "strain": cell_means(solution.strain).reshape(-1, n * n),
         "stress": cell_means(solution.stress).reshape(-1, n * n),

@@ -160,7 +160,8 @@ def simplices_of(points: Floats, cells: Ints, middles: Ints | None) -> Simplices
             "a triangle mesh must lie in the plane z = 0; surfaces in space are not supported"
         )
     used, compact = np.unique(cells, return_inverse=True)
-    corners, compact = points[used, :n], compact.reshape(cells.shape)
+    corners = points[used, :n]
+    compact = compact.reshape(cells.shape)
     with np.errstate(invalid="ignore"):  # infinite coordinates, which Mesh rejects with a message
         turned = orient_cells(corners, compact)
     return Simplices(corners, turned, used, int((turned != compact).any(axis=1).sum()))
@@ -195,7 +196,8 @@ def cells_of_rows(
     """Return the nodes of VTK's cells, (M, w) for each type; polylines of varying length keep
     their first nodes.
     """
-    sizes, cells = np.diff(offsets), {}
+    sizes = np.diff(offsets)
+    cells = {}
     for kind, chosen in rows_of_kind.items():
         width = int(sizes[chosen].min())
         if kind in NODES_OF_KIND and (sizes[chosen] != NODES_OF_KIND[kind]).any():

@@ -104,13 +104,13 @@ def section_html(points: Floats, cells: Ints, values: NDArray | None = None) -> 
     if points.shape[1] == 3:
         middle = 0.5 * (points[:, 2].min() + points[:, 2].max())
         cut = plane_cut(points, cells, points[:, 2] - middle)
-        corners, owner, where = (
-            cut.corners[:, :, :2],
-            cut.cells,
-            f"the section at z = {middle:.4g} mm",
-        )
+        corners = cut.corners[:, :, :2]
+        owner = cut.cells
+        where = f"the section at z = {middle:.4g} mm"
     else:
-        corners, owner, where = points[cells], np.arange(len(cells)), "the mesh"
+        corners = points[cells]
+        owner = np.arange(len(cells))
+        where = "the mesh"
     if len(owner) == 0:  # separate components on both sides of the plane
         return ""
     return _picture_html(
@@ -123,7 +123,8 @@ def _draw_polygons(corners: Floats, values: NDArray | None) -> PIL.Image.Image:
     import PIL.Image
     import PIL.ImageDraw
 
-    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    low = corners.min(axis=(0, 1))
+    high = corners.max(axis=(0, 1))
     scale = DRAWN_SCALE * (PICTURE_PIXELS - 2 * MARGIN_PIXELS) / float((high - low).max())
     margin = DRAWN_SCALE * MARGIN_PIXELS
     width, height = (int(side) + 2 * margin for side in np.ceil((high - low) * scale))

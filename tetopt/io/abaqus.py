@@ -123,8 +123,7 @@ def _check(model: Model) -> None:
     if model.is_nonlinear and (count := count_of_steps(model.loads)) > 1:
         raise InputError(
             f"abaqus: expected one nonlinear step, got {count} (each would continue from the "
-            "previous one); write a "
-            "file for each"
+            "previous one); write a file for each"
         )
     others = {
         name: cells for name, cells in model.sets.cells.items() if name not in _shared_sets(model)
@@ -166,7 +165,8 @@ def _materials(model: Model) -> list[str]:
         return []
     parts = []
     densities = [] if model.materials.density is None else mass_densities(model).tolist()
-    names, shared = named_materials(model), _shared_sets(model)
+    names = named_materials(model)
+    shared = _shared_sets(model)
     for k, (name, members) in enumerate(zip(names, cells_of(model.materials), strict=True)):
         parts += [] if name in shared else [f"*ELSET, ELSET={name}\n{_list(members)}"]
         parts.append(f"*MATERIAL, NAME={name}\n{_law(model, model.materials, k)}")
@@ -187,7 +187,8 @@ def _law(model: Model, materials: Materials, k: int) -> str:
     if model.node_young is None:
         young = materials.young[k : k + 1]
     else:
-        low, high = float(model.node_young.min()), float(model.node_young.max())
+        low = float(model.node_young.min())
+        high = float(model.node_young.max())
         count = (
             1 + int(np.ceil(np.log(high / low) / np.log(TEMPERATURE_RATIO)))
             if model.is_nonlinear
@@ -214,7 +215,8 @@ def _temperatures(model: Model, young: Floats) -> Floats:
 
 def _springs(model: Model) -> list[str]:
     """Return three springs along the axes at each node of a set with springs."""
-    parts, number = [], len(model.mesh.cells)
+    parts = []
+    number = len(model.mesh.cells)
     for load in model.loads:
         if load.kind != "spring":
             continue
@@ -338,7 +340,9 @@ def input_sets(path: Path, mesh: Mesh) -> Sets | None:
     other files and meshes.
     """
     text = regular_file(path, "Abaqus file").read_text("utf-8", "replace")
-    facets, cells, own = {}, {}, {ALL_ELEMENTS}
+    facets = {}
+    cells = {}
+    own = {ALL_ELEMENTS}
     if not text.startswith("** tetopt"):
         return None
     for block in text.split("\n*")[1:]:

@@ -152,7 +152,8 @@ def _sent(stream: IO[bytes], answer: Json) -> None:
 
 def _receive_answer(stream: IO[bytes]) -> Json | None:
     """Return the child's answer; None if it is incomplete."""
-    line, pipe = stream.readline(), SimpleNamespace(read=stream.read)
+    line = stream.readline()
+    pipe = SimpleNamespace(read=stream.read)
 
     def unmarked(table: Json) -> Any:
         if table.get(ARRAY_MARK) is not True:

@@ -52,8 +52,10 @@ def note_other_place(header: Any, shape: Sequence[int]) -> None:
     qform, qform_code = header.get_qform(coded=True)
     if sform is None or qform is None:
         return
-    used, other = sform.astype(np.float64), qform.astype(np.float64)
-    columns, others = used[:3, :3], other[:3, :3]
+    used = sform.astype(np.float64)
+    other = qform.astype(np.float64)
+    columns = used[:3, :3]
+    others = other[:3, :3]
     steps = np.linalg.norm(columns, axis=0)
     if not (steps > 0.0).all() or not np.isfinite(used).all():
         return  # refused later

@@ -153,7 +153,9 @@ def _check(model: Model) -> None:
 
 def _parts(model: Model) -> list[_Part]:
     assert model.materials is not None
-    young, nu, of_cell = model.materials.young, model.materials.nu, model.materials.of_cell
+    young = model.materials.young
+    nu = model.materials.nu
+    of_cell = model.materials.of_cell
     density = mass_densities(model)
     if len(young) > MOST_MATERIAL_PARTS:
         ratio, mass = (
@@ -236,7 +238,9 @@ def _mesh_data(model: Model, parts: list[_Part]) -> list[str]:
     cells would not work: across parts, FEBio uses their order and not that of the set.
     """
     assert model.materials is not None
-    young, nu, of_cell = model.materials.young, model.materials.nu, model.materials.of_cell
+    young = model.materials.young
+    nu = model.materials.nu
+    of_cell = model.materials.of_cell
     stated = {YOUNG_MAP: (parts[0].young, young), NU_MAP: (parts[0].nu, nu)}
     stated[DENSITY_MAP] = parts[0].density, mass_densities(model)
     fields = {name: values[of_cell] for name, (word, values) in stated.items() if word == name}
@@ -325,7 +329,8 @@ def _ground(model: Model, points: Floats) -> list[str]:
 
 
 def _force_and_spring_sets(model: Model, points: Floats) -> list[str]:
-    forced, sprung = _dead_forces(model)[0], _springs(model)[0]
+    forced = _dead_forces(model)[0]
+    sprung = _springs(model)[0]
     sets = [f'<NodeSet name="{DEAD_FORCES}">{_list(forced)}</NodeSet>\n'] if len(forced) else []
     if len(sprung) == 0:
         return sets

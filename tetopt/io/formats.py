@@ -292,7 +292,8 @@ def _check_model(path: Path, model: Model) -> Model:
 
     Models are records that anyone can build, and no writer checks them.
     """
-    mesh, n_cells = model.mesh, len(model.mesh.cells)
+    mesh = model.mesh
+    n_cells = len(model.mesh.cells)
     cell_data = check_fields(f"{path}: cell_data", model.cell_data, n_cells)
     point_data = {
         name: node_field(values, mesh, model.order)
@@ -352,8 +353,7 @@ def _check_sets(
         ):
             raise InputError(
                 f"{path}: set {plain(str(name))!r}: expected {what}, distinct integers from 0 to "
-                f"{ends[0] - 1} in "
-                f"ascending order, got {values.dtype} of shape {values.shape}"
+                f"{ends[0] - 1} in ascending order, got {values.dtype} of shape {values.shape}"
             )
         arrays[name] = values.astype(np.int64)
     return arrays
@@ -361,7 +361,8 @@ def _check_sets(
 
 def _check_materials(path: Path, table: Materials, n_cells: int) -> None:
     """Raise InputError unless each cell has one of the materials, whose numbers are finite."""
-    of_cell, n_kinds = np.asarray(table.of_cell), len(table.young)
+    of_cell = np.asarray(table.of_cell)
+    n_kinds = len(table.young)
     is_index = of_cell.dtype.kind in "iu" and of_cell.shape == (n_cells,)
     if not is_index or of_cell.min() < 0 or of_cell.max() >= n_kinds:
         raise InputError(
@@ -392,7 +393,8 @@ def _rename_data(path: Path, model: Model) -> Model:
     if twice := [name for name in sets if counts[name.lower()] > 1]:
         raise InputError(f"{path}: two sets have the name {twice[1]}; rename one of them")
     shown = SHOWN_NAMES.get(path.suffix.lower(), file_name)
-    changed, renamed = list[str](), dict[str, Json]()
+    changed = list[str]()
+    renamed = dict[str, Json]()
     for part in ("cell_data", "point_data", "about"):
         data = getattr(model, part)
         names = names_apart(data, shown)

@@ -159,8 +159,7 @@ def read_frd(path: str | Path, mesh: Mesh) -> Results:
         if stages[number].n_nodes != len(grid.points):
             raise InputError(
                 f"{path}: has results at {stages[number].n_nodes} of {len(grid.points)} nodes in "
-                f"step {step}; request "
-                "them at all nodes (*NODE FILE and *EL FILE without NSET)"
+                f"step {step}; request them at all nodes (*NODE FILE and *EL FILE without NSET)"
             )
         suffix = "" if step == 1 else f"_step{step}"
         fields = _fields_of_step(path, of_step, step)
@@ -202,7 +201,9 @@ def _grid_of(path: str, numbers: list[int]) -> tuple[Any, ...]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about unknown cells; those of the mesh are compared
         reader = pyvista_frd.FRDReader(path)
-    grid, n_times, arrays = reader.read(), reader.number_time_points, []
+    grid = reader.read()
+    n_times = reader.number_time_points
+    arrays = []
     for number in numbers:
         if number < n_times:  # otherwise the times do not match the increments, which is reported
             reader.set_active_time_point(number)
@@ -226,7 +227,8 @@ def _check_mesh(path: Path, mesh: Mesh, grid: _Grid, spaces: tuple[str, ...]) ->
             f"{path}: expected a tetrahedral mesh for CalculiX's results, got triangles"
         )
     points, cells = quadratic(mesh.points, mesh.cells, mesh.midpoints)
-    counts, n_cells = (len(mesh.points), len(points)), sum(map(len, grid.cells))
+    counts = (len(mesh.points), len(points))
+    n_cells = sum(map(len, grid.cells))
     if len(grid.points) not in counts or n_cells != len(mesh.cells):
         raise InputError(
             f"{path}: belongs to another mesh: expected {len(mesh.cells)} cells and {counts[0]} "
@@ -247,8 +249,7 @@ def _check_mesh(path: Path, mesh: Mesh, grid: _Grid, spaces: tuple[str, ...]) ->
     if is_off.any():
         raise InputError(
             f"{path}: belongs to another mesh: {int(is_off.sum())} of {len(points)} nodes are "
-            "displaced by up to "
-            f"{float(distances[space].max()):.3g} mm"
+            f"displaced by up to {float(distances[space].max()):.3g} mm"
         )
     theirs = grid.cells[0]
     if theirs.shape != cells.shape or not np.array_equal(

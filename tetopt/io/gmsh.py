@@ -96,7 +96,8 @@ def own_comments(lines: list[str]) -> OwnComments | None:
     texts: dict[str, str] = {}
     constants: dict[str, tuple[float, float]] = {}
     entities: dict[str, dict[str, list[int]]] = {"cells": {}, "facets": {}}
-    zero, labels = None, {}
+    zero = None
+    labels = {}
     for line in lines:
         if match := re.fullmatch(r"units: m+, (\w+), .*", line):
             texts["units"] = match[1]
@@ -139,7 +140,8 @@ def gmsh41(model: Model) -> bytes:
     InputError
         A set has the name of a group of cells.
     """
-    grouped, comments = model, []
+    grouped = model
+    comments = []
     if _n_materials(model) > MOST_MATERIAL_GROUPS:
         grouped = model._replace(materials=None)
         comments = [
@@ -194,8 +196,7 @@ def gmsh22(model: Model) -> bytes:
     if _n_materials(model) > MOST_MATERIAL_GROUPS:
         raise InputError(
             f"gmsh 2.2: expected at most {MOST_MATERIAL_GROUPS} materials, as each becomes a "
-            "group, got "
-            f"{_n_materials(model)}; group them with `bins` 32, or use .msh"
+            f"group, got {_n_materials(model)}; group them with `bins` 32, or use .msh"
         )
     points, cells = _geometry(model)
     parts = _parts(model)

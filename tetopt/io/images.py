@@ -243,7 +243,9 @@ def save_voxels(path: Path, values: NDArray, image: Image) -> None:
 
     Vectors are along the fifth axis, with the intent "vector".
     """
-    n, affine, is_vector = image.ndim, np.eye(4), values.ndim > image.ndim
+    n = image.ndim
+    affine = np.eye(4)
+    is_vector = values.ndim > image.ndim
     affine[:n, :n] = image.affine[:-1, :-1]
     affine[:n, 3] = image.affine[:-1, -1]
     kind = nibabel.Nifti1Image if max(image.shape) <= MOST_OF_NIFTI_1 else nibabel.Nifti2Image
@@ -265,7 +267,8 @@ def _for_file(data: NDArray[np.floating]) -> NDArray:
     """Convert small whole numbers to integers, so that programs recognise labels; return other
     data unchanged.
     """
-    low, high = data.min(), data.max()
+    low = data.min()
+    high = data.max()
     for dtype in (np.uint8, np.int16, np.int32):
         if (
             np.iinfo(dtype).min <= low
@@ -477,7 +480,8 @@ def folder_checksum(path: Path, is_read: Callable[[Path], bool]) -> str:
     contents. Links are followed, but no folder is visited twice. For a level of an OME-Zarr image,
     the image's metadata count, too.
     """
-    digest, known = hashlib.sha256(), set()
+    digest = hashlib.sha256()
+    known = set()
     files: dict[str, Path] = {}
     for folder, folders, names in os.walk(path, followlinks=True, onerror=_raise_error):
         status = os.stat(folder)
@@ -541,7 +545,8 @@ def reader_of(path: Path) -> Reader:
 
 def _named_readers(path: Path) -> list[Reader]:
     """Return the reader of a file's suffix, if any."""
-    is_file, name = not path.is_dir(), path.name.lower()
+    is_file = not path.is_dir()
+    name = path.name.lower()
     return [reader for reader in READERS if is_file and name.endswith(reader.suffixes)]
 
 

@@ -144,7 +144,8 @@ def header_sizes(path: Path) -> tuple[int, ...]:
     InputError for the reasons of `check_header` in the header.
     """
     header = read_header(path)
-    fields, n_axes = header.fields, len(header.sizes)
+    fields = header.fields
+    n_axes = len(header.sizes)
     kinds = fields.get("kinds", "").lower().split()
     directions = re.findall(r"none|\(", fields.get("spacedirections", "").lower())
     is_other = [
@@ -235,7 +236,8 @@ def _lines(head: bytes, names: Names) -> tuple[dict[str, str], dict[str, str], l
         if is_nrrd and value.startswith("="):  # "key:=value", which is not a field; in UTF-8
             texts[key] = value[1:].encode("latin-1").decode("utf-8", "replace")
             continue
-        key, value = key.strip(), value.strip()
+        key = key.strip()
+        value = value.strip()
         if is_nrrd:
             key = key.lower().replace(" ", "")
         elif (key and not mark) or ":" in key:  # ITK also ends a key at a colon

@@ -118,7 +118,8 @@ def _middles(raw: Raw, kind: str) -> tuple[Ints, bool, tuple[str, ...]]:
     if kind not in raw.middles:
         return np.empty(0, dtype=np.int64), False, ()
     edges, number = numbered_edges(raw.cells[kind])
-    nodes, notes = np.empty(len(edges), dtype=np.int64), []
+    nodes = np.empty(len(edges), dtype=np.int64)
+    notes = []
     nodes[number] = raw.middles[kind]
     if n_torn := len(np.unique(number[nodes[number] != raw.middles[kind]])):
         notes.append(
@@ -138,7 +139,8 @@ def _numbers(
     raw: Raw, ndim: int, cell_data: Arrays, point_data: Arrays
 ) -> tuple[list[Arrays], tuple[str, ...]]:
     """Return numeric cell data and point data in RAS+ and kPa, and notes on dropped data."""
-    fields, notes = [], []
+    fields = []
+    notes = []
     for what, values_of in (("cell", cell_data), ("point", point_data)):
         numbers = {
             name: values for name, values in values_of.items() if values.dtype.kind in "biuf"
@@ -165,7 +167,8 @@ def _sets_of_groups(raw: Raw, mesh: Mesh, kind: str, used: Ints) -> tuple[Sets, 
     """Return gmsh's groups of cells and of facets as sets, and notes on renamed ones."""
     place = np.full(len(raw.points), -1)
     place[used] = np.arange(len(used))
-    sets, notes = Sets({}, {}), []
+    sets = Sets({}, {})
+    notes = []
     taken: set[str] = set()
     n = CELL_DIMENSIONS[kind]
     groups = [group for group in raw.groups if n - 1 <= CELL_DIMENSIONS[group.kind] <= n]

@@ -43,5 +43,6 @@ def mni_tissue() -> Image:
         For the reasons of `mni_path`.
     """
     t1, grey, white = (load_image(mni_path(contrast)) for contrast in ("t1", "gm", "wm"))
-    g, w = grey.data.astype(np.int64), white.data.astype(np.int64)
+    g = grey.data.astype(np.int64)
+    w = white.data.astype(np.int64)
     return Image(np.where(t1.data > 0, 1 + np.argmax([255 - g - w, g, w], axis=0), 0), t1.affine)

@@ -114,7 +114,9 @@ def other_file(path: Path) -> list[Path]:
     match = PAIR.fullmatch(path.name)
     if match is None:
         return []
-    stem, kind, packed = match[1], match[2].lower(), (match[3] or "").lower()
+    stem = match[1]
+    kind = match[2].lower()
+    packed = (match[3] or "").lower()
     other = "img" if kind == "hdr" else "hdr"
     # With the same packing first; of .IMG, .HDR.
     for suffix in (f".{other}{packed}", f".{other}", f".{other}.gz"):
@@ -249,15 +251,14 @@ def _voxels(
     """Return the scaled values of a box of a volume; InputError unless the file can hold all up to
     this volume, before memory is allocated.
     """
-    dtype, offset, size = (
-        header.get_data_dtype(),
-        int(header.get_data_offset()),
-        path.stat().st_size,
-    )
+    dtype = header.get_data_dtype()
+    offset = int(header.get_data_offset())
+    size = path.stat().st_size
     volume_bytes = math.prod(shape[:3]) * dtype.itemsize
     whole = offset + math.prod(shape[3:]) * volume_bytes
     begin = offset + volume * volume_bytes
-    end, is_packed = begin + volume_bytes, path.name.lower().endswith(PACKED_SUFFIXES)
+    end = begin + volume_bytes
+    is_packed = path.name.lower().endswith(PACKED_SUFFIXES)
     too_short = InputError(
         f"{DAMAGED_FILE} (its header declares {' x '.join(map(str, shape))} voxels, {end:.4g} "
         f"bytes, but the file has {size})"
@@ -309,7 +310,8 @@ def _unpack_gzip(path: Path, begin: int, end: int, most: int) -> tuple[int, io.B
 
     Nothing is kept of the rest, and nothing is unpacked beyond `most`.
     """
-    n_bytes, part = 0, io.BytesIO()
+    n_bytes = 0
+    part = io.BytesIO()
     try:
         with gzip.open(path) as stream:
             while n_bytes <= most and (block := stream.read(1 << 20)):

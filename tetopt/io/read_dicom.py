@@ -72,8 +72,7 @@ MOST_EMPTY = 10
 ALONE = "put the files of one into a separate folder"
 NO_PLACES = (
     "does not state where its {} frames lie (cine, or an old kind of file); convert it with a "
-    "program that knows, such "
-    "as dcm2niix, or export a series of slices"
+    "program that knows, such as dcm2niix, or export a series of slices"
 )
 
 
@@ -435,7 +434,8 @@ def _check_bits(file: DicomFile) -> None:
     bits that are left.
     """
     with _errors_of(file.name):
-        low, tags = _low_bits(file), file.tags
+        low = _low_bits(file)
+        tags = file.tags
         is_compressed = tags.file_meta.TransferSyntaxUID.is_compressed
         if low < 0 or (low and (is_compressed or int(tags.HighBit) >= int(tags.BitsAllocated))):
             raise InputError(
@@ -455,9 +455,8 @@ def _check_sizes(files: list[DicomFile]) -> None:
         if file.size != most:
             here, there = ("{} x {}".format(*size) for size in (file.size, most))
             raise InputError(
-                f"{file.name} has {here} pixels, and {count} others of its series have {there} "
-                "(is it a localizer?); "
-                "move it out of the folder"
+                f"{file.name} has {here} pixels, and {count} others of its series have {there} (is "
+                "it a localizer?); move it out of the folder"
             )
 
 
@@ -482,7 +481,8 @@ def _check_world(files: list[DicomFile]) -> None:
 def _frames(file: DicomFile) -> list[Frame]:
     """Return the frames of a file, as their functional groups state, or else the file."""
     with _errors_of(file.name):
-        tags, n = file.tags, file.n_frames
+        tags = file.tags
+        n = file.n_frames
         shared = (tags.get("SharedFunctionalGroupsSequence") or [{}])[0]
         own = tags.get("PerFrameFunctionalGroupsSequence") or []
         if own and len(own) != n:
@@ -577,7 +577,8 @@ def _stack_frames(file: DicomFile) -> list[tuple[float, ...]]:
     """Return the places of frames without functional groups, where the file states a distance
     between them.
     """
-    tags, n = file.tags, file.n_frames
+    tags = file.tags
+    n = file.n_frames
     detectors = tags.get("DetectorInformationSequence") or []
     for each in detectors if len(detectors) == 1 else ():  # nuclear medicine
         for keyword in ("ImagePositionPatient", "ImageOrientationPatient"):
@@ -616,7 +617,8 @@ def _stack_frames(file: DicomFile) -> list[tuple[float, ...]]:
                 f"{file.name} has a GridFrameOffsetVector that is not of its position; export it "
                 "again"
             )
-        along, offsets = np.array([0.0, 0.0, 1.0]), tuple(each - offsets[0] for each in offsets)
+        along = np.array([0.0, 0.0, 1.0])
+        offsets = tuple(each - offsets[0] for each in offsets)
     return [tuple((np.array(first.place) + each * along).tolist()) for each in offsets]
 
 
@@ -672,7 +674,8 @@ def _place_frames(frames: list[Frame], *, is_sparse: bool) -> tuple[Floats, Ints
     if len(places) < len(points) and not is_sparse:
         raise _several_volumes(frames, len(places))
     if len(places) == 1:
-        step, slices = normal * _thickness(first), np.zeros(1, dtype=np.int64)
+        step = normal * _thickness(first)
+        slices = np.zeros(1, dtype=np.int64)
     else:
         step, slices = _steps(places, first, is_sparse)
         _check_step(step, normal, first)
@@ -704,7 +707,8 @@ def _check_alike(frames: list[Frame]) -> None:
 
 
 def _several_volumes(frames: list[Frame], n_places: int) -> InputError:
-    n, remedy = len(frames), "put the slices of one volume into a separate folder, or "
+    n = len(frames)
+    remedy = "put the slices of one volume into a separate folder, or "
     if all(frame.file.n_frames == n for frame in frames):
         remedy = ""
     elif all(frame.file.n_frames == n_places for frame in frames):
@@ -777,12 +781,12 @@ def _check_step(step: Floats, normal: Floats, first: Frame) -> None:
         raise InputError(
             "the DICOM slices lie beside each other, not above each other; choose another series"
         )
-    lengths, stated = (across, float(np.linalg.norm(step))), abs(first.step)
+    lengths = (across, float(np.linalg.norm(step)))
+    stated = abs(first.step)
     if stated and all(abs(length / stated - 1.0) > _UNEVEN_FRACTION for length in lengths):
         note(
             f"its slices lie {lengths[1]:.4g} mm apart by their positions, which are used; "
-            "SpacingBetweenSlices is "
-            f"{stated:.4g} mm"
+            f"SpacingBetweenSlices is {stated:.4g} mm"
         )
     thickness = first.thickness
     if (
@@ -792,8 +796,7 @@ def _check_step(step: Floats, normal: Floats, first: Frame) -> None:
     ):
         note(
             f"its slices lie {lengths[1]:.4g} mm apart by their positions, which are used; "
-            "SliceThickness is "
-            f"{thickness:.4g} mm, so slices between them may be missing"
+            f"SliceThickness is {thickness:.4g} mm, so slices between them may be missing"
         )
 
 
@@ -813,8 +816,7 @@ def _unevenness(points: Floats, off: Floats) -> str:
     where = "elsewhere" if is_other.sum() == 1 else "at most places"
     return (
         f"a step of {steps[k]:.3g} mm between slices {k} and {k + 1}, counted from 0, and "
-        f"{usual:.3g} mm {where}: "
-        "one is missing, or several volumes are mixed"
+        f"{usual:.3g} mm {where}: one is missing, or several volumes are mixed"
     )
 
 
@@ -825,7 +827,8 @@ def _planes(frames: list[Frame]) -> Iterator[NDArray]:
     """Yield the stored values of frames of one file, (rows, columns)."""
     from pydicom.pixels import iter_pixels
 
-    file, indices = frames[0].file, [frame.number for frame in frames]
+    file = frames[0].file
+    indices = [frame.number for frame in frames]
     if (
         int(file.tags.BitsAllocated) == 1
         and not file.tags.file_meta.TransferSyntaxUID.is_compressed
@@ -853,9 +856,11 @@ def _unpack_bits(file: DicomFile, indices: list[int]) -> Iterator[NDArray]:
     too few for some.
     """
     columns, rows = file.size
-    packed, size = np.frombuffer(file.tags.PixelData, np.uint8), rows * columns
+    packed = np.frombuffer(file.tags.PixelData, np.uint8)
+    size = rows * columns
     for index in indices:
-        first, end = index * size, (index + 1) * size
+        first = index * size
+        end = (index + 1) * size
         bits = np.unpackbits(packed[first // 8 : -(-end // 8)], bitorder="little")
         yield bits[first % 8 :][:size].reshape(rows, columns)
 
@@ -890,7 +895,8 @@ def _number_segments(frames: list[Frame], slices: Ints, shape: tuple[int, int, i
     """
     tags = frames[0].file.tags
     order = np.lexsort([[frame.segment for frame in frames], slices])
-    frames, slices = [frames[k] for k in order], slices[order]
+    frames = [frames[k] for k in order]
+    slices = slices[order]
     names = {number: _name(each) for number, each in _segments(frames[0].file).items()}
     for one, other, k, before in zip(frames[1:], frames, slices[1:], slices, strict=False):
         if (one.segment, k) == (other.segment, before):

@@ -45,7 +45,8 @@ def check_grid(kind: str, errors: str, arrays: Json) -> RawGrid:
     if kind != "UnstructuredGrid" or not len(arrays.get("cell_types", ())):
         raise InputError(f"expected an unstructured grid with cells, found {kind}; damaged?")
     grid = RawGrid(**arrays)
-    starts, n = grid.offsets, len(grid.cell_types)
+    starts = grid.offsets
+    n = len(grid.cell_types)
     is_whole = len(starts) == n + 1 and starts[0] == 0 and starts[-1] <= len(grid.connectivity)
     is_whole &= all(len(each) == len(grid.points) for each in grid.point_data.values())
     is_whole &= all(len(each) == n for each in grid.cell_data.values())
@@ -147,7 +148,8 @@ def _data_of(data: Any) -> Arrays:
             )
         elif isinstance(array, vtkDataArray):
             if isinstance(array, vtkBitArray):
-                bits, array = array, vtkUnsignedCharArray()
+                bits = array
+                array = vtkUnsignedCharArray()
                 array.DeepCopy(bits)
             arrays[name] = vtk_to_numpy(array)
     return arrays

@@ -222,8 +222,7 @@ def _series(names: list[str]) -> list[str]:
     if count < 2 or len(others) > 1:
         raise InputError(
             f"expected one series of numbered slices, got {', '.join(sorted(names)[:4])} and "
-            "others; put one series "
-            "into its own folder"
+            "others; put one series into its own folder"
         )
     numbers = {
         name: [int(digits) for digits in parts[name][1::2]] for name in names if forms[name] == form
@@ -319,7 +318,8 @@ def _stack_of(path: str, is_page: bool) -> Tiff:
         tiff = _tiff_of(first)
         if is_page:
             return tiff
-        series, axes = file.series, _stack_axes(file)
+        series = file.series
+        axes = _stack_axes(file)
         n_slices = int(_ome_pixels(first.description).get("SizeZ", 1))
         if len(file.pages) == 1 and set(axes) <= set("YXS") and not words and n_slices == 1:
             return tiff
@@ -337,7 +337,8 @@ def _stack_of(path: str, is_page: bool) -> Tiff:
 
 def _stack_axes(file: Any) -> dict[str, int]:
     """Return the lengths of a file's axes, if above 1, by tifffile's letters, also those of OME."""
-    pixels, series = _ome_pixels(file.pages.first.description), file.series[0]
+    pixels = _ome_pixels(file.pages.first.description)
+    series = file.series[0]
     axes = zip(series.axes, series.shape, strict=True)
     of_ome = ((name, pixels.get(f"Size{name}", 1)) for name in "CT")
     return {name: int(size) for name, size in (*axes, *of_ome) if int(size) > 1}
@@ -345,7 +346,8 @@ def _stack_axes(file: Any) -> dict[str, int]:
 
 def _stack_shape(file: Any, axes: dict[str, int]) -> list[int]:
     """Return the numbers of slices, rows and columns; InputError unless the pages are one stack."""
-    series, description = file.series, file.pages.first.description
+    series = file.series
+    description = file.pages.first.description
     # A program may write a page at a time, each as a picture of its own.
     is_apart = all((each.kind, each.axes) == ("shaped", "YX") for each in series)
     if len({(each.shape, each.dtype) for each in series}) > 1 or (len(series) > 1 and not is_apart):
@@ -404,7 +406,8 @@ def _imagej_scale(fields: dict[str, str]) -> tuple[float, float]:
     curve = fields.get("cf", IMAGEJ_LINE if {"c0", "c1"} <= fields.keys() else IMAGEJ_NONE)
     if curve == IMAGEJ_LINE:
         try:
-            slope, intercept = float(fields["c1"]), float(fields["c0"])
+            slope = float(fields["c1"])
+            intercept = float(fields["c0"])
             if slope and np.isfinite([slope, intercept]).all():
                 return slope, intercept
         except (KeyError, ValueError):

@@ -101,8 +101,7 @@ def save_surface(
     if odd := [name for name in labels or {} if not SET_NAME.fullmatch(name)]:
         raise InputError(
             f"{path}: expected label names of up to {MOST_LETTERS} letters, digits, _ or -, the "
-            "first a letter, "
-            f'got "{plain(odd[0])}"; rename them'
+            f'first a letter, got "{plain(odd[0])}"; rename them'
         )
     surface, labels = _check_arrays(path, surface, labels)
     if space not in SPACES:
@@ -120,7 +119,8 @@ def _check_arrays(path: Path, surface: Surface, labels: Labels | None) -> tuple[
     points, triangles = simplex_arrays(f"{path}: surface", surface.points, surface.triangles, 3)
     if points.shape[1] != 3:
         raise InputError(f"{path}: expected points in space, got shape {points.shape}")
-    arrays, range_ = check_fields(f"{path}: labels", labels, len(triangles)), np.iinfo(np.int32)
+    arrays = check_fields(f"{path}: labels", labels, len(triangles))
+    range_ = np.iinfo(np.int32)
     for name, values in arrays.items():
         if (
             values.ndim != 1

@@ -177,7 +177,8 @@ def number_parts(model: Model) -> tuple[Part, Part]:
     InputError
         A set has the name of a material, a label or the group of other cells.
     """
-    labels, n_facets = group_labels(model), len(model.sets.facets)
+    labels = group_labels(model)
+    n_facets = len(model.sets.facets)
     names, group = _cell_groups(model, labels)
     room = LEAST_ROOM
     while room <= max(names, default=0) or room <= n_facets + 2 * model.mesh.ndim + 2:
@@ -203,7 +204,8 @@ def _part(
     An entity has the number of its first group; if the group has several entities, they are
     numbered after `room`.
     """
-    counts, free = Counter(groups[0] for groups in groups_of), count(room + 1)
+    counts = Counter(groups[0] for groups in groups_of)
+    free = count(room + 1)
     number = np.array(
         [groups[0] if counts[groups[0]] == 1 else next(free) for groups in groups_of],
         dtype=np.int64,
@@ -242,7 +244,8 @@ def _cell_groups(model: Model, labels: Ints | None) -> tuple[dict[int, str], Int
     if model.materials is None:
         listed, group = _disjoint_sets(model)
     else:
-        listed, group = material_names(model, model.sets.facets), model.materials.of_cell + 1
+        listed = material_names(model, model.sets.facets)
+        group = model.materials.of_cell + 1
     return dict(enumerate(listed, 1)), group
 
 
@@ -344,7 +347,9 @@ def remarks(model: Model) -> list[str]:
     """
     lines = header_lines(model)
     if model.materials is not None:
-        young, nu, density = model.materials.young, model.materials.nu, model.materials.density
+        young = model.materials.young
+        nu = model.materials.nu
+        density = model.materials.density
         masses = [""] * len(young)
         if density is not None:
             masses = [f", density {each!r} kg/m3" for each in density.tolist()]
@@ -410,7 +415,8 @@ def label_lines(model: Model, cells: Part, what: str) -> list[str]:
         return []
     divided = sorted({group for number, (group,) in cells.groups_of.items() if number != group})
     renumbered = renumbered_labels(model)
-    zero, lines = group_of_zero(labels), [f"the {what} of a cell is its label"]
+    zero = group_of_zero(labels)
+    lines = [f"the {what} of a cell is its label"]
     if renumbered:
         lines[0] = (
             f"the {what} of a cell numbers its label from 1, as labels above {LARGEST_GROUP} do "

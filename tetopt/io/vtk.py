@@ -176,7 +176,8 @@ def sets_in(field_data: Arrays, mesh: Mesh) -> tuple[Sets, tuple[str, ...]]:
         return sets, (f"{words}: {', '.join(name.partition(':')[2] for name in names)}",)
     unfit = []
     for key in names:
-        prefix, name = key[: key.index(":") + 1], key.partition(":")[2]
+        prefix = key[: key.index(":") + 1]
+        name = key.partition(":")[2]
         ends = (len(mesh.cells), mesh.ndim + 1) if prefix == FACETS_PREFIX else (len(mesh.cells),)
         is_free = name.lower() not in {each.lower() for part in sets for each in part}
         if not SET_NAME.fullmatch(name) or not is_free or not is_set(field_data[key], ends):

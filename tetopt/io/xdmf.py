@@ -160,7 +160,9 @@ def _mesh_grid(model: Model, others: str) -> str:
         ("load", load_words(load)) for load in model.loads
     ]
     if model.materials is not None:
-        young, nu, of_cell = model.materials.young, model.materials.nu, model.materials.of_cell
+        young = model.materials.young
+        nu = model.materials.nu
+        of_cell = model.materials.of_cell
         own = {"material": of_cell + 1, "young": young[of_cell], "nu": nu[of_cell]}
         if model.materials.density is not None:
             own["density"] = model.materials.density[of_cell]
@@ -206,7 +208,8 @@ def _cell_grid(model: Model) -> str:
 
 def _facet_grid(model: Model) -> str:
     """Return the grid of facets in sets, with those that a set holds from the other side."""
-    sets, scale = model.sets.facets, (model.mesh.ndim + 1, 1)
+    sets = model.sets.facets
+    scale = (model.mesh.ndim + 1, 1)
     listed = facet_tags(model.mesh, sets).items @ scale
     turned = {
         f"{name} turned": others

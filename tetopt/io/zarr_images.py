@@ -384,8 +384,7 @@ def _axes_of(axes: list[Json]) -> _Axes:
         ways = [WAYS.get(names[number].lower()) for number in space]
         note(
             "has no orientation: assuming x, y and z are right, anterior and superior; if "
-            "left/right "
-            "matters, give its axes an orientation (NGFF's RFC-4)"
+            "left/right matters, give its axes an orientation (NGFF's RFC-4)"
         )
     rows, signs = zip(*(way or (None, 0.0) for way in ways), strict=True)
     if set(rows) != {0, 1, 2}:
@@ -395,13 +394,17 @@ def _axes_of(axes: list[Json]) -> _Axes:
 
 def _scale_and_shift(transforms: list[Json], n: int) -> tuple[Floats, Floats]:
     """Combine successive scales and translations of n axes."""
-    scale, shift, has_scale = np.ones(n), np.zeros(n), False
+    scale = np.ones(n)
+    shift = np.zeros(n)
+    has_scale = False
     for each in transforms:
         kind = each["type"]
         if kind == "scale":
             values = np.array(each[kind], dtype=np.float64).reshape(n)
             with np.errstate(invalid="ignore"):  # infinite scales are refused with the affine
-                scale, shift, has_scale = scale * values, shift * values, True
+                scale = scale * values
+                shift = shift * values
+                has_scale = True
         elif kind == "translation":
             shift = shift + np.array(each[kind], dtype=np.float64).reshape(n)
         elif kind != "identity":
@@ -465,7 +468,8 @@ def check_chunks(level: ZarrLevel, picks: Sequence[Pick]) -> None:
         for pick, size in zip(picks, edges, strict=True)
     ]
     most_bytes = PACKED_BYTES + PACKED_VOXEL_BYTES * math.prod(edges)
-    n_chunks, n_missing = math.prod(map(len, ranges)), 0
+    n_chunks = math.prod(map(len, ranges))
+    n_missing = 0
     if n_chunks > MOST_CHUNKS:
         raise InputError(
             f"expected at most {MOST_CHUNKS} chunks, got {n_chunks}; write it again with larger "

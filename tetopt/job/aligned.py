@@ -238,7 +238,8 @@ def read_mask(
     InputError
         The file cannot be read; it does not have a label, or its table a name.
     """
-    path, words = options.mask, options.mask_label
+    path = options.mask
+    words = options.mask_label
     if path is None:
         if words is not None:
             raise InputError("`mask_label`: needs `mask`")
@@ -246,7 +247,8 @@ def read_mask(
     mask = read_companion(path, getattr(options, "spacing_mm", None))
     if words is None:
         return {(path, resample_mask): mask}
-    mask, table = check_labels(str(path), mask, is_map=True), names_of
+    mask = check_labels(str(path), mask, is_map=True)
+    table = names_of
     if table is None and str(path).lower().endswith((".seg.nrrd", ".dcm")):
         table = path
     names = {} if table is None else load_label_table(table).names

@@ -211,7 +211,8 @@ def of_option(name: str, kind: Any, value: Any) -> Any:
     """Convert a value to the type of an option, and check its minimum; raise InputError for an
     invalid one.
     """
-    value, least = _of_kind(name, get_args(kind)[0], value), option_of(kind).least
+    value = _of_kind(name, get_args(kind)[0], value)
+    least = option_of(kind).least
     if value is not None and least is not None and value < least:
         raise InputError(f"`{name}`: expected {least} or more, got {value}")
     return value

@@ -95,7 +95,8 @@ def warn_of_other_image(
     Reject such an image unless it is registered or has the source's box to a voxel; with
     `is_exact`, reject any image with another box.
     """
-    made_from, words = loaded.text("image_sha256"), ""
+    made_from = loaded.text("image_sha256")
+    words = ""
     is_other = made_from is not None and made_from != sha256(image_path)
     if is_exact or is_other:
         words = words_of_other_box(loaded, image, SAME_GRID_VOXELS if is_exact else SAME_BOX_VOXELS)

@@ -61,11 +61,14 @@ START_WORDS = "building the initial mesh"
 
 def mesh_task(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
     """Build the optimised mesh; `begin` is the run's start time by `time.perf_counter`."""
-    job, content, options = task.plan.job, task.source.content, task.plan.engine_options
+    job = task.plan.job
+    content = task.source.content
+    options = task.plan.engine_options
     ends = None if job.max_seconds is None else begin + job.max_seconds
     limit = _memory_limit(task, content)
     before = peak_bytes(), resident_bytes()
-    begins, early = list[float](), list[Path]()
+    begins = list[float]()
+    early = list[Path]()
 
     def most_bytes(nodes: int) -> float:
         return max(before[0], before[1] + bytes_of(content, nodes))
@@ -145,7 +148,8 @@ def _memory_limit(task: Task, content: Content) -> MemoryLimit | None:
 
 def _aim(task: Task) -> Aim:
     """Return the mesh that the run is to make."""
-    plan, job = task.plan, task.plan.job
+    plan = task.plan
+    job = task.plan.job
     kind = (
         kind_of(plan, task.source.content.image.ndim) if plan.mode in ("uniform", "paper") else None
     )
@@ -168,7 +172,9 @@ def _prepare(task: Task) -> None:
     starts.
     """
     return_freed()  # temporaries of the contents and the initial mesh
-    content, k_D, mode = task.source.content, task.plan.engine_options["k_D"], task.plan.mode
+    content = task.source.content
+    k_D = task.plan.engine_options["k_D"]
+    mode = task.plan.mode
     prepare_kernels(
         content, k_D, "paper" if mode == "paper" else "fast", mode == "graded", progress
     )
@@ -232,14 +238,14 @@ def _say_run(task: Task, number: int, result: MeshingResult) -> None:
     """Report one of several runs, repeated until the error, or the number of nodes of order 2,
     is close enough.
     """
-    job, content = task.plan.job, task.source.content
+    job = task.plan.job
+    content = task.source.content
     n_nodes = node_count(result.mesh.points, result.mesh.cells, task.plan.order)
     if (target := job.target_error) is not None:
         fraction = unexplained_by(content, result.mesh, *result.history[-1].counted)
         note(
             f"run {number} of up to {ERROR_RUNS}: {n_nodes} nodes leave {fraction:.4g} of the "
-            "variance unexplained; "
-            f"aim: {ERROR_REACHED * target:.4g} to {target:.4g}"
+            f"variance unexplained; aim: {ERROR_REACHED * target:.4g} to {target:.4g}"
         )
     elif job.order == 2 and job.nodes is not None and task.plan.mode != "start":
         note(
@@ -266,7 +272,8 @@ def _start_words(task: Task, initial: Mesh) -> str:
     size = " x ".join(str(s) for s in image.shape)
     spacing = " x ".join(f"{s:.4g}" for s in image.spacing)
     start = f"{task.start_name} of {len(initial.points)} nodes, {len(initial.cells)} cells"
-    job, plan = task.plan.job, task.plan
+    job = task.plan.job
+    plan = task.plan
     if (
         plan.mode == "graded"
         and plan.order == 1

@@ -57,10 +57,8 @@ ForceOption = Annotated[bool, Option(None, "Replace existing outputs.")]
 AVERAGE_OPTION = Option(
     "WORD",
     "Average of a cell's voxel moduli: mean (the paper's), geometric, harmonic, power:P, hill "
-    "(between mean and "
-    "harmonic); or gauss (one per Gauss point of quadratic cells), nodes (linear between nodes) "
-    "(default "
-    f"{DEFAULT_AVERAGE}).",
+    "(between mean and harmonic); or gauss (one per Gauss point of quadratic cells), nodes "
+    f"(linear between nodes) (default {DEFAULT_AVERAGE}).",
 )
 LabelNamesOption = Annotated[
     Path | None,
@@ -240,8 +238,7 @@ class RegionOptions(LabelChoice):
         Option(
             "GROUPS",
             'Merge labels: "white=2,41; grey=3,42; soft=500-530; other=*", aseg, synthseg or '
-            "simnibs, or a .toml or "
-            ".csv file.",
+            "simnibs, or a .toml or .csv file.",
         ),
     ] = None
     weights: Annotated[
@@ -360,9 +357,8 @@ class StartOptions:
         Lattice | None,
         Option(
             "KIND",
-            "Initial mesh: octree (default), with nodes where the image has detail, or the "
-            "uniform bcc, five-tet or, "
-            "in 2-D, criss-cross.",
+            "Initial mesh: octree (default), with nodes where the image has detail, or the uniform "
+            "bcc, five-tet or, in 2-D, criss-cross.",
         ),
     ] = None
     uniform: Annotated[
@@ -486,9 +482,8 @@ class ModelOptions:
         list[str] | None,
         Option(
             "NAME=...",
-            "Add a set: NAME=below:T, NAME=point:X,Y,Z:D, NAME=plane:X,Y,Z:NX,NY,NZ:D (mm, "
-            "RAS+), or of other "
-            "sets: NAME=A-B, NAME=outer:A-B, NAME=inner:A-B. May be repeated.",
+            "Add a set: NAME=below:T, NAME=point:X,Y,Z:D, NAME=plane:X,Y,Z:NX,NY,NZ:D (mm, RAS+), "
+            "or of other sets: NAME=A-B, NAME=outer:A-B, NAME=inner:A-B. May be repeated.",
             "set",
         ),
     ] = None
@@ -505,10 +500,8 @@ class ModelOptions:
         Option(
             "...",
             "compress:5%, hold:SET, move:SET:X,Y,Z (mm, or free), pressure:SET:P (kPa, inwards), "
-            "traction:SET:X,Y,Z "
-            "(kPa), spring:SET:K (kPa/mm), gravity:X,Y,Z (mm/s2; the earth's is 9810); 2/... "
-            "acts in step 2 only. "
-            "May be repeated.",
+            "traction:SET:X,Y,Z (kPa), spring:SET:K (kPa/mm), gravity:X,Y,Z (mm/s2; the earth's is "
+            "9810); 2/... acts in step 2 only. May be repeated.",
             "load",
         ),
     ] = None

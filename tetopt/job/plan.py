@@ -302,11 +302,11 @@ def _mode(job: JobOptions) -> Mode:
                 "`lattice` octree: has no single spacing; use `nodes` instead of `spacing`"
             )
     if job.start is not None:
-        others = ("lattice", "mask", "background", "keep_labels", "drop_labels")
-        given = [*counts, *(name for name in others if getattr(job, name) is not None)]
-        if given := [*given, *["uniform"] * job.uniform]:
+        regions = ("lattice", "mask", "background", "keep_labels", "drop_labels")
+        others = [*counts, *(name for name in regions if getattr(job, name) is not None)]
+        if others := [*others, *["uniform"] * job.uniform]:
             raise InputError(
-                f"`start` and `{given[0]}`: {job.start} already has nodes and a boundary; leave "
+                f"`start` and `{others[0]}`: {job.start} already has nodes and a boundary; leave "
                 "one out"
             )
         if is_paper:
@@ -372,14 +372,18 @@ def with_numbers(
     The defaults are the number of nodes, as the sizes require or fewer on small images, and the
     longest edge, which applies anyway and is stated.
     """
-    image, job = content.image, plan.job
+    image = content.image
+    job = plan.job
     is_counted = job.nodes is not None or job.target_error is not None or job.spacing is not None
     if plan.mode == "start":
         return plan, None, None
     if plan.mode != "graded":
         nodes = job.nodes if is_counted else DEFAULT_NODES[image.ndim]
         return plan._replace(job=changed_options(job, nodes=nodes)), None, None
-    order, nodes, limits, by_label = plan.order, job.nodes, _limits(job, table), None
+    order = plan.order
+    nodes = job.nodes
+    limits = _limits(job, table)
+    by_label = None
     if limits is not None:
         limits, by_label = with_label_sizes(limits, content, nodes, order)
     if not is_counted:
@@ -405,7 +409,8 @@ def nodes_of_targets(plan: Plan, content: Content, sizes: Sizes | None) -> int |
 
 def expected_nodes(plan: Plan, content: Content) -> int:
     """Return the requested number of nodes, or the usual one if only the run can tell."""
-    ndim, spacing = content.image.ndim, plan.job.spacing
+    ndim = content.image.ndim
+    spacing = plan.job.spacing
     if spacing is not None:
         # two per block, in five-tet lattices one
         return round(2.0 * content.volume / spacing**ndim)

@@ -68,7 +68,8 @@ def read_planned(plan: Plan) -> Task:
     start = None if plan.job.start is None else read_mesh(plan.job.start)
     source = read_source(plan.job, plan.job.label_names, loaded=start)
     if start is not None:
-        image, path = source.contrasts[0], Path(str(plan.job.start))
+        image = source.contrasts[0]
+        path = Path(str(plan.job.start))
         check_place(str(path), start.mesh, image)
         warn_of_other_image(start, path, source.paths[0], image, is_registered=True)
         if plan.job.order is None and start.order == 2 and format_of(plan.job.output).has_quadratic:

@@ -187,14 +187,17 @@ def _shapes(outcome: Meshed, failed: dict[str, str]) -> Shapes:
 
 def _problems(result: Result, failed: dict[str, str]) -> list[Problem]:
     """Return violated requirements, failed measurements and oddities, worst first."""
-    task, outcome, measured = result.task, result.meshed, result.measured
+    task = result.task
+    outcome = result.meshed
+    measured = result.measured
     required = dict(outcome.result.violated)
     if outcome.result.labels is None:  # but its file gives each cell that of most voxels
         of_labels = {name: rows for name, rows in measured.items() if name == "labels"}
         required |= judge(of_labels, task.source.required)
     problems = list(unmet_requirements(required, measured, task.source.mask_word))
     problems += failures(failed, problems)
-    job, mode = task.plan.job, task.plan.mode
+    job = task.plan.job
+    mode = task.plan.mode
     expected = job.nodes if mode == "graded" and job.target_error is None else None
     n_nodes = node_count(result.model.mesh.points, result.model.mesh.cells, result.model.order)
     spacing = task.source.contrasts[0].spacing

@@ -226,8 +226,7 @@ def with_chosen_sets(model: Model, output: Path, options: ModelOptions) -> Model
     ):
         note(
             f"{len(interfaces)} interfaces are not written as sets (`written_sets` all writes "
-            "them); convert, fem and "
-            "view derive them from the cells' labels"
+            "them); convert, fem and view derive them from the cells' labels"
         )
         groups.discard("interfaces")
     left = set() if "labels" in groups else set(of_label.values())
@@ -282,9 +281,8 @@ def check_early(
     for request in requests:
         if request.kind == "below" and request.vectors[0][0] <= low:
             raise InputError(
-                f"set {request.name}: no cell can have a mean below {request.vectors[0][0]:g}, "
-                "as the image's "
-                f"minimum is {low:g}"
+                f"set {request.name}: no cell can have a mean below {request.vectors[0][0]:g}, as "
+                f"the image's minimum is {low:g}"
             )
     names = {name for request in requests for name in request.names()}
     loads = [parse_load(text, ndim) for text in solver.loads or ()]
@@ -314,9 +312,8 @@ def check_early(
         ):
             raise InputError(
                 f'load: the facets of "{load.set_name}" lie between two cells, where no outside '
-                "force can act "
-                f"({load.kind}); use a set on the boundary, leave out one side (`drop_labels`), "
-                "or move the set"
+                f"force can act ({load.kind}); use a set on the boundary, leave out one side "
+                "(`drop_labels`), or move the set"
             )
     file_bytes(output, _with_names(model, requests), space=solver.space, units=solver.units)
 
@@ -325,7 +322,8 @@ def _with_names(model: Model, requests: Sequence[SetRequest]) -> Model:
     """Return the model with a facet and a cell in each requested set, so that a writer rejects
     bad names now.
     """
-    facets, cells = dict(model.sets.facets), dict(model.sets.cells)
+    facets = dict(model.sets.facets)
+    cells = dict(model.sets.cells)
     for request in requests:
         *of_cells, of_facets = request.names()
         facets[of_facets] = model.sets.facets[BOUNDARY_SET][:1]
@@ -373,7 +371,8 @@ def keep_early(mesh: Mesh, labels: Ints | None, places: Iterable[Path]) -> Path 
     """Keep an optimised mesh in the first possible place until all is written, in case the
     process ends; return it.
     """
-    data, reason = {} if labels is None else {LABEL_FIELD: labels}, ""
+    data = {} if labels is None else {LABEL_FIELD: labels}
+    reason = ""
     for place in places:
         try:
             save_mesh(place, mesh, data, order=1 if mesh.midpoints is None else 2)

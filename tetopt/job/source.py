@@ -228,9 +228,11 @@ def _balance(options: SourceOptions, is_own: bool) -> Balance:
     balance = balance_of(options)
     if options.weights is not None or not is_own:
         return balance
-    whose, used = "one of the tissues", "tissues"
+    whose = "one of the tissues"
+    used = "tissues"
     if options.tissues is None:
-        whose, used = "the label image", "labels"
+        whose = "the label image"
+        used = "labels"
     note(f"the image is also {whose}: only the {used} are used")
     return balance._replace(weights=[0.0])
 
@@ -368,7 +370,8 @@ def _labelling(
     numbers: Mapping[int, int] | None,
 ) -> ReadLabels:
     """Read the labels, merged by the options, or the tissues."""
-    table, is_alone = label_table(label_names, labels_path=options.labels), len(options.images) == 1
+    table = label_table(label_names, labels_path=options.labels)
+    is_alone = len(options.images) == 1
     if options.tissues is not None:
         volumes = tissue_volumes(options.tissues)
         tissues = [beside(path, resample_tissue) for path in volumes.values()]

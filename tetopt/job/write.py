@@ -58,7 +58,8 @@ def model_with(
     """Build the model of a mesh with the options; `fields` of its cells are computed if not
     given.
     """
-    source, started = task.source, task.started
+    source = task.source
+    started = task.started
     if fields is None:
         fields = source.fields(mesh)
     own = Sets({}, {})
@@ -99,7 +100,10 @@ def save_outcome(task: Task, outcome: Meshed, failed: dict[str, str]) -> tuple[M
     first, or in the file itself if the run was cut short. Measurements that fail are left out, and
     noted in `failed`.
     """
-    plan, job, source, result = task.plan, task.plan.job, task.source, outcome.result
+    plan = task.plan
+    job = task.plan.job
+    source = task.source
+    result = outcome.result
     options = stated_options(plan, source.content.image.ndim)
     if job.target_error is not None:
         options["nodes"] = result.nodes
@@ -119,7 +123,8 @@ def save_outcome(task: Task, outcome: Meshed, failed: dict[str, str]) -> tuple[M
             with warnings.catch_warnings(action="ignore"):
                 return model_with(task, result.mesh, SolverOptions(), about, fields)
 
-        kept, early = early, None
+        kept = early
+        early = None
         save_anyway(job.output, result.mesh, bare, error, kept)
         raise
     finally:
@@ -199,7 +204,10 @@ def _counts(task: Task, result: MeshingResult, model: Model) -> dict[str, Callab
     """Return further measures of a mesh, by name; their value is None if there is nothing to
     report.
     """
-    source, sizes, mesh, fields = task.source, task.sizes, result.mesh, model.cell_data
+    source = task.source
+    sizes = task.sizes
+    mesh = result.mesh
+    fields = model.cell_data
     measures: dict[str, Callable[[], Any]] = {}
     has_image = "n_voxels" in fields
     if has_image:
@@ -223,7 +231,9 @@ def draw(task: Task, outcome: Meshed, model: Model) -> None:
     """Draw the pictures."""
     from tetopt.report import figures, thumbnail  # matplotlib loads slowly and is needed only here
 
-    pictures, mesh, source = task.plan.pictures, outcome.result.mesh, task.source
+    pictures = task.plan.pictures
+    mesh = outcome.result.mesh
+    source = task.source
     image = source.contrasts[0]
     own = continue_image(image, source.content.continuation)
     figures.save_run_figures(

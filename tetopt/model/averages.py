@@ -153,9 +153,8 @@ def cell_values(image: Image, mesh: Mesh, mapping: ModulusMapping) -> Floats:
     if not np.isfinite(values).all():
         at = seen.data[~np.isfinite(values)].ravel()[0]
         raise InputError(
-            f"mapping: no value at intensity {at:g}; give a mapping (`nu`, `density`) defined "
-            "for all intensities "
-            "in the mesh"
+            f"mapping: no value at intensity {at:g}; give a mapping (`nu`, `density`) defined for "
+            "all intensities in the mesh"
         )
     return _of_cells(Image(values, image.affine), mesh, owner, 1.0)
 
@@ -175,14 +174,16 @@ def node_young(image: Image, mesh: Mesh, mapping: ModulusMapping = None) -> Floa
     """
     field, owner = _moduli(image, mesh, mapping, parse_average("nodes"))
     n_nodes = len(mesh.points)
-    weight, total = np.zeros(n_nodes), np.zeros(n_nodes)
+    weight = np.zeros(n_nodes)
+    total = np.zeros(n_nodes)
     for voxels, hats in _places(field, mesh, owner):
         nodes = mesh.cells[owner[voxels]].ravel()
         logarithms = np.log(field.data.ravel()[voxels])[:, None]
         weight += np.bincount(nodes, hats.ravel(), minlength=n_nodes)
         total += np.bincount(nodes, (hats * logarithms).ravel(), minlength=n_nodes)
     # Clipped to the range of the surrounding voxels, so that equal moduli stay exact.
-    low, high = np.full(n_nodes, np.inf), np.full(n_nodes, -np.inf)
+    low = np.full(n_nodes, np.inf)
+    high = np.full(n_nodes, -np.inf)
     low_of_cell, high_of_cell = ranges_of(owner, field.data.ravel(), len(mesh.cells))
     for corner in mesh.cells.T:
         np.minimum.at(low, corner, low_of_cell)
@@ -235,7 +236,8 @@ def gauss_young(node_young: Floats, mesh: Mesh, order: int) -> Floats:
     places, _ = gauss_rule(mesh.ndim, order, mesh.midpoints is not None)
     corners = node_young[mesh.cells]
     # Clipped to their range, so that equal moduli stay exact.
-    low, high = corners.min(axis=1, keepdims=True), corners.max(axis=1, keepdims=True)
+    low = corners.min(axis=1, keepdims=True)
+    high = corners.max(axis=1, keepdims=True)
     return np.clip(np.einsum("qa,ca->cq", places, corners), low, high)
 
 
@@ -292,10 +294,8 @@ def _moduli(
     if len(empty):
         raise InputError(
             f"average: expected moduli above 0 kPa for {average.words}, got 0 in {len(empty)} "
-            "voxels of the mesh, e.g. "
-            f"at intensity {image.data.ravel()[empty[0]]:g}; give empty space a small modulus, "
-            "as in "
-            '`young` "0:0.1,255:6", or use `average` mean'
+            f"voxels of the mesh, e.g. at intensity {image.data.ravel()[empty[0]]:g}; give empty "
+            'space a small modulus, as in `young` "0:0.1,255:6", or use `average` mean'
         )
     return field, owner
 
@@ -316,7 +316,8 @@ def _averages(field: Image, owner: Ints, power: float | None, n_parts: int) -> t
     `owner` holds the number of a part, or -1, for each voxel.
     """
     inside = owner >= 0
-    part, values = owner[inside], field.data.ravel()[inside].astype(np.float64)
+    part = owner[inside]
+    values = field.data.ravel()[inside].astype(np.float64)
     n_voxels = np.bincount(part, minlength=n_parts)
     ranges = ranges_of(owner, field.data.ravel(), n_parts)
     if power is None:

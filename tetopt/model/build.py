@@ -191,7 +191,8 @@ def build_model(
     if loaded is not None:
         loaded = without_stale_results(loaded, is_stale=choices.is_new)
         box = loaded.box if box is None else box
-        table, of_box = loaded.label_table, {} if box is None else {"box": box_text(box)}
+        table = loaded.label_table
+        of_box = {} if box is None else {"box": box_text(box)}
         of_labels = {TABLE_TEXT: table} if table.names or table.colours else {}
         about = texts_of(loaded) | of_labels | of_box | about
         order = loaded.order if order is None else order
@@ -248,7 +249,8 @@ def model_of_file(
     The file's data of cells include those that the image gives. Warns of the file's data that are
     left out or renamed.
     """
-    mesh, fields = loaded.mesh, loaded.cell_data
+    mesh = loaded.mesh
+    fields = loaded.cell_data
     young, nu, density = moduli_in(fields, choices.young, choices.nu, choices.density)
     if nu is None and "nu" in fields:
         warn(f"ignored nu in the mesh's file; nu comes from `young`, or is {DEFAULT_NU:g}", Note)
@@ -276,12 +278,16 @@ def _model(
     known_sets: Sets,
 ) -> Model:
     """Build a model whose sets are those known and the chosen ones."""
-    mesh, order, bins = cells.mesh, choices.order, choices.bins
+    mesh = cells.mesh
+    order = choices.order
+    bins = choices.bins
     if order not in (1, 2):
         raise InputError(f"order: expected 1 or 2, got {order}")
     parse_average(choices.average)
     all_sets = with_requested(mesh, known_sets, choices.sets, cells.mean)
-    table, nodal, at_gauss = None, None, None
+    table = None
+    nodal = None
+    at_gauss = None
     if choices.young is not None:
         nodal, at_gauss = _varying_moduli(cells, choices)
         table = _materials(cells, choices)
@@ -315,12 +321,12 @@ def _of_result(
     cell_data: Arrays | None,
 ) -> tuple[Mesh, Content, int | None, Arrays]:
     """Return a result's mesh and content, and its order and data of cells, unless given."""
-    mesh, content = result.mesh, result.content
+    mesh = result.mesh
+    content = result.content
     if image is not None or content is None:
         raise InputError(
             "build_model: expected a result of `mesh_image` without an image, as it has its own; "
-            "pass `result.mesh` "
-            "with an image instead"
+            "pass `result.mesh` with an image instead"
         )
     if cell_data is None:
         labels = {} if result.labels is None else {LABEL_FIELD: result.labels}
@@ -379,7 +385,9 @@ def _materials(cells: _ModelCells, choices: Choices) -> Materials:
     """Build materials from mappings; ratio and density default to columns of the file that the
     modulus names.
     """
-    young, nu, density = choices.young, choices.nu, choices.density
+    young = choices.young
+    nu = choices.nu
+    density = choices.density
     if nu is None:
         nu = young if isinstance(young, str) and has_column(young, "nu") else DEFAULT_NU
     if density is None and isinstance(young, str) and has_column(young, "density"):
@@ -394,7 +402,9 @@ def _varying_moduli(cells: _ModelCells, choices: Choices) -> tuple[Floats | None
     """Return `node_young` and moduli at Gauss points from a mapping of the intensity; None if
     the average has none.
     """
-    young, average, order = choices.young, choices.average, choices.order
+    young = choices.young
+    average = choices.average
+    order = choices.order
     mapping: Any = parse_any_mapping(young) if isinstance(young, str) else young
     place = parse_average(average).place
     if cells.image is None or not (callable(mapping) or np.ndim(mapping) == 2):

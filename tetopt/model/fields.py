@@ -98,7 +98,8 @@ def node_field(values: NDArray, mesh: Mesh, order: int) -> NDArray:
     InputError
         The number of rows is neither that of the mesh's nodes nor that of order 2.
     """
-    values, n_corners = np.asarray(values), len(mesh.points)
+    values = np.asarray(values)
+    n_corners = len(mesh.points)
     if order == 1 and len(values) == n_corners:
         return values
     cells = quadratic(mesh.points, mesh.cells)[1]

@@ -235,14 +235,14 @@ def own_mask(loaded: MeshFile, image: Image) -> Image | None:
         if mask is not None:
             return resample_mask(mask, image, "the mesh's own mask")
     inputs = loaded.table("inputs")
-    name, level = inputs.get("mask"), inputs.get("background")
+    name = inputs.get("mask")
+    level = inputs.get("background")
     if name is None and level is None:
         return None
     name = f"the foreground above {level}" if name is None else f"the mask {name}"
     raise InputError(
         f"the mesh was built within {name}, which its file does not contain: pass `mask`, or in "
-        "Python tetopt.content "
-        "with the mask instead of the image"
+        "Python tetopt.content with the mask instead of the image"
     )
 
 
@@ -359,14 +359,13 @@ def _gauss_moduli(model: Model, loaded: MeshFile) -> Floats | None:
     moduli = loaded.cell_data.get(GAUSS_MODULI)
     if moduli is None or model.order == 1 or model.materials is None:
         return None
-    of_cell, shape = (
-        model.materials.young[model.materials.of_cell],
-        (len(model.mesh.cells), model.mesh.ndim + 1),
-    )
+    of_cell = model.materials.young[model.materials.of_cell]
+    shape = (len(model.mesh.cells), model.mesh.ndim + 1)
     # A cell's own modulus is a mean of these; columns follow a cell's nodes, which reorienting
     # swaps.
     if moduli.shape == shape and not loaded.n_turned:
-        low, high = moduli.min(axis=1), moduli.max(axis=1)
+        low = moduli.min(axis=1)
+        high = moduli.max(axis=1)
         if ((1.0 - MODULUS_ROUNDING) * low <= of_cell).all() and (
             of_cell <= (1.0 + MODULUS_ROUNDING) * high
         ).all():
@@ -388,7 +387,8 @@ def with_cells(loaded: MeshFile, labels: Ints, is_kept: Bools) -> MeshFile:
         name: rows for name, rows in loaded.sets.facets.items() if name not in named
     } | of_labels.facets
     used, cells = compact(mesh.cells[is_kept], len(mesh.points))
-    now, number = np.cumsum(is_kept) - 1, numbered_edges(mesh.cells)[1]
+    now = np.cumsum(is_kept) - 1
+    number = numbered_edges(mesh.cells)[1]
     edges = np.unique(number[is_kept])  # in the order of the new mesh, as that of the nodes stays
     part = Mesh(mesh.points[used], cells, None if mesh.midpoints is None else mesh.midpoints[edges])
     facets: dict[str, Ints] = {}

@@ -110,9 +110,11 @@ def _compile_node(node: ast.expr, text: str, depth: int) -> Callable[[Floats], A
         case ast.Name(id="h"):
             return lambda h: h
         case ast.BinOp(left=left, op=op, right=right) if type(op) in BINARY_OPERATORS:
-            function, operands = BINARY_OPERATORS[type(op)], [left, right]
+            function = BINARY_OPERATORS[type(op)]
+            operands = [left, right]
         case ast.UnaryOp(op=op, operand=operand) if type(op) in UNARY_OPERATORS:
-            function, operands = UNARY_OPERATORS[type(op)], [operand]
+            function = UNARY_OPERATORS[type(op)]
+            operands = [operand]
         case ast.Call(func=ast.Name(id=name), args=operands, keywords=[]) if (
             name in FORMULA_FUNCTIONS
         ):

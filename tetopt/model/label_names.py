@@ -165,7 +165,8 @@ def table_of_words(words: Any) -> LabelTable:
     """Convert the result of `table_words` back to a table, with colours to 1/255; invalid
     entries are ignored.
     """
-    names, colours = {}, {}
+    names = {}
+    colours = {}
     for label, entry in words.items() if isinstance(words, dict) else ():
         if re.fullmatch(r"\d{1,10}", str(label)) is None or not isinstance(entry, dict):
             continue

@@ -323,7 +323,8 @@ def _warn_of_small(name: str, mesh: Mesh, sets: Sets) -> None:
         np.maximum((area_vectors(mesh, sets.facets[BOUNDARY_SET]) * normal).sum(axis=1), 0.0).sum()
     )
     if share < SMALL_SIDE:
-        count, along = len(sets.facets[name]), (mesh.points * normal).sum(axis=1)
+        count = len(sets.facets[name])
+        along = (mesh.points * normal).sum(axis=1)
         vectors = (mesh.points[along.argmax()], normal, [SIDE_DEPTH * np.ptp(along)])
         plane = ":".join(",".join(f"{number + 0.0:.4g}" for number in each) for each in vectors)
         what = (
@@ -339,7 +340,8 @@ def _warn_of_small(name: str, mesh: Mesh, sets: Sets) -> None:
 
 
 def _check_outer(load: Load, mesh: Mesh, sets: Sets) -> None:
-    rows, shared = sets.facets[load.set_name], facets(mesh.cells)
+    rows = sets.facets[load.set_name]
+    shared = facets(mesh.cells)
     if inner := int((shared.n_cells[shared.of_cell[rows[:, 0], rows[:, 1]]] > 1).sum()):
         raise InputError(
             f'load: {inner} of the {len(rows)} facets of "{load.set_name}" lie between two '

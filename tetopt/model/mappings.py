@@ -79,8 +79,7 @@ def mapped_values(mapping: ModulusMapping, intensities: ArrayLike) -> Floats:
     if values.shape != intensities.shape:
         raise InputError(
             "mapping: expected a function that returns one value for each intensity, got shape "
-            f"{values.shape} "
-            f"for shape {intensities.shape}"
+            f"{values.shape} for shape {intensities.shape}"
         )
     return values
 
@@ -109,10 +108,8 @@ def young_from(mapping: ModulusMapping, intensities: ArrayLike) -> Floats:
         first = ", ".join(f"{modulus:g} at intensity {intensity:g}" for modulus, intensity in pairs)
         raise InputError(
             f"modulus: expected 0 kPa or more, got {int(is_bad.sum())} invalid values, such as "
-            f"{first}; "
-            f"give a modulus mapping (`young`) that is positive from {intensities.min():g} to "
-            f"{intensities.max():g}, "
-            "or leave out other tissue (`mask`)"
+            f"{first}; give a modulus mapping (`young`) that is positive from "
+            f"{intensities.min():g} to {intensities.max():g}, or leave out other tissue (`mask`)"
         )
     return young
 
@@ -175,7 +172,8 @@ def _by_label(pairs: list[tuple[str, float]]) -> ByLabel:
     rest: float | None = None
     for text, value in pairs:
         label = text.strip()
-        is_rest, key = label == "*", _label_of(label)
+        is_rest = label == "*"
+        key = _label_of(label)
         if (rest is not None) if is_rest else (key in values):
             raise InputError(f"values by label: label {label} has two values; give each once")
         if is_rest:
@@ -391,7 +389,6 @@ def _check_table(mapping: ArrayLike) -> Floats:
         k = int(falls[0])
         raise InputError(
             f"mapping: intensities must increase, got {table[k, 0]:g} and then "
-            f"{table[k + 1, 0]:g}; "
-            "sort the pairs and give each intensity once"
+            f"{table[k + 1, 0]:g}; sort the pairs and give each intensity once"
         )
     return table

@@ -221,7 +221,8 @@ def bin_moduli(
         raise InputError(f"bins: expected 1 or more, got {count}")
     if spacing not in SPACINGS:
         raise InputError(f"bins: expected {', '.join(SPACINGS)}, got {spacing}")
-    young, nu = exact.young[exact.of_cell], exact.nu[exact.of_cell]
+    young = exact.young[exact.of_cell]
+    nu = exact.nu[exact.of_cell]
     fewer = _bin_means(young, volumes, count, spacing)
     linear: Spacing = "quantile" if spacing == "quantile" else "equal"
     ratios = _bin_means(nu, volumes, count, linear)

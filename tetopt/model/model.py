@@ -135,7 +135,8 @@ class Model(NamedTuple):
 
     def _repr_html_(self) -> str:
         """Show the model in a notebook, with the middle section shaded by mean or modulus."""
-        mesh, table = self.mesh, self.materials
+        mesh = self.mesh
+        table = self.materials
         moduli = []
         if table is not None:
             young = f"{table.young.min():.4g} to {table.young.max():.4g} {self.units}"
@@ -289,13 +290,12 @@ def in_units(model: Model, units: str) -> Model:
         raise InputError(f"units: expected one of {', '.join(STRESS_UNITS)}, got {units}")
     if units == model.units:
         return model
-    old, new, mesh, table = (
-        STRESS_UNITS[model.units],
-        STRESS_UNITS[units],
-        model.mesh,
-        model.materials,
-    )
-    stress, length = old.kPa / new.kPa, old.mm / new.mm
+    old = STRESS_UNITS[model.units]
+    new = STRESS_UNITS[units]
+    mesh = model.mesh
+    table = model.materials
+    stress = old.kPa / new.kPa
+    length = old.mm / new.mm
     if length != 1.0:
         middles = None if mesh.midpoints is None else mesh.midpoints * length
         mesh = Mesh(mesh.points * length, mesh.cells, middles)
@@ -324,18 +324,17 @@ def scale_load(load: Load, stress: float, length: float) -> Load:
 def odd_units(model: Model) -> Iterator[str]:
     """Yield a line for each quantity of a model in kPa that seems to be in a wrong unit."""
     if (table := model.materials) is not None:
-        low, high = float(table.young.min()), float(table.young.max())
+        low = float(table.young.min())
+        high = float(table.young.max())
         if PASCAL_RANGE[0] <= low and high <= PASCAL_RANGE[1]:
             yield (
                 f"young is {low:.4g} to {high:.4g} kPa, stiffer than soft tissue (0.1 to a few "
-                "hundred kPa): if it "
-                "is in Pa, divide it by 1000"
+                "hundred kPa): if it is in Pa, divide it by 1000"
             )
         elif high < MEGAPASCAL_MOST:
             yield (
-                f"young is at most {high:.4g} kPa, softer than any tissue (0.1 kPa or more): if "
-                "it is in MPa, "
-                "multiply it by 1000; `units` affects only the output file"
+                f"young is at most {high:.4g} kPa, softer than any tissue (0.1 kPa or more): if it "
+                "is in MPa, multiply it by 1000; `units` affects only the output file"
             )
         if (
             table.density is not None
@@ -363,8 +362,7 @@ def locking_words(model: Model) -> str:
         return ""
     return (
         f"nu = {largest:g}: linear elements are too stiff near incompressibility; use quadratic "
-        "elements (order 2), or "
-        "choose them in the solver"
+        "elements (order 2), or choose them in the solver"
     )
 
 
@@ -410,7 +408,8 @@ def mass_densities(model: Model) -> Floats:
     water's if there is none.
     """
     assert model.materials is not None
-    density, water = model.materials.density, STRESS_UNITS[model.units].water
+    density = model.materials.density
+    water = STRESS_UNITS[model.units].water
     return (
         np.full(len(model.materials.young), water)
         if density is None

@@ -113,7 +113,8 @@ def field_on_image(
 
 def _order_of(mesh: Mesh, n_rows: int, at: At | None) -> int:
     """The order of a field's nodes by its number of rows, or 0 for one of cells."""
-    n_nodes, n_cells = len(mesh.points), len(mesh.cells)
+    n_nodes = len(mesh.points)
+    n_cells = len(mesh.cells)
     ends = edge_ends(mesh.cells).reshape(-1, 2)
     n_edges = len(np.unique(ends[:, 0] * n_nodes + ends[:, 1]))
     counts = [(0, "cells", n_cells), (1, "nodes", n_nodes), (2, "nodes", n_nodes + n_edges)]
@@ -226,11 +227,9 @@ def warped_image(
             )
     if not np.isfinite(outside):
         raise InputError(f"outside: expected a finite number in a moved image, got {outside}")
-    u, like, n_nodes = (
-        plain_array("displacement", displacement).astype(np.float64),
-        image if like is None else like,
-        len(mesh.points),
-    )
+    u = plain_array("displacement", displacement).astype(np.float64)
+    like = image if like is None else like
+    n_nodes = len(mesh.points)
     if u.ndim != 2 or u.shape[1] != mesh.ndim:
         raise InputError(
             f"displacement: expected {mesh.ndim} numbers for each node, got an array of shape "
@@ -249,7 +248,8 @@ def warped_image(
     inside = np.flatnonzero(np.isfinite(places[:, 0]))
     index = image.to_index(places[inside])
     is_there = ((index >= -0.5) & (index <= np.array(image.shape) - 0.5)).all(axis=1)
-    inside, index = inside[is_there], index[is_there]
+    inside = inside[is_there]
+    index = index[is_there]
     if len(inside) == 0:
         raise InputError(
             "image: no voxel of it is inside the mesh; do both use the same world coordinates?"

@@ -224,7 +224,8 @@ def label_set_names(labels: Iterable[int], names: Mapping[int, str]) -> dict[int
     counts.update(2 * [*standard_names(2), *standard_names(3)])
     of_label = {}
     for label in labels:
-        name, default = plain.get(label, ""), f"label_{label}"
+        name = plain.get(label, "")
+        default = f"label_{label}"
         if name.lower() == default:
             name = default
         elif name and (counts[name.lower()] > 1 or RESERVED_NAME.fullmatch(name)):
@@ -267,17 +268,18 @@ def face_sets(mesh: Mesh, boundary: Ints, box: Box | None) -> dict[str, Ints]:
     """Return the boundary facets on each face of the box, and, with a box, those on no face."""
     n = mesh.ndim
     if box is None:
-        low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
-        places, faces, tolerance = (
-            mesh.points,
-            np.column_stack([low, high]),
-            ON_SIDE_VOXELS * (high - low).max(),
-        )
-        axes, directions = tuple(range(n)), np.ones(n)
+        low = mesh.points.min(axis=0)
+        high = mesh.points.max(axis=0)
+        places = mesh.points
+        faces = np.column_stack([low, high])
+        tolerance = ON_SIDE_VOXELS * (high - low).max()
+        axes = tuple(range(n))
+        directions = np.ones(n)
     else:
         inverse = np.asarray(np.linalg.inv(box.affine[:n, :n]), dtype=np.float64)
         places = transform_vectors(mesh.points - box.affine[:n, n], inverse)
-        faces, tolerance = box_sides(box.shape), ON_SIDE_VOXELS
+        faces = box_sides(box.shape)
+        tolerance = ON_SIDE_VOXELS
         axes = world_axes(box.affine)
         directions = box.affine[list(axes), range(n)]
     # (B, n, 2)
@@ -298,9 +300,11 @@ def _extent_sets(mesh: Mesh, boundary: Ints) -> dict[str, Ints]:
 
     No facet belongs to two sides: each faces the direction nearest to its normal.
     """
-    low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
+    low = mesh.points.min(axis=0)
+    high = mesh.points.max(axis=0)
     centres = mesh.points[facet_triples(mesh.cells, boundary)].mean(axis=1)
-    areas, fraction = area_vectors(mesh, boundary), (centres - low) / (high - low)
+    areas = area_vectors(mesh, boundary)
+    fraction = (centres - low) / (high - low)
     faced = np.abs(areas).argmax(axis=1)
     sets = {}
     for axis, (name_low, name_high) in enumerate(FACE_NAMES[mesh.ndim]):
@@ -423,8 +427,7 @@ def parse_set(text: str, ndim: int) -> SetRequest:
     if not equals or not (kind in shapes or is_difference):
         raise InputError(
             "set: expected NAME=below:T, NAME=point:X,Y,Z:D, NAME=plane:X,Y,Z:NX,NY,NZ:D, "
-            "NAME=A-B, NAME=outer:A-B or "
-            f'NAME=inner:A-B of sets A, B, ..., got "{text}"'
+            f'NAME=A-B, NAME=outer:A-B or NAME=inner:A-B of sets A, B, ..., got "{text}"'
         )
     if not SET_NAME.fullmatch(name):
         raise InputError(
@@ -480,7 +483,8 @@ def _of_sets(mesh: Mesh, request: SetRequest, sets: Sets) -> Ints:
 
 def places_in(request: SetRequest, sets: Sets) -> list[tuple[str, bool]]:
     """Return `place_of` the sets in "A-B-C"; as a name may contain "-", the longest known ones."""
-    parts, places = request.difference.split("-"), []
+    parts = request.difference.split("-")
+    places = []
     while parts:
         for k in range(len(parts), 0, -1):
             if (place := place_of("-".join(parts[:k]).strip(), sets)) is not None:
@@ -525,14 +529,17 @@ def _is_inner(mesh: Mesh, rows: Ints) -> Bools:
 
     The facets of an inner part, such as a lumen or a cavity, closed or open, face its own middle.
     """
-    nodes, n = facet_triples(mesh.cells, rows), mesh.ndim
+    nodes = facet_triples(mesh.cells, rows)
+    n = mesh.ndim
     sides = [np.sort(np.delete(nodes, k, axis=1), axis=1) for k in range(n)]
     of_side = np.unique(np.concatenate(sides), axis=0, return_inverse=True)[1].reshape(n, -1).T
     order = np.argsort(of_side.ravel(), kind="stable")
-    facet, side = order // n, of_side.ravel()[order]
+    facet = order // n
+    side = of_side.ravel()[order]
     is_same = side[1:] == side[:-1]
     n_parts, part = connected_sets(facet[:-1][is_same], facet[1:][is_same], len(rows))
-    centres, vectors = mesh.points[nodes].mean(axis=1), area_vectors(mesh, rows)
+    centres = mesh.points[nodes].mean(axis=1)
+    vectors = area_vectors(mesh, rows)
     areas = np.linalg.norm(vectors, axis=1)
     middle = np.stack(
         [
@@ -557,7 +564,8 @@ def check_free_names(request: SetRequest, sets: Sets) -> None:
 
 
 def _cells_below(mesh: Mesh, request: SetRequest, mean: Floats | None) -> Ints:
-    name, threshold = request.name, float(request.vectors[0][0])
+    name = request.name
+    threshold = float(request.vectors[0][0])
     if mean is None:
         raise InputError(f"set {name}: the mesh has no cell means; give the image (`image`)")
     chosen = largest_component(mesh.cells, mean < threshold)
@@ -582,9 +590,8 @@ def _facets_within(mesh: Mesh, request: SetRequest) -> Ints:
     farthest = distance[facet_triples(mesh.cells, rows)].max(axis=1)
     if not (farthest <= reach).any():
         raise InputError(
-            f"set {request.name}: no boundary facet lies within {reach:g} mm; the nearest one "
-            "lies within "
-            f"{farthest.min():.4g} mm"
+            f"set {request.name}: no boundary facet lies within {reach:g} mm; the nearest one lies "
+            f"within {farthest.min():.4g} mm"
         )
     return rows[farthest <= reach]
 
@@ -663,7 +670,8 @@ def free_name(label: str, taken: set[str]) -> str:
     """
     name = re.sub(r"[^A-Za-z0-9_-]", "_", label)
     stem = (name if name[0].isalpha() else f"set_{name}")[:MOST_LETTERS]
-    name, number = stem, 1
+    name = stem
+    number = 1
     while name.lower() in taken:
         number += 1
         name = f"{stem[: MOST_LETTERS - 1 - len(str(number))]}_{number}"

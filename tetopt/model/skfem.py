@@ -51,7 +51,8 @@ def _boundary(mesh: skfem.Mesh, cells: Ints, rows: Ints) -> NDArray[np.integer]:
     """Return scikit-fem's numbers of the facets (K, 2)."""
     from skfem.generic_utils import OrientedBoundary
 
-    cell, node = rows[:, 0], cells[rows[:, 0], rows[:, 1]]
+    cell = rows[:, 0]
+    node = cells[rows[:, 0], rows[:, 1]]
     of_cell = mesh.t2f[:, cell]  # (n+1, K)
     is_opposite = (mesh.facets[:, of_cell] != node).all(axis=0)
     numbers = of_cell[is_opposite.argmax(axis=0), np.arange(len(rows))]

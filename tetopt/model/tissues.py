@@ -96,7 +96,8 @@ def merge_labels(labels: Image, merge: str, names: Mapping[int, str] | None = No
     ([[0.0, 1.0, 1.0, 2.0, 5.0]], {1: 'white', 2: 'grey', 5: 'soft'})
     """
     labels = check_labels("labels", labels)
-    groups, present = groups_of(merge), np.unique(labels.data).astype(np.int64)
+    groups = groups_of(merge)
+    present = np.unique(labels.data).astype(np.int64)
     owner, rest = _members(groups, names or {}, present)
     owner.setdefault(0, 0)
     lost = [label for label in present.tolist() if label not in owner]
@@ -105,9 +106,8 @@ def merge_labels(labels: Image, merge: str, names: Mapping[int, str] | None = No
             ", ..." if len(lost) > UNGROUPED_LISTED else ""
         )
         raise InputError(
-            f"`merge`: expected each label of the image in a group, got no group for {listed}; "
-            "add them to a group, or "
-            f"give NAME={REST} for all others"
+            f"`merge`: expected each label of the image in a group, got no group for {listed}; add "
+            f"them to a group, or give NAME={REST} for all others"
         )
     numbers = {label: owner.get(label, rest or 0) for label in present.tolist()}
     return Merged(
@@ -223,7 +223,8 @@ def _labels_of(word: str, names: Mapping[int, str], present: Ints) -> list[int]:
     if (match := RANGE.fullmatch(word)) is None:
         with prefix_errors("`merge`"):
             return labels_named(word, names)
-    first, last = int(match[1]), int(match[2] or match[1])
+    first = int(match[1])
+    last = int(match[2] or match[1])
     if not first <= last <= LARGEST_LABEL:
         raise InputError(
             f"`merge`: expected labels or an increasing range up to {LARGEST_LABEL}, got {word}"

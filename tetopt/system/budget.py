@@ -66,7 +66,8 @@ def check_memory(
     limit : float, optional
         The user's limit on the total memory of this process.
     """
-    free, room = available_bytes(), inf if limit is None else limit - resident_bytes()
+    free = available_bytes()
+    room = inf if limit is None else limit - resident_bytes()
     remedy = advice(min(free, room)) if callable(advice) else advice
     if n_bytes > free:
         raise MemoryShortage(
@@ -95,7 +96,8 @@ def available_bytes() -> int:
     """Return the memory available without swapping, within all limits."""
     import psutil
 
-    free, of_group = psutil.virtual_memory().available, _group_bytes()
+    free = psutil.virtual_memory().available
+    of_group = _group_bytes()
     return max(0, free if of_group is None else min(free, of_group))
 
 
@@ -172,7 +174,8 @@ def _group_bytes() -> int | None:
     for row in rows:
         _, controllers, path = row.split(":", 2)
         if controllers == "":
-            root, names = GROUP_FOLDER, ("memory.max", "memory.current", "inactive_file")
+            root = GROUP_FOLDER
+            names = ("memory.max", "memory.current", "inactive_file")
         elif "memory" in controllers.split(","):
             root = GROUP_FOLDER / "memory"
             names = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")

@@ -247,7 +247,8 @@ def _output(path: Path, n_bytes: int | None = None) -> Iterator[Path]:
 
     System errors within the block are reported as errors of writing `path`.
     """
-    outputs, key = _OUTPUTS.get(), _absolute(path)
+    outputs = _OUTPUTS.get()
+    key = _absolute(path)
     place = (
         Path(os.path.realpath(path))
         if outputs is None

@@ -96,7 +96,8 @@ def _count_pairs(
         while at >= 0 and column[at] != columns[v]:
             at = after[at]
         if at < 0:
-            at, n = n, n + 1
+            at = n
+            n = n + 1
             row[at], column[at], count[at] = rows[v], columns[v], 0
             after[at], first[rows[v]] = first[rows[v]], at
         count[at] += 1
