@@ -3,6 +3,7 @@ labels, an oblique box.
 """
 
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 from meshes import with_bent_edges
@@ -14,6 +15,7 @@ import tetopt
 from tetopt.fem.elasticity import lame_constants, stiffness, strains
 from tetopt.geometry.quadratic import cell_edges, quadratic
 from tetopt.geometry.simplex import volumes
+from tetopt.io.formats import file_bytes
 from tetopt.model.label_names import TABLE_TEXT, LabelTable, table_words
 from tetopt.model.loads import parse_loads
 from tetopt.model.materials import bin_moduli, materials
@@ -27,6 +29,11 @@ from tetopt.model.sets import (
 )
 
 ABOUT = {"tetopt": "0.1.0", "image": "two spheres & <more>.nii.gz", "image_sha256": "ab" * 32}
+
+
+def bytes_of(name, model):
+    """What save_model writes, in the model's own axes and units."""
+    return file_bytes(Path(name), model, space=model.space, units=model.units)
 
 
 @cache

@@ -7,13 +7,13 @@ import json
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import meshio
 import numpy as np
 import pytest
 from models import (
     ABOUT,
+    bytes_of,
     each_once,
     labelled_model,
     quadratic_model,
@@ -27,7 +27,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import tetopt.io.gmsh
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
-from tetopt.io.formats import file_bytes, save_model
+from tetopt.io.formats import save_model
 from tetopt.io.gmsh import gmsh22, gmsh41, own_comments
 from tetopt.io.meshes import load_mesh
 from tetopt.model.build import build_model
@@ -565,7 +565,7 @@ def test_gmsh_reads_it(version, n, bins, order, tmp_path):
     model = (sample_model if order == 1 else quadratic_model)(n, bins)
     own, path = elements(model)[1], tmp_path / "model.msh"
     suffix = {"4.1": ".msh", "2.2": ".msh2"}[version]
-    path.write_bytes(file_bytes(Path(f"a{suffix}"), model))
+    path.write_bytes(bytes_of(f"a{suffix}", model))
     groups, nodes, views, tags, _ = read_by_gmsh(path, model)
     smaller = set()
     for name, rows in sorted(model.sets.facets.items(), key=lambda item: len(item[1])):

@@ -15,6 +15,7 @@ from models import (
     ABOUT,
     SAMPLES,
     all_nodes,
+    bytes_of,
     each_once,
     labelled_model,
     quadratic_model,
@@ -32,7 +33,7 @@ from test_mfem import Read as Mfem
 from test_xdmf import facet_set, fields, grids, item, named
 
 import tetopt.io.gmsh
-from tetopt.io.formats import file_bytes, save_model
+from tetopt.io.formats import save_model
 from tetopt.io.meshes import load_mesh
 from tetopt.io.tags import named_materials
 from tetopt.model.loads import load_words
@@ -251,7 +252,7 @@ SUFFIXES = [*READERS, ".vtu", ".vtk"]
 
 
 def contents(path, model):
-    path.write_bytes(file_bytes(path, model))
+    path.write_bytes(bytes_of(path, model))
     if path.suffix in READERS:
         return READERS[path.suffix](path.read_bytes(), model)
     return of_vtk(path, model)
@@ -351,7 +352,7 @@ def test_meshio_reads_it(suffix, n, bins, order, tmp_path):
         tmp_path / f"a{suffix}",
     )
     (points, own), table = elements(model), model.materials
-    path.write_bytes(file_bytes(path, model))
+    path.write_bytes(bytes_of(path, model))
     read = meshio.read(path, "gmsh" if suffix == ".msh2" else None)
     assert_array_equal(read.points[:, :n], points)
     kind = {3: "triangle", 4: "tetra", 6: "triangle6", 10: "tetra10"}[own.shape[1]]

@@ -2,20 +2,26 @@
 dolfinx has its own test.
 """
 
-from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 import pyvista
-from models import ABOUT, SAMPLES, all_nodes, quadratic_model, sample_model, with_two_sides
+from models import (
+    ABOUT,
+    SAMPLES,
+    all_nodes,
+    bytes_of,
+    quadratic_model,
+    sample_model,
+    with_two_sides,
+)
 
 from tetopt.errors import InputError
-from tetopt.io.formats import file_bytes
 from tetopt.model.loads import load_words
 from tetopt.model.model import elements, header_lines
 
-XDMF = Path("a.xdmf")
+XDMF = "a.xdmf"
 
 
 @pytest.fixture(params=list(SAMPLES))
@@ -42,7 +48,7 @@ def named(node):
 
 def grids(model):
     """The grids of a model's file, or of its bytes, by name."""
-    root = ElementTree.fromstring(model if isinstance(model, bytes) else file_bytes(XDMF, model))
+    root = ElementTree.fromstring(model if isinstance(model, bytes) else bytes_of(XDMF, model))
     inner = {grid.get("Name"): grid for grid in root.findall("./Domain/Grid/Information/Grid/Grid")}
     (whole,) = root.find("Domain")
     return {**inner, "mesh": whole}
@@ -87,7 +93,7 @@ def test_point_data_are_on_every_node(n, tmp_path):
     )
     expected = parts | {"warmth": all_nodes(model.point_data["warmth"], model.mesh)}
     assert list(columns) == list(expected)
-    (tmp_path / "model.xdmf").write_bytes(file_bytes(XDMF, model))
+    (tmp_path / "model.xdmf").write_bytes(bytes_of(XDMF, model))
     read = pyvista.get_reader(tmp_path / "model.xdmf").read()["mesh"].point_data
     for name, values in expected.items():
         assert np.array_equal(columns[name], values), name
@@ -96,7 +102,7 @@ def test_point_data_are_on_every_node(n, tmp_path):
 
 def test_loads_and_origin_are_told():
     model = sample_model()
-    head = ElementTree.fromstring(file_bytes(XDMF, model)).findall("./Domain/Grid/Information")
+    head = ElementTree.fromstring(bytes_of(XDMF, model)).findall("./Domain/Grid/Information")
     loads = [each.get("Value") for each in head if each.get("Name") == "load"]
     assert loads == [load_words(load) for load in model.loads]
     about = [each.get("Value") for each in head if each.get("Name") == "about"]
@@ -106,7 +112,7 @@ def test_loads_and_origin_are_told():
 
 def test_vtk_reads_the_same(model, tmp_path):
     path = tmp_path / "model.xdmf"
-    path.write_bytes(file_bytes(XDMF, model))
+    path.write_bytes(bytes_of(XDMF, model))
     read = pyvista.get_reader(path).read()
     if not isinstance(read, pyvista.MultiBlock):  # of one grid
         read = pyvista.MultiBlock({"mesh": read})
@@ -149,7 +155,7 @@ def test_cell_data_of_any_name_shape_and_kind(tmp_path):
     }
     assert list(columns) == ["material", "young", "nu", *expected]
     assert (columns["young"] > 0.0).all()
-    (tmp_path / "model.xdmf").write_bytes(file_bytes(XDMF, model))
+    (tmp_path / "model.xdmf").write_bytes(bytes_of(XDMF, model))
     read = pyvista.get_reader(tmp_path / "model.xdmf").read()["mesh"].cell_data
     for name, values in expected.items():
         assert np.array_equal(columns[name], values), name
@@ -165,4 +171,4 @@ def test_values_that_vtk_cannot_read_are_refused(value):
     ):
         odd = {"odd": np.array([value] + [1.0] * (n_rows - 1))}
         with pytest.raises(InputError, match=r"^a\.xdmf: .* 'odd'; .* use \.vtu$"):
-            file_bytes(XDMF, model._replace(**{name: odd}))
+            bytes_of(XDMF, model._replace(**{name: odd}))

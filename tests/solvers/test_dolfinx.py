@@ -6,12 +6,12 @@ import os
 import subprocess
 import sys
 import textwrap
-from pathlib import Path
 
 import numpy as np
 import pytest
 from models import (
     LOAD_CASES,
+    bytes_of,
     loaded_model,
     sample_model,
     with_one_ratio,
@@ -21,7 +21,6 @@ from scipy.spatial import KDTree
 
 import tetopt.io.xdmf
 from tetopt.fem.solution import solve
-from tetopt.io.formats import file_bytes
 from tetopt.model.model import elements
 from tetopt.model.sets import facet_triples
 
@@ -105,7 +104,7 @@ def snippet(first="from xml.etree", then="Before 0.7"):
 def answer(request, tmp_path_factory):
     """The model and what dolfinx made of its file."""
     folder, model = tmp_path_factory.mktemp("dolfinx"), pressed_model(request.param)
-    folder.joinpath("model.xdmf").write_bytes(file_bytes(Path("model.xdmf"), model))
+    folder.joinpath("model.xdmf").write_bytes(bytes_of("model.xdmf", model))
     program = snippet().replace('"superior"', f'"{model.loads[0].set_name}"')
     run(BEFORE + program + READ, folder)
     with np.load(folder / "read.npz") as read:
@@ -232,7 +231,7 @@ def solved_cases(tmp_path_factory):
     for number, (case, n, order, moduli) in enumerate(CASES):
         (folder / str(number)).mkdir()
         model = loaded_model(case, n, 1, moduli)
-        (folder / str(number) / "model.xdmf").write_bytes(file_bytes(Path("model.xdmf"), model))
+        (folder / str(number) / "model.xdmf").write_bytes(bytes_of("model.xdmf", model))
         reading = snippet().replace('"superior"', '"boundary"')
         applying = snippet("import ufl", "Moduli that are linear")
         loaded = LOADED.format(order=order, is_nodal=moduli == "nodes")
