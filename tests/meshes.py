@@ -9,6 +9,8 @@ from functools import lru_cache
 from itertools import permutations, product
 
 import numpy as np
+import pytest
+from hypothesis import strategies as st
 from naive import barycentric_functions, dot
 from scipy.spatial import Delaunay
 
@@ -163,7 +165,11 @@ SMALL = {
 ALL_SMALL = [*SMALL[2], *SMALL[3]]
 
 
-# Random things; rng is a numpy Generator
+# Random things; rng is a numpy Generator, seeded by hypothesis
+
+seeds = st.integers(0, 2**32 - 1)
+dimensions = st.sampled_from([2, 3])
+both_dimensions = pytest.mark.parametrize("n", [2, 3])
 
 
 def random_rotation(rng, n):
@@ -255,15 +261,19 @@ def delaunay_box(rng, shape, n_nodes):
     return points, orient_cells(points, cells)
 
 
+def mesh_edges(mesh):
+    """Ends and lengths of a mesh's edges."""
+    ends = numbered_edges(mesh.cells)[0]
+    return ends, np.linalg.norm(np.diff(mesh.points[ends], axis=1)[:, 0], axis=1)
+
+
 def with_bent_edges(mesh, fraction):
     """The mesh with midpoints moved at random by about a fraction of the edge, or less where a
     cell would fold.
     """
-    edges = numbered_edges(mesh.cells)[0]
+    edges, lengths = mesh_edges(mesh)
     ends = mesh.points[edges]
-    moves = np.random.default_rng(6).normal(size=(len(edges), mesh.ndim)) * np.linalg.norm(
-        np.diff(ends, axis=1), axis=2
-    )
+    moves = np.random.default_rng(6).normal(size=(len(edges), mesh.ndim)) * lengths[:, None]
     while True:
         bent = Mesh(mesh.points, mesh.cells, ends.mean(axis=1) + fraction * moves)
         if scaled_jacobians(bent).min() > 0.2:

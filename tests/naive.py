@@ -207,18 +207,6 @@ def cell_of_voxel(image, mesh):
     return owner
 
 
-def cell_ranges(image, owner, n_cells):
-    """The least and the greatest value in each cell, from the cells of the voxels; inf and -inf
-    where it has none.
-    """
-    ranges = [(np.inf, -np.inf)] * n_cells
-    for voxel, cell in np.ndenumerate(owner):
-        if cell >= 0:
-            h = float(image.data[voxel])
-            ranges[cell] = min(ranges[cell][0], h), max(ranges[cell][1], h)
-    return ranges
-
-
 def moment_sums(image, owner, n_cells, shift):
     """Count, sum of h - shift and sum of its square over each cell, from the cells of the
     voxels; exact inside.

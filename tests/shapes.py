@@ -72,3 +72,13 @@ def n_pieces(surface):
 def channels(content):
     """All channels of a content, (C, *shape)."""
     return np.stack([content.channel(number) for number in range(content.n_channels)])
+
+
+def labels_alone(labels, **options):
+    """Content of labels without a contrast."""
+    return tetopt.content(labels, labels, weights=[0.0], **options)
+
+
+def ball_image(shape, centre, radius, affine=None):
+    """1 in a ball, 0 around it."""
+    return tetopt.Image(1.0 * (distance(shape, *centre) < radius), affine)

@@ -26,10 +26,15 @@ def ball(shape, affine=None):
     return tetopt.Image(data, affine)
 
 
+def on_lattice(image, *blocks):
+    """An image and a lattice of so many blocks along each axis."""
+    return image, tetopt.lattice_mesh(image, blocks=blocks)
+
+
 CASES = {
-    "2-D": (ball((40, 30)), (6, 5)),
-    "3-D": (ball((24, 20, 22)), (4, 3, 4)),
-    "oblique": (ball((24, 20, 10), OBLIQUE), (4, 4, 4)),
+    "2-D": on_lattice(ball((40, 30)), 6, 5),
+    "3-D": on_lattice(ball((24, 20, 22)), 4, 3, 4),
+    "oblique": on_lattice(ball((24, 20, 10), OBLIQUE), 4, 4, 4),
 }
 
 

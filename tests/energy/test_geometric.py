@@ -4,10 +4,11 @@ import naive
 import numpy as np
 import pytest
 from hypothesis import given
-from hypothesis import strategies as st
 from meshes import (
     ALL_SMALL,
     BAD_TETS,
+    dimensions,
+    seeds,
     split_box,
 )
 
@@ -17,22 +18,14 @@ from tetopt.geometry.simplex import orient_cells, volumes
 
 pytestmark = pytest.mark.kernel
 
-seeds = st.integers(0, 2**32 - 1)
-dimensions = st.sampled_from([2, 3])
-
-
-def random_mesh(seed, n):
-    rng = np.random.default_rng(seed)
-    points, cells = split_box(rng, (3,) * n, int(rng.integers(1, 8)))
-    return rng, points, cells
-
 
 # Closed forms
 
 
 @given(seeds, dimensions)
 def test_E_G_is_eq_1_as_printed(seed, n):
-    _, points, cells = random_mesh(seed, n)
+    rng = np.random.default_rng(seed)
+    points, cells = split_box(rng, (3,) * n, int(rng.integers(1, 8)))
     assert E_G(points, cells) == pytest.approx(naive.E_G_as_printed(points, cells), rel=1e-13)
 
 

@@ -5,14 +5,14 @@ from it.
 from itertools import permutations
 
 import naive
-import numba
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from meshes import delaunay_box, random_affine, split_box
+from meshes import delaunay_box, dimensions, random_affine, seeds, split_box
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial import Delaunay
+from threads import assert_same_bits
 
 from tetopt import Image, InputError, Mesh, cell_moments, cell_of_voxel, lattice_mesh
 from tetopt.energy.sampling import (
@@ -27,9 +27,6 @@ from tetopt.energy.sampling import (
 from tetopt.geometry.simplex import orient_cells
 
 pytestmark = pytest.mark.kernel
-
-seeds = st.integers(0, 2**32 - 1)
-dimensions = st.sampled_from([2, 3])
 
 
 def random_image(rng, shape, affine=None):
@@ -55,6 +52,13 @@ def random_case(seed, n, *, is_snapped):
     return image, placed(image, *delaunay_box(rng, shape, n_nodes))
 
 
+def assert_owners(image, mesh):
+    """That they are the twin's; return them."""
+    owner = cell_of_voxel(image, mesh)
+    assert_array_equal(owner, naive.cell_of_voxel(image, mesh))
+    return owner
+
+
 # The rule of ties, by hand
 
 
@@ -65,12 +69,9 @@ def test_centres_on_the_walls_of_a_cube_s_six_cells():
     image = Image(np.zeros((5, 5, 5)))
     mesh = placed(image, *split_box(np.random.default_rng(0), (5, 5, 5), 0))
     number = {axes: cell for cell, axes in enumerate(permutations(range(3)))}
-    owner = cell_of_voxel(image, mesh)
-    for voxel, cell in np.ndenumerate(owner):
-        assert (
-            cell
-            == number[tuple(sorted(range(3), key=lambda axis: (voxel[axis], axis), reverse=True))]
-        )
+    for voxel, cell in np.ndenumerate(cell_of_voxel(image, mesh)):
+        axes = sorted(range(3), key=lambda axis: (voxel[axis], axis), reverse=True)
+        assert cell == number[tuple(axes)]
 
 
 # The twin
@@ -79,8 +80,7 @@ def test_centres_on_the_walls_of_a_cube_s_six_cells():
 @given(seeds, dimensions, st.booleans())
 def test_owners_are_the_twin_s(seed, n, is_snapped):
     """Also with nodes on centres, corners and halves of voxels: every kind of tie."""
-    image, mesh = random_case(seed, n, is_snapped=is_snapped)
-    assert_array_equal(cell_of_voxel(image, mesh), naive.cell_of_voxel(image, mesh))
+    assert_owners(*random_case(seed, n, is_snapped=is_snapped))
 
 
 @pytest.mark.parametrize("shape", [(3, 90), (90, 4), (40, 50), (14, 12, 16), (2, 3, 90)])
@@ -88,10 +88,8 @@ def test_owners_with_ties_that_floats_get_wrong_are_the_twin_s(shape):
     """Nodes on centres far apart: lines and planes of slopes like 7/49 pass through other
     centres.
     """
-    rng = np.random.default_rng(2)
-    image = Image(np.zeros(shape))
-    mesh = placed(image, *split_box(rng, shape, 5 if len(shape) == 3 else 12, 1))
-    assert_array_equal(cell_of_voxel(image, mesh), naive.cell_of_voxel(image, mesh))
+    image, n_nodes = Image(np.zeros(shape)), 5 if len(shape) == 3 else 12
+    assert_owners(image, placed(image, *split_box(np.random.default_rng(2), shape, n_nodes, 1)))
 
 
 @given(seeds, dimensions)
@@ -103,14 +101,12 @@ def test_owners_near_a_tie_are_the_twin_s(seed, n):
     image = Image(np.zeros((4,) * n))
     index, cells = split_box(rng, image.shape, 5)
     grid = sampling_grid(image, index)
-    is_inside = ((index > -0.5) & (index < 3.5)).all(axis=1)
-    for node in np.flatnonzero(is_inside):
+    for node in np.flatnonzero(((index > -0.5) & (index < 3.5)).all(axis=1)):
         moved = index.copy()
         moved[node] += rng.integers(-2, 3, n) * 2.0**-grid.bits
         if (orientations(to_ticks(moved, grid), cells) == 1).all():
             index = moved
-    mesh = placed(image, index, cells)
-    assert_array_equal(cell_of_voxel(image, mesh), naive.cell_of_voxel(image, mesh))
+    assert_owners(image, placed(image, index, cells))
 
 
 @given(seeds, dimensions)
@@ -124,10 +120,10 @@ def test_owners_in_cells_far_larger_than_the_image_are_the_twin_s(seed, n):
     points = np.vstack([rng.uniform(-reach, reach, (8, n)), rng.uniform(-1, 5, (4, n))])
     try:
         mesh = placed(image, points, Delaunay(points).simplices)
-        owner = cell_of_voxel(image, mesh)
+        cell_of_voxel(image, mesh)
     except InputError:
         return  # a cell flat to within a tick
-    assert_array_equal(owner, naive.cell_of_voxel(image, mesh))
+    assert_owners(image, mesh)
 
 
 @given(seeds, dimensions)
@@ -154,8 +150,7 @@ def test_orientations_are_exact(seed, n):
 def test_counts_on_a_long_thin_image():
     """100,000 voxels in a row leave 11 bits for the fraction."""
     image = Image(np.zeros((2, 100_000 if naive.IS_COMPILED else 5_000), dtype=np.float32))
-    rng = np.random.default_rng(0)
-    mesh = placed(image, *delaunay_box(rng, image.shape, 40))
+    mesh = placed(image, *delaunay_box(np.random.default_rng(0), image.shape, 40))
     assert cell_moments(image, mesh).n_voxels.sum() == image.data.size
     assert (cell_of_voxel(image, mesh) >= 0).all()
 
@@ -169,9 +164,8 @@ def test_moment_sums_of_all_sizes_of_numbers(high):
     and fractions.
     """
     rng = np.random.default_rng(0)
-    shape = (3, 4, 5)
-    image = Image(np.where(rng.random(shape) < 0.5, 0, high))
-    mesh = placed(image, *split_box(rng, shape, 4))
+    image = Image(np.where(rng.random((3, 4, 5)) < 0.5, 0, high))
+    mesh = placed(image, *split_box(rng, image.shape, 4))
     grid = sampling_grid(image, mesh.points)
     sums = moment_sums(grid, to_ticks(image.to_index(mesh.points), grid), mesh.cells)
     twin = naive.moment_sums(image, naive.cell_of_voxel(image, mesh), len(mesh.cells), grid.shift)
@@ -181,23 +175,18 @@ def test_moment_sums_of_all_sizes_of_numbers(high):
 @given(seeds, dimensions, st.booleans())
 def test_moments_are_numpy_s_over_each_cell_s_voxels(seed, n, is_snapped):
     image, mesh = random_case(seed, n, is_snapped=is_snapped)
-    moments = cell_moments(image, mesh)
-    owner = cell_of_voxel(image, mesh)
-    data = image.data.astype(np.float64)
-    for cell in np.flatnonzero(moments.n_voxels):
-        h = data[owner == cell]
-        assert moments.mean[cell] == pytest.approx(h.mean(), rel=1e-13)
-        assert moments.variance[cell] == pytest.approx(h.var(), rel=1e-10, abs=1e-9)
+    moments, owner = cell_moments(image, mesh), cell_of_voxel(image, mesh)
     both, (low, high) = cell_moments_and_ranges(image, mesh)
-    with_voxels = moments.n_voxels > 0
-    twin = naive.cell_ranges(image, owner, len(mesh.cells))
-    assert [tuple(row) for row in np.column_stack([low, high])[with_voxels]] == [
-        row for row, has in zip(twin, with_voxels, strict=True) if has
-    ]
     assert [a.tobytes() for a in both] == [a.tobytes() for a in moments]
-    for cell, n_voxels in enumerate(moments.n_voxels):
-        h = data[owner == cell] if n_voxels else moments.mean[cell]
-        assert (low[cell], high[cell]) == (np.min(h), np.max(h))
+    data = image.data.astype(np.float64)
+    for cell, (n_voxels, mean, variance) in enumerate(zip(*moments, strict=True)):
+        h = data[owner == cell]
+        assert n_voxels == len(h)
+        if n_voxels:
+            assert mean == pytest.approx(h.mean(), rel=1e-13)
+            assert variance == pytest.approx(h.var(), rel=1e-10, abs=1e-9)
+        span = (h.min(), h.max()) if n_voxels else (mean, mean)
+        assert (low[cell], high[cell]) == span
 
 
 @pytest.mark.parametrize(("offset", "contrast"), [(1e8, 1.0), (-1e8, 1.0), (0.4, 1e-6)])
@@ -226,37 +215,32 @@ def test_cells_without_voxel_centres_have_the_centroid_s_value(seed, n):
     is_empty = moments.n_voxels == 0
     assert is_empty.any()
     index = image.to_index(mesh.points[mesh.cells].mean(axis=1))
-    nearest = np.clip(np.rint(index).astype(int), 0, np.array(image.shape) - 1)
-    expected = np.array([image.data[tuple(voxel)] for voxel in nearest], dtype=np.float64)
-    assert_array_equal(moments.mean[is_empty], expected[is_empty])
+    nearest = np.clip(np.rint(index).astype(int), 0, np.array(image.shape) - 1)[is_empty]
+    assert_array_equal(moments.mean[is_empty], image.data[tuple(nearest.T)].astype(np.float64))
     assert (moments.variance[is_empty] == 0).all()
 
 
 def test_nearest_values_clip_to_the_border():
     image = Image(np.arange(6.0).reshape(2, 3), np.diag([2.0, 3.0, 1.0]))
-    points = np.array([[0, 0], [0.9, 1.4], [1.1, 1.6], [-99, 99], [99, -99]])
-    assert nearest_values(image, points).tolist() == [0, 0, 4, 2, 3]
-    assert nearest_values(image, points).dtype == np.float64
+    values = nearest_values(image, np.array([[0, 0], [0.9, 1.4], [1.1, 1.6], [-99, 99], [99, -99]]))
+    assert (values.tolist(), values.dtype) == ([0, 0, 4, 2, 3], np.float64)
 
 
 @given(seeds, dimensions)
 def test_a_mesh_partly_outside_counts_what_is_inside(seed, n):
     rng = np.random.default_rng(seed)
-    image = random_image(rng, (5, 4, 4)[:n])
-    index, cells = split_box(rng, (5, 4, 4)[:n], 4)
+    shape = (5, 4, 4)[:n]
+    image = random_image(rng, shape)
+    index, cells = split_box(rng, shape, 4)
     shift = rng.integers(-6, 7, n) / 2
     mesh = placed(image, index + shift, cells)
-    owner = cell_of_voxel(image, mesh)
-    assert_array_equal(owner, naive.cell_of_voxel(image, mesh))
-    moments = cell_moments(image, mesh)
-    assert_array_equal(moments.n_voxels, np.bincount(owner[owner >= 0], minlength=len(cells)))
+    owner = assert_owners(image, mesh)
+    counts = np.bincount(owner[owner >= 0], minlength=len(cells))
+    assert_array_equal(cell_moments(image, mesh).n_voxels, counts)
     # The box is shifted by halves, so its walls may run through centres: those in [low, high) are
     # inside.
-    is_inside = np.ones(image.shape, dtype=bool)
-    for axis, centres in enumerate(np.indices(image.shape)):
-        low, high = shift[axis] - 0.5, shift[axis] - 0.5 + (5, 4, 4)[axis]
-        is_inside &= (centres >= low) & (centres < high)
-    assert_array_equal(owner >= 0, is_inside)
+    from_low = np.moveaxis(np.indices(shape), 0, -1) - shift + 0.5
+    assert_array_equal(owner >= 0, ((from_low >= 0) & (from_low < shape)).all(axis=-1))
 
 
 # Laws
@@ -273,22 +257,11 @@ def test_the_order_of_the_cells_changes_not_a_bit(seed, n):
     assert_array_equal(order[cell_of_voxel(image, other)], cell_of_voxel(image, mesh))
 
 
-@pytest.mark.skipif(not naive.IS_COMPILED, reason="NUMBA_DISABLE_JIT is set: no threads")
-@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="NUMBA_NUM_THREADS is 1")
 def test_the_same_bits_on_one_and_two_threads():
-    rng = np.random.default_rng(0)
-    image = Image(rng.normal(size=(30, 31, 32)))
+    image = Image(np.random.default_rng(0).normal(size=(30, 31, 32)))
     mesh = lattice_mesh(image, blocks=(6, 6, 6))
     assert len(mesh.cells) > 1000
-    before = numba.get_num_threads()
-    sums = []
-    try:
-        for threads in (1, 2, 1, 2):
-            numba.set_num_threads(threads)
-            sums.append(b"".join(column.tobytes() for column in cell_moments(image, mesh)))
-    finally:
-        numba.set_num_threads(before)
-    assert len(set(sums)) == 1
+    assert_same_bits(lambda: cell_moments(image, mesh))
 
 
 # The fixed-point grid
@@ -315,16 +288,12 @@ def test_ticks_are_the_nearest_and_stay_below_2_to_the_28(seed, n):
 # Messages
 
 
-def test_mesh_and_image_of_different_dimension_are_refused():
-    square, cube = Image(np.zeros((3, 3))), Image(np.zeros((3, 3, 3)))
-    for of_image, of_mesh, message in [
-        (square, cube, "a 3-D mesh and a 2-D image"),
-        (cube, square, "a 2-D mesh and a 3-D image"),
-    ]:
-        mesh = lattice_mesh(of_mesh, blocks=(1,) * of_mesh.ndim)
-        for function in (cell_moments, cell_of_voxel):
-            with pytest.raises(InputError, match=message):
-                function(of_image, mesh)
+@pytest.mark.parametrize(("of_image", "of_mesh"), [(2, 3), (3, 2)])
+@pytest.mark.parametrize("function", [cell_moments, cell_of_voxel])
+def test_mesh_and_image_of_different_dimension_are_refused(function, of_image, of_mesh):
+    image, other = (Image(np.zeros((3,) * n)) for n in (of_image, of_mesh))
+    with pytest.raises(InputError, match=f"a {of_mesh}-D mesh and a {of_image}-D image"):
+        function(image, lattice_mesh(other, blocks=(1,) * of_mesh))
 
 
 @pytest.mark.parametrize("function", [cell_moments, cell_of_voxel])
@@ -333,9 +302,7 @@ def test_cells_flat_or_inverted_at_the_grid_s_resolution_are_refused(function, h
     """A height of 1e-9 voxel is 0 ticks: positive in the world, flat in the grid."""
     image = Image(np.zeros((4, 4)), np.diag([hand, 1.0, 1.0]))
     flat = Mesh([[0, 0], [2, 0], [1, 1], [1, -1e-9]], [[0, 1, 2], [0, 3, 1]])
-    with pytest.raises(
-        InputError, match=r"1 cells are flat or inverted to within a millionth .* such as \[1\]"
-    ):
+    with pytest.raises(InputError, match=r"1 cells are flat .* such as \[1\]"):
         function(image, flat)
 
 
@@ -344,7 +311,7 @@ def test_a_mesh_in_other_units_is_refused(function):
     image = Image(np.zeros((4, 4, 4)))
     mesh = lattice_mesh(image, blocks=(1, 1, 1))
     assert function(image, Mesh(mesh.points + 2.0**20 - 8, mesh.cells)) is not None
-    with pytest.raises(InputError, match=r"the mesh reaches 2\.1e\+06 voxels .* points in mm\?"):
+    with pytest.raises(InputError, match=r"reaches 2\.1e\+06 voxels .* mm"):
         function(image, Mesh(mesh.points + 2.0**21, mesh.cells))
 
 
@@ -353,12 +320,12 @@ def test_float32_and_float64_give_the_same(dtype):
     """In float32 values are stored, not summed."""
     rng = np.random.default_rng(7)
     data = rng.integers(0, 4096, (9, 9, 9)) / 16
-    image = Image(data.astype(dtype))
     stored = Image(data)
     object.__setattr__(stored, "data", data.astype(dtype))
-    mesh = placed(image, *split_box(rng, data.shape, 6))
+    mesh = placed(stored, *split_box(rng, data.shape, 6))
     owner = cell_of_voxel(stored, mesh)
     for cell, (count, mean, variance) in enumerate(zip(*cell_moments(stored, mesh), strict=True)):
         if count:
-            assert mean == pytest.approx(data[owner == cell].mean(), rel=1e-13)
-            assert variance == pytest.approx(data[owner == cell].var(), rel=1e-11, abs=1e-10)
+            h = data[owner == cell]
+            assert mean == pytest.approx(h.mean(), rel=1e-13)
+            assert variance == pytest.approx(h.var(), rel=1e-11, abs=1e-10)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from meshes import delaunay_box
+from numpy.testing import assert_array_equal
 from states import Engine, ball, random_case
 
 import tetopt
@@ -23,15 +24,15 @@ SPREAD = 3  # of the asks of a run, those at which the quick test stops
 def target(n, *parts):
     """A ball with what is named: labels (ball, core, rest), mask, second contrast."""
     image = ball((14,) * n if n == 3 else (24, 20))
-    h = image.data
-    index = np.stack(
-        np.meshgrid(*[np.linspace(-1.0, 1.0, s) for s in image.shape], indexing="ij"), -1
-    )
-    radius = np.linalg.norm(index, axis=-1)
-    of = lambda values: tetopt.Image(1.0 * values, image.affine)  # noqa: E731
+    places = np.meshgrid(*[np.linspace(-1.0, 1.0, s) for s in image.shape], indexing="ij")
+    radius = np.linalg.norm(places, axis=0)
+
+    def of(values):
+        return tetopt.Image(1.0 * values, image.affine)
+
     labels = of((radius < 0.7) + (radius < 0.4)) if "labels" in parts else None
     mask = of(radius < 0.9) if "mask" in parts else None
-    images = [image, of(h * (index[..., 0] > 0))] if "contrasts" in parts else image
+    images = [image, of(image.data * (places[0] > 0))] if "contrasts" in parts else image
     return image, labels, mask, tetopt.content(images, labels, mask)
 
 
@@ -68,75 +69,59 @@ class Asked:
 
 def assert_sound(result, image, labels, mask, order=1):
     """What came of a run: one thing, that all measures take, and that can be written."""
-    mesh, last = result.mesh, result.history[-1]
-    assert last.n_cells == len(mesh.cells)
+    mesh, last, n_cells = result.mesh, result.history[-1], len(result.mesh.cells)
     check_unfolded(mesh)
     owner = tetopt.cell_of_voxel(image, mesh)
-    moments = tetopt.cell_moments(image, mesh)
-    np.testing.assert_array_equal(
-        np.bincount(owner.ravel() + 1, minlength=len(mesh.cells) + 1)[1:], moments.n_voxels
-    )
+    n_voxels = np.bincount(owner.ravel() + 1, minlength=n_cells + 1)[1:]
+    assert_array_equal(n_voxels, tetopt.cell_moments(image, mesh).n_voxels)
     assert overlap_of(image, mesh) is None
-    assert last.n_voxels == (owner >= 0).sum()
+    assert (last.n_cells, last.n_voxels) == (n_cells, n_voxels.sum())
     if mask is None and labels is None:
         assert last.E_D == pytest.approx(tetopt.E_D(image, mesh), rel=1e-6)
-    assert tetopt.quality(mesh.points, mesh.cells).n_cells == len(mesh.cells)
+    assert tetopt.quality(mesh.points, mesh.cells).n_cells == n_cells
     fields = tetopt.cell_fields(mesh, image)
     if labels is not None:  # at whatever iteration it ended
         problems = manifold_problems(mesh, result.labels) + (
             [] if mask is None else manifold_problems(mesh)
         )
         assert bool(problems) == ("manifold" in result.violated)
-        assert set(result.labels.tolist()) <= set(labels.data.astype(int).ravel().tolist())
+        assert set(result.labels) <= set(labels.data.ravel())
         fields["label"] = result.labels
     measured = fidelity(labels, mask, mesh, result.labels)
     if labels is not None and mask is None:
-        assert sum(row.n_cells for row in measured["labels"]) == len(mesh.cells)
-        assert sum(row.mesh_volume for row in measured["labels"]) == pytest.approx(image.volume)
-    assert all(len(values) == len(mesh.cells) for values in fields.values())
+        assert sum(row.n_cells for row in measured["labels"]) == n_cells
+        volume = sum(row.mesh_volume for row in measured["labels"])
+        assert volume == pytest.approx(image.volume)
+    assert {len(values) for values in fields.values()} == {n_cells}
     model = tetopt.build_model(mesh, image, young=3.0, order=order, cell_data=fields)
     assert len(file_bytes(Path("a.vtu"), model)) > 1000
 
 
-def assert_sound_however_stopped(run, asks, *parts):
-    """Stopped at each of the numbers of asks; a search may then give what an earlier run of it
-    came to.
+def assert_sound_however_stopped(kind, asks_of):
+    """Stopped at each of the numbers of asks, which `asks_of` chooses of as many; a search may
+    then give what an earlier run of it came to.
     """
+    (*parts, _), options = KINDS[kind]
+    never = Asked()
+    meshed(kind, never)
+    asks = asks_of(never.number)
     for k in asks:
-        result = run(Asked(k))
+        result = meshed(kind, Asked(k))
         assert result.ended == "stopped" or k > asks[0]
-        assert_sound(result, *parts)
-
-
-def asks_of(run):
-    stop = Asked()
-    run(stop)
-    return stop.number
+        assert_sound(result, *parts, options.get("order", 1))
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_stopped_run_is_sound(kind):
-    (image, labels, mask, _), options = KINDS[kind]
-    n = asks_of(lambda stop: meshed(kind, stop))
-    asks = sorted({round(k) for k in np.linspace(1, n, SPREAD)})
     assert_sound_however_stopped(
-        lambda stop: meshed(kind, stop), asks, image, labels, mask, options.get("order", 1)
+        kind, lambda n: sorted({round(k) for k in np.linspace(1, n, SPREAD)})
     )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_run_stopped_anywhere_is_sound(kind):
-    (image, labels, mask, _), options = KINDS[kind]
-    n = asks_of(lambda stop: meshed(kind, stop))
-    assert_sound_however_stopped(
-        lambda stop: meshed(kind, stop),
-        range(1, n + 1),
-        image,
-        labels,
-        mask,
-        options.get("order", 1),
-    )
+    assert_sound_however_stopped(kind, lambda n: range(1, n + 1))
 
 
 def test_cells_are_lifted_no_longer_than_a_run_has_time():
@@ -145,13 +130,12 @@ def test_cells_are_lifted_no_longer_than_a_run_has_time():
     """
     image = target(3)[0]
     mesh = tetopt.Mesh(*delaunay_box(np.random.default_rng(0), image.shape, 150))
-    of = lambda: Engine(image, mesh)  # noqa: E731
     never = Asked()
-    n_all = of().repair(15.0, never).n_moves
+    n_all = Engine(image, mesh).repair(15.0, never).n_moves
     assert never.number > 4
     n_moves = []
     for k in (1, 2, never.number // 2, never.number):
-        engine, asked = of(), Asked(k)
+        engine, asked = Engine(image, mesh), Asked(k)
         n_moves.append(engine.repair(15.0, asked).n_moves)
         assert k <= asked.number <= k + 2
         engine.assert_sound()
@@ -178,5 +162,5 @@ def test_lifting_skips_only_what_would_fail_again(monkeypatch):
     assert (lifted.n_below, lifted.n_moves) == (again.n_below, again.n_moves)
     assert again.n_below > 0
     assert len(tried) > 100
-    np.testing.assert_array_equal(marked.complex.ticks, every.complex.ticks)
-    np.testing.assert_array_equal(marked.cells, every.cells)
+    assert_array_equal(marked.complex.ticks, every.complex.ticks)
+    assert_array_equal(marked.cells, every.cells)

@@ -1,10 +1,12 @@
 """Cells with labels: interfaces smooth, whole and manifold, and what every move keeps of them."""
 
-import numba
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
+from shapes import ball_image, distance, labels_alone
 
 import tetopt
+from tetopt import Image, mesh_image, quality
 from tetopt.contents.content import content
 from tetopt.energy.discretization import combine_energies
 from tetopt.energy.sampling import channel_grid, from_ticks
@@ -18,15 +20,15 @@ from tetopt.engine.repair import repair
 from tetopt.engine.sliding import combined_ways, constraint_values
 from tetopt.engine.smooth import attract, blocks, sweep
 from tetopt.engine.state import state_of, with_min_dihedral
+from tetopt.geometry.topology import facets
 from tetopt.measure.interfaces import label_interfaces
 
 
-def ball_in_ball(n=32, spacing=(1.0, 1.0, 1.0)):
+def ball_in_ball(n=32):
     """Labels 5 in 2 in 0: an off-centre ball in a ball, exactly known."""
-    at = np.stack(np.meshgrid(*[np.arange(n) - (n - 1) / 2] * 3, indexing="ij"), axis=-1)
-    inner = np.linalg.norm(at - [2.1, 0.0, -1.3], axis=-1) < 5.0
-    data = np.where(inner, 5.0, np.where(np.linalg.norm(at, axis=-1) < 11.5, 2.0, 0.0))
-    return tetopt.Image(data, np.diag([*spacing, 1.0]))
+    middle, shape = np.full(3, (n - 1) / 2), (n,) * 3
+    inner = distance(shape, *(middle + np.array([2.1, 0.0, -1.3]))) < 5.0
+    return Image(np.where(inner, 5.0, np.where(distance(shape, *middle) < 11.5, 2.0, 0.0)))
 
 
 def quarters(n=20):
@@ -34,45 +36,45 @@ def quarters(n=20):
     data = np.zeros((n, n, n))
     data[n // 2 :] = 1.0
     data[: n // 2, n // 2 :] = 2.0
-    return tetopt.Image(data)
+    return Image(data)
 
 
 CASES = {"balls": ball_in_ball(), "quarters": quarters()}
 
 
-def voxels_of(target):
-    """Information on the voxels of a content's labels."""
-    members = target.memberships
-    return label_voxels(members.partition, target.image.spacing, len(members.labels), members.parts)
+def state_for(target, nodes):
+    """The state of an octree mesh, with labels if the content has some; the mesh and its grid."""
+    mesh = tetopt.octree_mesh(target, nodes)
+    grid, members = channel_grid(target, mesh.points), target.memberships
+    state = state_of(target, mesh, grid, 0.85, is_graded=True)
+    if members is not None:
+        state = with_min_dihedral(state, 12.0)
+        voxels = label_voxels(
+            members.partition, target.image.spacing, len(members.labels), members.parts
+        )
+        state = with_labels(state, target, target.smooth, mesh, voxels)
+    return state, mesh, grid
 
 
-@pytest.fixture(scope="module")
-def labelled_state():
-    """A state with labels, some moves on, of each case; a function, as tests change it."""
-
-    def made(name, nodes=500):
-        target = content(CASES[name], labels=CASES[name], weights=[0.0])
-        mesh = tetopt.octree_mesh(target, nodes)
-        grid = channel_grid(target, mesh.points)
-        state = with_min_dihedral(state_of(target, mesh, grid, 0.85, is_graded=True), 12.0)
-        return with_labels(state, target, target.smooth, mesh, voxels_of(target)), target, grid
-
-    return made
+def labelled_state(name, nodes=500):
+    """A state with labels of a case, its content and grid."""
+    target = labels_alone(CASES[name])
+    state, _, grid = state_for(target, nodes)
+    return state, target, grid
 
 
-def parts(state, target, grid):
-    """Mesh, label of each cell, and the labels' rows in `label_interfaces`."""
+def mesh_of(state, target, grid):
+    """The mesh, and the label of each cell."""
     n_cells = int(state.complex.n_cells[0])
     points = target.image.to_world(from_ticks(state.complex.ticks, grid, 3))
     mesh = tetopt.Mesh(points, state.complex.cells[:n_cells].copy())
-    labels = target.memberships.labels[state.complex.labels[:n_cells]]
-    return mesh, labels, label_interfaces(target.image, mesh, labels)
+    return mesh, target.memberships.labels[state.complex.labels[:n_cells]]
 
 
 def topology(state, target, grid):
     return [
         (row.label, row.mesh_euler, row.nonmanifold_edges, row.nonmanifold_nodes)
-        for row in parts(state, target, grid)[2]
+        for row in label_interfaces(target.image, *mesh_of(state, target, grid))
     ]
 
 
@@ -93,6 +95,15 @@ def stated_labels(state):
     rows = [row[row >= 0].tolist() for row in state.complex.meeting]
     assert rows == [sorted(row) for row in rows]
     return [set(row) for row in rows]
+
+
+def measured(state):
+    """Copies of the numbers of all cells, by their names."""
+    n_cells = int(state.complex.n_cells[0])
+    return {
+        name: getattr(state.complex, name)[:n_cells].copy()
+        for name in ("cells", "labels", "sums", "E_shape")
+    }
 
 
 def swept(state):
@@ -123,7 +134,7 @@ MOVES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_every_move_keeps_labels_topology_and_sums(labelled_state, name):
+def test_every_move_keeps_labels_topology_and_sums(name):
     """Euler numbers and manifoldness of every label, which labels meet at a node, and all sums
     measured afresh.
     """
@@ -131,29 +142,18 @@ def test_every_move_keeps_labels_topology_and_sums(labelled_state, name):
     state = MOVES["attract"](state)
     before = topology(state, target, grid)
     for move in ("sweep", "flip", "exchange", "attract", "sweep", "exchange", "flip", "repair"):
-        n_cells = int(state.complex.n_cells[0])
-        old = (
-            state.complex.cells[:n_cells].copy(),
-            state.complex.labels[:n_cells].copy(),
-            state.complex.ticks.copy(),
-        )
+        old = [measured(state)["cells"], measured(state)["labels"], state.complex.ticks.copy()]
         state = MOVES[move](state)
-        n_cells = int(state.complex.n_cells[0])
-        new = state.complex.cells[:n_cells], state.complex.labels[:n_cells], state.complex.ticks
+        new = measured(state)
         if move in ("sweep", "flip", "exchange"):
-            assert any(
-                a.shape != b.shape or (a != b).any() for a, b in zip(old, new, strict=True)
-            ), move
+            there = [new["cells"], new["labels"], state.complex.ticks]
+            assert not all(map(np.array_equal, old, there)), move
         assert topology(state, target, grid) == before, move
         assert stated_labels(state) == meeting_labels(state), move
-        sums, E_shape = state.complex.sums[:n_cells].copy(), state.complex.E_shape[:n_cells].copy()
         remeasure(state)
-        np.testing.assert_allclose(
-            state.complex.sums[:n_cells], sums, atol=1e-6 * np.abs(sums).max(), err_msg=move
-        )
-        np.testing.assert_allclose(
-            state.complex.E_shape[:n_cells], E_shape, rtol=1e-9, err_msg=move
-        )
+        afresh, size = measured(state), np.abs(new["sums"]).max()
+        assert_allclose(afresh["sums"], new["sums"], atol=1e-6 * size, err_msg=move)
+        assert_allclose(afresh["E_shape"], new["E_shape"], rtol=1e-9, err_msg=move)
 
 
 @pytest.mark.parametrize("has_mask", [False, True])
@@ -164,20 +164,13 @@ def test_splits_are_the_best_of_all_edges(has_mask, has_labels):
     """
     image = CASES["balls"]
     target = content(
-        image, image if has_labels else None, tetopt.Image(image.data > 0.0) if has_mask else None
+        image, image if has_labels else None, Image(image.data > 0.0) if has_mask else None
     )
-    mesh = tetopt.octree_mesh(target, 200)
-    state = state_of(target, mesh, channel_grid(target, mesh.points), 0.85, is_graded=True)
-    if has_labels:
-        state = with_labels(state, target, target.smooth, mesh, voxels_of(target))
+    state, mesh, _ = state_for(target, 200)
     N, stars = len(state.complex.ticks), node_stars(state)
     room, x = roomy(state, N, 0), np.empty((4, 3))
-    splits = best_splits(
-        room,
-        stars,
-        np.ones(N, dtype=bool),
-        Limits(0.0, np.full(N, np.inf), 0.0, np.full(N, np.inf)),
-    )
+    free = np.full(N, np.inf)
+    splits = best_splits(room, stars, np.ones(N, dtype=bool), Limits(0.0, free, 0.0, free))
     energy = state.objective.geometry * state.complex.E_shape[: len(mesh.cells)]
     energy = energy + state.objective.image * cell_squares(state)
     n_fitted = 0
@@ -190,68 +183,57 @@ def test_splits_are_the_best_of_all_edges(has_mask, has_labels):
             if _put_middle(room, stars, a, b, N + a)
         ]
         assert splits.gain[a] == pytest.approx(max(gains, default=-np.inf), rel=1e-9)
-        n_fitted += (
-            splits.gain[a]
-            > energy[around[(mesh.cells[around] == splits.other[a]).any(axis=1)]].sum()
-        )
+        of_edge = around[(mesh.cells[around] == splits.other[a]).any(axis=1)]
+        n_fitted += splits.gain[a] > energy[of_edge].sum()
     # whose misfit falls by more than the energy of the cells around
     assert (n_fitted > 5) == has_mask
 
 
-def lengths(state, target, grid):
-    """Edges (a, b), their lengths, and the mean length of each node's edges, as many times as
-    they have cells.
+def edge_lengths(mesh):
+    """Lengths of edges, as many times as they have cells, and the mean length of the edges at the
+    end of each where that is shorter.
     """
-    mesh = parts(state, target, grid)[0]
     pairs = np.concatenate([mesh.cells[:, [k, m]] for k in range(4) for m in range(k)])
     length = np.linalg.norm(mesh.points[pairs[:, 0]] - mesh.points[pairs[:, 1]], axis=1)
-    return (
-        pairs,
-        length,
-        np.bincount(pairs.ravel(), np.repeat(length, 2)) / np.bincount(pairs.ravel()),
-    )
+    mean = np.bincount(pairs.ravel(), np.repeat(length, 2)) / np.bincount(pairs.ravel())
+    return length, mean[pairs].min(axis=1)
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_nodes_do_not_meet_on_the_way_to_a_surface(labelled_state, name):
+def test_nodes_do_not_meet_on_the_way_to_a_surface(name):
     """No edge becomes shorter than about a third of those around it; means change while
     neighbours move.
     """
     state, target, grid = labelled_state(name, 700)
-    pairs, before, mean = lengths(state, target, grid)
-    assert (before > 0.45 * mean[pairs].min(axis=1)).all()
-    pairs, after, mean = lengths(attracted(state), target, grid)
+    before, around = edge_lengths(mesh_of(state, target, grid)[0])
+    assert (before > 0.45 * around).all()
+    after, around = edge_lengths(mesh_of(attracted(state), target, grid)[0])
     assert (after != before).any()
-    assert (after > 0.3 * mean[pairs].min(axis=1)).all()
+    assert (after > 0.3 * around).all()
 
 
-def test_energy_falls_with_labels(labelled_state):
+def test_energy_falls_with_labels():
     """Sweeps and flips never raise E, voxels of other labels with it."""
-    state, _, _ = labelled_state("balls")
-    state = MOVES["attract"](state)
+    state = MOVES["attract"](labelled_state("balls")[0])
 
-    def E():
-        E_G, squares = energies(state)
-        return state.objective.geometry * E_G + state.objective.image * squares
+    def E(state):
+        return np.dot((state.objective.geometry, state.objective.image), energies(state))
 
-    last = E()
     for move in ("sweep", "flip", "sweep", "flip"):
-        state = MOVES[move](state)
-        assert last * (1.0 + 1e-9) >= E(), move
-        last = E()
+        before, state = E(state), MOVES[move](state)
+        assert E(state) <= before * (1.0 + 1e-9), move
 
 
-def test_squares_count_voxels_of_other_labels(labelled_state):
+def test_squares_count_voxels_of_other_labels():
     """Of labels alone: a voxel of label b in a cell of label a costs a's squared value and b's."""
     state, target, grid = labelled_state("balls")
-    mesh, _, _ = parts(state, target, grid)
-    owner = tetopt.energy.sampling.cell_of_voxel(target.image, mesh).ravel()
+    mesh = mesh_of(state, target, grid)[0]
+    owner = tetopt.cell_of_voxel(target.image, mesh).ravel()
     own, there = state.complex.labels[owner], target.memberships.partition.ravel()
     value = target.smooth.own_value.astype(float) ** 2
     cost = np.where(own != there, value[own] + value[there], 0.0)
-    np.testing.assert_allclose(
-        cell_squares(state), np.bincount(owner, cost, len(mesh.cells)), rtol=1e-9, atol=1e-6
-    )
+    expected = np.bincount(owner, cost, len(mesh.cells))
+    assert_allclose(cell_squares(state), expected, rtol=1e-9, atol=1e-6)
     assert cost.sum() > 0.0
 
 
@@ -265,14 +247,21 @@ def test_combined_ways_are_the_shortest():
         normal[:count] = normal[3 : 3 + count] = slopes
         is_found, way = combined_ways(normal, count, (*rise, 0.0, 0.0)[:3])
         assert is_found
-        np.testing.assert_allclose(way, np.linalg.lstsq(slopes, rise, rcond=None)[0], rtol=1e-9)
+        assert_allclose(way, np.linalg.lstsq(slopes, rise, rcond=None)[0], rtol=1e-9)
     normal[1] = normal[4] = 2.0 * normal[0]
     assert not combined_ways(normal, 2, (1.0, 1.0, 0.0))[0]
 
 
 @pytest.fixture(scope="module")
 def balls():
-    return tetopt.mesh_image(content(CASES["balls"], labels=CASES["balls"], weights=[0.0]), 1500)
+    return mesh_image(labels_alone(CASES["balls"]), 1500)
+
+
+def between(mesh, labels, *pair):
+    """Nodes of the facets between cells of two labels."""
+    shared = facets(mesh.cells)
+    of_sides = np.sort(labels[shared.cells], axis=1)
+    return shared.nodes[(shared.cells >= 0).all(axis=1) & (of_sides == pair).all(axis=1)]
 
 
 FACET_PLACES = np.array(
@@ -285,68 +274,44 @@ FACET_PLACES = FACET_PLACES / FACET_PLACES.sum(axis=1, keepdims=True)
 def test_balls(balls):
     """Two nested balls: their surfaces are near, whole, manifold and without folds."""
     rows = {row.label: row for row in label_interfaces(CASES["balls"], balls.mesh, balls.labels)}
-    for label in (2, 5):
-        row = rows[label]
+    for row in (rows[2], rows[5]):
         assert (row.nonmanifold_edges, row.nonmanifold_nodes) == (0, 0)
         assert (row.mesh_euler, row.mesh_cavities) == (row.euler, row.cavities)
         assert row.folded < 0.03
-    shared = tetopt.geometry.topology.facets(balls.mesh.cells)
-    labels = balls.labels[shared.cells]
     for pair, centre, radius in (((0, 2), 15.5, 11.5), ((2, 5), np.array([17.6, 15.5, 14.2]), 5.0)):
-        is_between = (shared.cells >= 0).all(axis=1) & (np.sort(labels, axis=1) == pair).all(axis=1)
-        corners = balls.mesh.points[shared.nodes[is_between]]
+        corners = balls.mesh.points[between(balls.mesh, balls.labels, *pair)]
         # Over the facets, as nodes lie off the surface by what these cut off: by .14 voxel on the
         # small ball.
-        off = np.abs(
-            np.linalg.norm(np.einsum("pk,fkd->fpd", FACET_PLACES, corners) - centre, axis=2)
-            - radius
-        )
+        at = np.einsum("pk,fkd->fpd", FACET_PLACES, corners)
+        off = np.abs(np.linalg.norm(at - centre, axis=2) - radius)
         assert off.mean() < 0.08
         assert np.quantile(off, 0.95) < 0.2
         assert off.max() < 0.45
         a, b, c = np.moveaxis(corners, 1, 0)
         area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
         assert area == pytest.approx(4.0 * np.pi * radius**2, rel=0.03)
-    assert tetopt.quality(balls.mesh.points, balls.mesh.cells).min_dihedral >= 12.0
-
-
-@pytest.mark.full
-def test_same_bits_on_any_number_of_threads():
-    before, runs = numba.get_num_threads(), []
-    try:
-        for threads in (before, 1):
-            numba.set_num_threads(threads)
-            target = content(CASES["balls"], labels=CASES["balls"], weights=[0.0])
-            runs.append(tetopt.mesh_image(target, 400, iterations=4))
-    finally:
-        numba.set_num_threads(before)
-    many, one = runs
-    np.testing.assert_array_equal(one.mesh.points, many.mesh.points)
-    np.testing.assert_array_equal(one.mesh.cells, many.mesh.cells)
-    np.testing.assert_array_equal(one.labels, many.labels)
+    assert quality(balls.mesh.points, balls.mesh.cells).min_dihedral >= 12.0
 
 
 @pytest.mark.full
 def test_E_of_the_history_is_comparable_throughout():
     """Eq. (4) in every row, also where cells have labels, whose own values moves follow."""
     phantom = tetopt.load_phantom("sphere")
-    what = tetopt.content(phantom.image(voxel_mm=4), phantom.label_image(voxel_mm=4))
-    result = tetopt.mesh_image(what, 300, iterations=4)
-    first = result.history[0]
+    what = content(phantom.image(voxel_mm=4), phantom.label_image(voxel_mm=4))
+    result = mesh_image(what, 300, iterations=4)
     assert result.labels is not None
-    for row in result.history:
-        assert row.E == pytest.approx(
-            combine_energies(row.E_G, row.E_D, first.E_G, first.E_D, GRADED_K_D), rel=1e-9
-        )
+    first, history = result.history[0], result.history
+    expected = [
+        combine_energies(row.E_G, row.E_D, first.E_G, first.E_D, GRADED_K_D) for row in history
+    ]
+    assert [row.E for row in history] == pytest.approx(expected, rel=1e-9)
 
 
-def test_nodes_of_three_labels_lie_on_their_curve(labelled_state):
+def test_nodes_of_three_labels_lie_on_their_curve():
     """Where three labels meet along a line, nodes between them come to it, and stay on it."""
-    state, _, _ = labelled_state("quarters")
-    for _ in range(4):
-        state = MOVES["attract"](state)
-        state = MOVES["sweep"](state)
-        state = MOVES["flip"](state)
+    state = labelled_state("quarters")[0]
+    for move in ("attract", "sweep", "flip") * 4:
+        state = MOVES[move](state)
     is_curve = state.complex.meeting[:, 2] >= 0
     assert is_curve.sum() > 5
     at = state.complex.ticks[is_curve] * 2.0**-state.objective.bits
@@ -362,61 +327,52 @@ def test_thick_slices_do_not_show():
     """A ball on slices four times as thick as voxels: no fold between slices, and half of the
     steps' area is gone.
     """
-    fine = ball_in_ball(32)
-    data = np.where(fine.data > 0.0, 1.0, 0.0)[:, :, 1::3]
-    thick = tetopt.Image(data, np.diag([1.0, 1.0, 3.0, 1.0]))
-    target = content(thick, labels=thick, weights=[0.0])
+    data = 1.0 * (ball_in_ball().data > 0.0)[:, :, 1::3]
+    thick = Image(data, np.diag([1.0, 1.0, 3.0, 1.0]))
+    target = labels_alone(thick)
     assert target.image.shape == (32, 32, 3 * data.shape[2])
-    np.testing.assert_allclose(target.image.volume, thick.volume)
-    result = tetopt.mesh_image(target, 1200, iterations=8)
-    row = label_interfaces(thick, result.mesh, result.labels)[1]
-    assert row.folded < 0.08
-    assert row.area == pytest.approx(4.0 * np.pi * 11.5**2, rel=0.08)
-    rough = tetopt.mesh_image(
-        content(thick, labels=thick, weights=[0.0], smooth_interfaces=False), 1200, iterations=8
+    assert_allclose(target.image.volume, thick.volume)
+    smooth, rough = (
+        mesh_image(each, 1200, iterations=8)
+        for each in (target, labels_alone(thick, smooth_interfaces=False))
     )
     assert rough.labels is None
-    before = label_interfaces(thick, rough.mesh, tetopt.cell_labels(thick, rough.mesh))[1]
+    row, before = (
+        label_interfaces(thick, mesh, labels)[1]
+        for mesh, labels in (
+            (smooth.mesh, smooth.labels),
+            (rough.mesh, tetopt.cell_labels(thick, rough.mesh)),
+        )
+    )
+    assert row.folded < 0.08
+    assert row.area == pytest.approx(4.0 * np.pi * 11.5**2, rel=0.08)
     assert before.folded > 4.0 * row.folded
+
+
+DISC = ball_image((40, 40), (19.5, 19.5), 12.0)
 
 
 def test_triangles():
     """A disc in the plane: its outline is one circle."""
-    at = np.stack(np.meshgrid(*[np.arange(40) - 19.5] * 2, indexing="ij"), axis=-1)
-    disc = tetopt.Image((np.linalg.norm(at, axis=-1) < 12.0).astype(float))
-    result = tetopt.mesh_image(content(disc, labels=disc, weights=[0.0]), 200)
-    facets = tetopt.geometry.topology.facets(result.mesh.cells)
-    labels = result.labels[facets.cells]
-    is_between = (facets.cells >= 0).all(axis=1) & (labels[:, 0] != labels[:, 1])
-    nodes, count = np.unique(facets.nodes[is_between], return_counts=True)
+    result = mesh_image(labels_alone(DISC), 200)
+    nodes, count = np.unique(between(result.mesh, result.labels, 0, 1), return_counts=True)
     assert (count == 2).all()
     assert np.abs(np.linalg.norm(result.mesh.points[nodes] - 19.5, axis=1) - 12.0).max() < 0.4
 
 
 def patches(seed, n, count):
     """Labels of the nearest of some random places: many of them meet at a node of large cells."""
-    at = np.indices((n,) * 3).reshape(3, -1).T
     places = np.random.default_rng(seed).uniform(0, n, (count, 3))
-    nearest = ((at[:, None] - places) ** 2).sum(axis=-1).argmin(axis=1)
-    return tetopt.Image(nearest.reshape((n,) * 3).astype(float))
+    away = [distance((n,) * 3, *place) for place in places]
+    return Image(np.argmin(away, axis=0).astype(float))
 
 
-def test_collapses_keep_labels_as_small_as_a_cell(labelled_state):
+def test_collapses_keep_labels_as_small_as_a_cell():
     """Where labels are as small as cells: no cell between two interfaces goes with a node, nor
     one of five labels.
     """
-    image = patches(27, 14, 6)
-    target = content(image, labels=image, weights=[0.0])
-    mesh = tetopt.octree_mesh(target, 300)
-    grid = channel_grid(target, mesh.points)
-    state = with_labels(
-        with_min_dihedral(state_of(target, mesh, grid, 0.85, is_graded=True), 12.0),
-        target,
-        target.smooth,
-        mesh,
-        voxels_of(target),
-    )
-    before = None
+    target = labels_alone(patches(27, 14, 6))
+    state, _, grid = state_for(target, 300)
     for move in ("attract", "sweep", "flip", "exchange"):
         before = topology(state, target, grid)
         state = MOVES[move](state)
@@ -430,21 +386,17 @@ def test_uniform_meshes_go_on_with_labels():
     """The energy that falls is another one once cells have labels, and higher: that is not yet
     the end.
     """
-    at = np.stack(np.meshgrid(*[np.arange(40) - 19.5] * 2, indexing="ij"), axis=-1)
-    disc = tetopt.Image((np.linalg.norm(at, axis=-1) < 12.0).astype(float))
-    result = tetopt.mesh_image(content(disc, labels=disc, weights=[0.0]), 200, mode="uniform")
-    assert result.history[-1].iteration > 3
-    few = tetopt.mesh_image(
-        content(disc, labels=disc, weights=[0.0]), 200, mode="uniform", tolerance=0.9
+    result, few = (
+        mesh_image(labels_alone(DISC), 200, mode="uniform", **options)
+        for options in ({}, {"tolerance": 0.9})
     )
+    assert result.history[-1].iteration > 3
     assert few.labels is not None
 
 
 @pytest.mark.full
 def test_the_minimum_dihedral_angle_within_a_mask():
     """Nodes are brought between labels without a flat cell, which might not be lifted again."""
-    image = patches(2, 12, 20)
-    at = np.stack(np.meshgrid(*[np.arange(12) - 5.5] * 3, indexing="ij"), axis=-1)
-    mask = tetopt.Image((np.linalg.norm(at, axis=-1) < 5.2).astype(float))
-    result = tetopt.mesh_image(content(image, labels=image, mask=mask, weights=[0.0]), 300)
-    assert tetopt.quality(result.mesh.points, result.mesh.cells).min_dihedral >= 12.0
+    target = labels_alone(patches(2, 12, 20), mask=ball_image((12,) * 3, (5.5,) * 3, 5.2))
+    mesh = mesh_image(target, 300).mesh
+    assert quality(mesh.points, mesh.cells).min_dihedral >= 12.0

@@ -3,29 +3,59 @@
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from itertools import product
 
 import numpy as np
 import pytest
+from shapes import distance, shaped
+from states import ball, on_lattice
+from test_labelled_cells import CASES as LABELS
+from test_labelled_cells import labels_alone
+from threads import assert_same_bits
 
 import tetopt
+from tetopt import Image, InputError, Sizes, lattice_mesh, mesh_image, optimize_paper
 from tetopt.contents.content import plain
 from tetopt.engine.aim import Aim, needed_corners
 from tetopt.engine.meshing import search_mesh, sizes_of_order
-from tetopt.geometry.quadratic import node_count, quadratic
+from tetopt.geometry.quadratic import node_count
 from tetopt.start.clip import lattice_within
 
 IMAGE = tetopt.load_phantom("sphere").image(voxel_mm=4.0)
-MASK = tetopt.Image((IMAGE.data > 50).astype(np.uint8), IMAGE.affine)
+MASK = Image((IMAGE.data > 50).astype(np.uint8), IMAGE.affine)
 
 
 def assert_same(result, expected):
-    assert result.mesh.points.tobytes() == expected.mesh.points.tobytes()
-    assert result.mesh.cells.tobytes() == expected.mesh.cells.tobytes()
+    """To the last bit."""
+    for one, other in (
+        (result.mesh.points, expected.mesh.points),
+        (result.mesh.cells, expected.mesh.cells),
+    ):
+        assert one.tobytes() == other.tobytes()
     assert result.ended == expected.ended
 
 
+def masked_labels():
+    image, mask = shaped("touching")
+    labels = Image(np.rint(distance(image.shape, 0, 14, 16) / 5.0))
+    return tetopt.content([image, Image(image.data**2)], labels, mask)
+
+
+def noisy_ball():
+    image = ball((48, 40, 44))
+    noise = np.random.default_rng(0).normal(0.0, 3.0, image.shape)
+    return Image(image.data + noise)
+
+
+def from_lattice(optimize, k_D, iterations):
+    image = ball((40, 44, 36))
+    lattice = lattice_mesh(image, nodes=1500)
+    return optimize(image, lattice, k_D=k_D, iterations=iterations)
+
+
 def test_graded():
-    result, initial = tetopt.mesh_image(IMAGE, 200, iterations=4), tetopt.octree_mesh(IMAGE, 200)
+    result, initial = mesh_image(IMAGE, 200, iterations=4), tetopt.octree_mesh(IMAGE, 200)
     assert_same(result, tetopt.optimize(IMAGE, initial, nodes=200, k_D=0.85, iterations=4))
     assert result.initial.points.tobytes() == initial.points.tobytes()
     assert result.nodes == 200
@@ -33,33 +63,54 @@ def test_graded():
 
 
 @pytest.mark.full
+@pytest.mark.parametrize(
+    "run",
+    [
+        lambda: from_lattice(tetopt.optimize, 0.4, 6),
+        lambda: from_lattice(optimize_paper, 0.3, 4),
+        lambda: mesh_image(noisy_ball(), 1500, iterations=4),
+        lambda: mesh_image(labels_alone(LABELS["balls"]), 400, iterations=4),
+        lambda: mesh_image(masked_labels(), 400, iterations=3),
+    ],
+    ids=["lattice", "paper", "octree", "labels", "labels and contrasts in a mask"],
+)
+def test_same_bits_on_any_number_of_threads(run):
+    def arrays():
+        result = run()
+        rows = [row[:-1] for row in result.history]
+        labels = [] if result.labels is None else result.labels
+        return result.mesh.points, result.mesh.cells, labels, rows
+
+    assert_same_bits(arrays)
+
+
+@pytest.mark.full
 def test_threads_of_python_mesh_at_once():
     """Each to the bits of a run alone; what nobody catches (`sys.unraisablehook`) stays the
     user's to see.
     """
-    hook, nodes = sys.unraisablehook, [150, 200, 150, 200]
-    begin = threading.Barrier(len(nodes))
+    hook, counts = sys.unraisablehook, [150, 200, 150, 200]
+    begin = threading.Barrier(len(counts))
 
-    def meshed(number):
+    def meshed(nodes):
         begin.wait()
-        return tetopt.mesh_image(IMAGE, number, iterations=3)
+        return mesh_image(IMAGE, nodes, iterations=3)
 
-    with ThreadPoolExecutor(len(nodes)) as pool:
-        results = list(pool.map(meshed, nodes))
-    for number, result in zip(nodes, results, strict=True):
-        assert_same(result, tetopt.mesh_image(IMAGE, number, iterations=3))
+    with ThreadPoolExecutor(len(counts)) as pool:
+        results = list(pool.map(meshed, counts))
+    alone = [mesh_image(IMAGE, nodes, iterations=3) for nodes in counts[:2]] * 2
+    for result, expected in zip(results, alone, strict=True):
+        assert_same(result, expected)
     assert sys.unraisablehook is hook
 
 
 @pytest.mark.parametrize("mask", [None, MASK])
 def test_uniform(mask):
-    image = IMAGE if mask is None else tetopt.content(IMAGE, mask=mask)
-    result = tetopt.mesh_image(
-        image, 150, mode="uniform", kind="five-tet", iterations=2, shape_power=2.0
-    )
-    region = None if mask is None else image.region
-    initial = lattice_within(IMAGE if mask is None else image.image, region, "five-tet", nodes=150)
-    assert_same(result, tetopt.optimize(image, initial, k_D=0.2, iterations=2, shape_power=2.0))
+    content = tetopt.content(IMAGE, mask=mask)
+    options = {"iterations": 2, "shape_power": 2.0}
+    result = mesh_image(content, 150, mode="uniform", kind="five-tet", **options)
+    initial = lattice_within(content.image, content.region, "five-tet", nodes=150)
+    assert_same(result, tetopt.optimize(content, initial, k_D=0.2, **options))
 
 
 @pytest.mark.full
@@ -68,30 +119,30 @@ def test_nodes_of_order_2_are_counted_in_all(n):
     """Corners and midpoints together; the same run as with these corners and this longest edge
     from the start.
     """
-    image = IMAGE if n == 3 else tetopt.Image(IMAGE.data[15].copy(), np.diag([4.0, 4.0, 1.0]))
+    image = IMAGE if n == 3 else Image(IMAGE.data[15].copy(), np.diag([4.0, 4.0, 1.0]))
     nodes = 900 if n == 3 else 300
-    result = tetopt.mesh_image(image, nodes, order=2, iterations=16)
-    points, cells = result.mesh.points, result.mesh.cells
-    assert abs(len(quadratic(points, cells)[0]) - nodes) <= 0.01 * nodes
+    result = mesh_image(image, nodes, order=2, iterations=16)
+    mesh = result.mesh
+    assert abs(node_count(mesh.points, mesh.cells, 2) - nodes) <= 0.01 * nodes
     assert result.nodes == nodes
     sizes = sizes_of_order(plain(image), nodes, None, 2)
-    assert_same(tetopt.mesh_image(image, len(points), sizes=sizes, iterations=16), result)
+    assert_same(mesh_image(image, len(mesh.points), sizes=sizes, iterations=16), result)
 
 
 def test_a_lattice_for_order_2():
     """As near as the steps of lattices allow, over all runs."""
-    result = tetopt.mesh_image(IMAGE, 1200, mode="uniform", order=2, iterations=1)
-    assert len(result.mesh.points) < 250
-    assert abs(len(quadratic(result.mesh.points, result.mesh.cells)[0]) / 1200 - 1.0) < 0.2
+    mesh = mesh_image(IMAGE, 1200, mode="uniform", order=2, iterations=1).mesh
+    assert len(mesh.points) < 250
+    assert abs(node_count(mesh.points, mesh.cells, 2) / 1200 - 1.0) < 0.2
 
 
 @pytest.mark.parametrize(
     ("options", "n_runs"),
     [
-        ({"nodes": 700, "sizes": tetopt.Sizes(longest=20.0)}, 1),
-        ({"nodes": 3000, "sizes": tetopt.Sizes(smallest=12.0)}, 1),
+        ({"nodes": 700, "sizes": Sizes(longest=20.0)}, 1),
+        ({"nodes": 3000, "sizes": Sizes(smallest=12.0)}, 1),
         ({"nodes": 1200, "mode": "uniform"}, 2),
-        ({"target_error": 0.5, "sizes": tetopt.Sizes(longest=6.0), "order": 1}, 1),
+        ({"target_error": 0.5, "sizes": Sizes(longest=6.0), "order": 1}, 1),
     ],
 )
 def test_no_run_is_repeated(options, n_runs):
@@ -112,20 +163,16 @@ def test_no_run_is_repeated(options, n_runs):
 
 def test_longest_edge_of_order_2():
     """1.15 times that of a uniform mesh with the corners; a longest edge that is asked for
-    stays.
+    stays, and so are the limits of order 1.
     """
-    content = plain(IMAGE)
-    uniform = tetopt.Sizes(coarsest=1.0).longest_edge(IMAGE, round(1000 / 7.2))
-    assert sizes_of_order(content, 1000, None, 2).longest == pytest.approx(1.15 * uniform)
-    assert sizes_of_order(content, 1000, None, 2).gradation == 0.5
-    assert sizes_of_order(content, 1000, tetopt.Sizes(longest=9.0), 2).longest == 9.0
-    assert sizes_of_order(content, 1000, None, 1) is None
-    # those of order 1, asked for
-    stated = sizes_of_order(content, 1000, tetopt.Sizes(gradation=1.0, coarsest=1.4), 2)
-    assert stated.gradation == 1.0
-    assert stated.longest == pytest.approx(1.4 * uniform)
-    with pytest.raises(tetopt.InputError, match="expected order 1 or 2, got 3"):
-        tetopt.mesh_image(IMAGE, 100, order=3)
+    of_order = partial(sizes_of_order, plain(IMAGE), 1000)
+    uniform = Sizes(coarsest=1.0).longest_edge(IMAGE, round(1000 / 7.2))
+    own = of_order(None, 2)
+    assert (own.longest, own.gradation) == (pytest.approx(1.15 * uniform), 0.5)
+    assert of_order(Sizes(longest=9.0), 2).longest == 9.0
+    assert of_order(None, 1) is None
+    stated = of_order(Sizes(gradation=1.0, coarsest=1.4), 2)
+    assert (stated.longest, stated.gradation) == (pytest.approx(1.4 * uniform), 1.0)
 
 
 @pytest.mark.parametrize(
@@ -134,7 +181,7 @@ def test_longest_edge_of_order_2():
 def test_a_search_ends_at_the_most_nodes(order, nodes_max, n_runs):
     """With their mesh, and the error that it leaves, if the target takes more; no run has more."""
     x, y = np.indices((120, 100))
-    image = tetopt.Image(10.0 * np.sin(x / 9.0) * np.cos(y / 8.0) + x)
+    image = Image(10.0 * np.sin(x / 9.0) * np.cos(y / 8.0) + x)
     aim, needed, counts = Aim(target_error=0.001, order=order, nodes_max=nodes_max), [], []
 
     def attempt(run, _, aim, runs):
@@ -151,24 +198,25 @@ def test_a_search_ends_at_the_most_nodes(order, nodes_max, n_runs):
     assert result.fraction > 0.001
     assert result.violated["error"].startswith(f"{result.fraction:.4g} of the image's variance is")
     if order == 1:
-        assert_same(result, tetopt.mesh_image(image, nodes_max, iterations=3))
+        assert_same(result, mesh_image(image, nodes_max, iterations=3))
 
 
 def test_by_the_paper():
-    result = tetopt.mesh_image(IMAGE, mode="paper", spacing=16.0, iterations=2, n_t=1)
-    lattice = tetopt.lattice_mesh(IMAGE, spacing=16.0)
-    assert_same(result, tetopt.optimize_paper(IMAGE, lattice, k_D=0.2, iterations=2, n_t=1))
+    options = {"iterations": 2, "n_t": 1}
+    result = mesh_image(IMAGE, mode="paper", spacing=16.0, **options)
+    lattice = lattice_mesh(IMAGE, spacing=16.0)
+    assert_same(result, optimize_paper(IMAGE, lattice, k_D=0.2, **options))
 
 
 def test_a_mesh_to_start_from():
     """Its boundary stays, unless it is told to slide."""
-    start = tetopt.lattice_mesh(IMAGE, nodes=100)
-    assert_same(
-        tetopt.mesh_image(IMAGE, start=start, iterations=2),
-        tetopt.optimize(IMAGE, start, k_D=0.02, iterations=2, boundary="fixed"),
-    )
-    slid = tetopt.mesh_image(IMAGE, start=start, k_D=0.5, iterations=2, boundary="slide")
-    assert_same(slid, tetopt.optimize(IMAGE, start, k_D=0.5, iterations=2))
+    start = lattice_mesh(IMAGE, nodes=100)
+    for stated, options in (
+        ({}, {"k_D": 0.02, "boundary": "fixed"}),
+        ({"k_D": 0.5, "boundary": "slide"}, {"k_D": 0.5}),
+    ):
+        result = mesh_image(IMAGE, start=start, iterations=2, **stated)
+        assert_same(result, tetopt.optimize(IMAGE, start, iterations=2, **options))
 
 
 @pytest.mark.full
@@ -181,47 +229,64 @@ def test_a_search_by_several_runs():
         return run(callback=rows.append)
 
     result = search_mesh(IMAGE, Aim(target_error=0.2), attempt, iterations=3)
-    assert_same(result, tetopt.mesh_image(IMAGE, target_error=0.2, iterations=3))
+    assert_same(result, mesh_image(IMAGE, target_error=0.2, iterations=3))
     assert sum(row.iteration == 0 for row in rows) == len(starts) > 1
     assert any(initial is result.initial for initial in starts)
-    assert_same(result, tetopt.mesh_image(IMAGE, result.nodes, iterations=3))
+    assert_same(result, mesh_image(IMAGE, result.nodes, iterations=3))
+
+
+LIMITS = {"target_error": 0.2, "nodes_max": 500}
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"mode": "coarse"}, "expected mode graded, uniform, paper, start, got 'coarse'"),
+        ({"mode": "coarse"}, "graded, uniform, paper, start, got 'coarse'"),
+        ({"nodes": 100, "order": 3}, "order 1 or 2, got 3"),
         ({"nodes": 100, "kind": "bcc"}, "takes nodes, target_error, nodes_max, sizes, not kind"),
         (
-            {"nodes": 100, "mode": "uniform", "sizes": tetopt.Sizes()},
+            {"nodes": 100, "mode": "uniform", "sizes": Sizes()},
             "takes nodes, spacing, kind, not sizes",
         ),
-        ({"nodes": 100, "start": tetopt.lattice_mesh(IMAGE, nodes=60)}, "takes start, not nodes"),
-        ({"mode": "paper", "nodes": 100, "spacing": 5.0}, "give only one of nodes and spacing"),
-        ({"mode": "start"}, "requires a mesh to start from"),
+        ({"nodes": 100, "start": lattice_mesh(IMAGE, nodes=60)}, "takes start, not nodes"),
+        ({"mode": "paper", "nodes": 100, "spacing": 5.0}, "only one of nodes and spacing"),
+        ({"mode": "start"}, "a mesh to start from"),
         ({"nodes": 100, "nodes_max": 200}, "nodes_max needs target_error"),
         ({"nodes_max": 200}, "nodes_max needs target_error"),
-        (
-            {"target_error": 0.2, "nodes_max": 8},
-            "nodes_max: expected a whole number, 9 or more in 3-D, got 8",
-        ),
-        (
-            {"target_error": 0.2, "nodes_max": 64, "order": 2},
-            "nodes_max: expected a whole number, 65 or more in 3-D",
-        ),
-        (
-            {"target_error": 0.2, "nodes_max": 500, "sizes": tetopt.Sizes(edge_size=9.0)},
-            r"nodes_max: sizes require about \d+ nodes, got 500; allow as many, or larger cells",
-        ),
-        (
-            {"target_error": 0.2, "nodes_max": 500, "sizes": tetopt.Sizes(longest=9.0)},
-            r"nodes_max: sizes require about \d+ nodes, got 500",
-        ),
+        (LIMITS | {"nodes_max": 8}, "nodes_max: .* 9 or more in 3-D, got 8"),
+        (LIMITS | {"nodes_max": 64, "order": 2}, "nodes_max: .* 65 or more in 3-D"),
+        (LIMITS | {"sizes": Sizes(edge_size=9.0)}, r"nodes_max: .* \d+ nodes, got 500; "),
+        (LIMITS | {"sizes": Sizes(longest=9.0)}, r"nodes_max: .* \d+ nodes, got 500"),
     ],
 )
 def test_contradictions(arguments, words):
-    with pytest.raises(tetopt.InputError, match=words):
-        tetopt.mesh_image(IMAGE, **arguments)
+    with pytest.raises(InputError, match=words):
+        mesh_image(IMAGE, **arguments)
+
+
+def test_the_paper_takes_one_image():
+    with pytest.raises(InputError, match="one image"):
+        mesh_image(tetopt.content(IMAGE, mask=MASK), 100, mode="paper")
+
+
+@pytest.mark.parametrize(
+    ("optimize", "options"),
+    [
+        *product(
+            (tetopt.optimize, optimize_paper),
+            ({"k_D": 1.0}, {"k_D": np.nan}, {"iterations": -1}, {"boundary": "free"}),
+        ),
+        *product(
+            [tetopt.optimize],
+            ({"shape_power": 0.9}, {"min_dihedral": 71.0}, {"nodes": 0}, {"nodes": 189.5}),
+        ),
+        *product([optimize_paper], ({"n_t": -1}, {"retessellate": "often"}, {"step_ratio": 0.0})),
+    ],
+)
+def test_options_that_cannot_be(optimize, options):
+    ((name, value),) = options.items()
+    with pytest.raises(InputError, match=rf"{name}: expected .*, got '?{value}"):
+        optimize(*on_lattice(ball((12, 10)), 2, 2), **options)
 
 
 @pytest.mark.parametrize(
@@ -233,12 +298,5 @@ def test_contradictions(arguments, words):
     ],
 )
 def test_an_argument_of_another_name_is_named(arguments, words):
-    with pytest.raises(
-        TypeError, match=f"^mesh_image.* got an unexpected keyword argument {words}"
-    ):
-        tetopt.mesh_image(tetopt.Image(np.zeros((8, 8, 8))), **arguments)
-
-
-def test_the_paper_takes_one_image():
-    with pytest.raises(tetopt.InputError, match="one image, without labels or mask"):
-        tetopt.mesh_image(tetopt.content(IMAGE, mask=MASK), 100, mode="paper")
+    with pytest.raises(TypeError, match=f"^mesh_image.* {words}"):
+        mesh_image(IMAGE, **arguments)

@@ -8,7 +8,7 @@ from operations import operations
 from runs import labelled_world, runs
 from worlds import random_world
 
-import tetopt
+from tetopt import check_mesh, mesh_image, quality
 
 pytestmark = pytest.mark.full
 
@@ -21,11 +21,9 @@ def test_no_node_leaves_a_box_that_a_mask_touches(seed):
     rng = np.random.default_rng([19, seed])
     world = random_world(rng, needs_mask=True)
     nodes, k_D = int(rng.integers(80, 250)), float(rng.choice([0.02, 0.2, 0.85, 0.95]))
-    result = tetopt.mesh_image(world.content(), nodes, iterations=6, k_D=k_D)
+    result = mesh_image(world.content(), nodes, iterations=6, k_D=k_D)
     assert (
-        tetopt.check_mesh(
-            result.mesh, world.image, is_whole=False, is_filled=False, is_manifold=False
-        )
+        check_mesh(result.mesh, world.image, is_whole=False, is_filled=False, is_manifold=False)
         == []
     )
     assert "box" not in result.violated
@@ -52,22 +50,22 @@ def test_runs_meet_their_requirements_or_say_so():
 def test_the_last_flat_cells_may_leave_their_interface():
     """Of this world five cells were left under 22 degrees, all of their nodes on interfaces."""
     world = labelled_world(np.random.default_rng([21, 9, 7]))
-    result = tetopt.mesh_image(world.content(), 200, iterations=5, min_dihedral=22.0)
+    result = mesh_image(world.content(), 200, iterations=5, min_dihedral=22.0)
     assert result.violated == {}
-    assert tetopt.quality(result.mesh.points, result.mesh.cells).min_dihedral >= 22.0 - 1e-6
+    assert quality(result.mesh.points, result.mesh.cells).min_dihedral >= 22.0 - 1e-6
 
 
 def test_a_few_cells_on_a_mask_s_boundary_go_where_nothing_lifts_them():
     """Three of 644 were left in the corners of this world's mask, down to 9 degrees."""
     target = labelled_world(np.random.default_rng([21, 7, 57])).content()
-    result = tetopt.mesh_image(target, 280)
+    result = mesh_image(target, 280)
     assert "min_dihedral" not in result.violated
-    assert tetopt.quality(result.mesh.points, result.mesh.cells).min_dihedral >= 12.0 - 1e-6
-    assert tetopt.check_mesh(result.mesh, is_whole=False) == []
+    assert quality(result.mesh.points, result.mesh.cells).min_dihedral >= 12.0 - 1e-6
+    assert check_mesh(result.mesh, is_whole=False) == []
 
 
 def test_parts_of_a_boundary_do_not_touch_in_one_place():
     """Two nodes of this world's mask slid into one place."""
     target = labelled_world(np.random.default_rng([21, 7, 263])).content()
-    result = tetopt.mesh_image(target, 135)
-    assert tetopt.check_mesh(result.mesh, is_whole=False) == []
+    result = mesh_image(target, 135)
+    assert check_mesh(result.mesh, is_whole=False) == []

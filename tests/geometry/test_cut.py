@@ -4,18 +4,10 @@ import naive
 import numpy as np
 import pytest
 from hypothesis import given
-from hypothesis import strategies as st
-from meshes import TWO_TETS, split_box
+from meshes import TWO_TETS, seeds, split_box
+from numpy.testing import assert_allclose, assert_array_equal
 
 from tetopt.geometry.cut import plane_cut
-
-seeds = st.integers(0, 2**32 - 1)
-
-
-def areas(corners):
-    """Of the polygons (K, 4, 3), if they are convex and in order."""
-    diagonals = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
-    return 0.5 * np.linalg.norm(diagonals, axis=1)
 
 
 def sorted_rows(rows):
@@ -24,18 +16,16 @@ def sorted_rows(rows):
 
 def test_a_node_on_the_plane_counts_as_above():
     points, cells = TWO_TETS  # the shared triangle lies in z = 0
-    assert plane_cut(points, cells, points[:, 2]).cells.tolist() == [1]
-    assert plane_cut(points, cells, -points[:, 2]).cells.tolist() == [0]
-    on = plane_cut(points, cells, -points[:, 2])
-    assert areas(on.corners) == pytest.approx([0.5])  # cell 0 is cut in the shared triangle itself
+    below, above = (plane_cut(points, cells, sign * points[:, 2]) for sign in (1.0, -1.0))
+    assert (below.cells.tolist(), above.cells.tolist()) == ([1], [0])
+    a, b, c, d = above.corners[0]  # cell 0 is cut in the shared triangle itself
+    assert 0.5 * np.linalg.norm(np.cross(c - a, d - b)) == pytest.approx(0.5)
 
 
-def test_a_plane_that_misses_cuts_nothing():
-    points, cells = TWO_TETS
-    for side in (1.0, -1.0):
-        cut = plane_cut(points, cells, np.full(5, side))
-        assert cut.corners.shape == (0, 4, 3)
-        assert cut.cells.shape == (0,)
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_plane_that_misses_cuts_nothing(side):
+    cut = plane_cut(*TWO_TETS, np.full(5, side))
+    assert (cut.corners.shape, cut.cells.shape) == ((0, 4, 3), (0,))
 
 
 @given(seeds)
@@ -51,7 +41,7 @@ def test_corners_are_those_of_the_twin(seed):
         distinct = corners if len(twin[cell]) == 4 else corners[:3]
         assert sorted_rows(distinct) == sorted_rows(twin[cell])
         if len(twin[cell]) == 3:
-            np.testing.assert_array_equal(corners[2], corners[3])
+            assert_array_equal(corners[2], corners[3])
 
 
 @given(seeds)
@@ -64,7 +54,7 @@ def test_polygons_are_convex(seed):
     height = (points - np.array([1.5, 2, 1]) - rng.uniform(-0.5, 0.5, 3)) @ normal
     cut = plane_cut(points, cells, height)
     corners = cut.corners
-    np.testing.assert_allclose((corners - points[0]) @ normal, -height[0], atol=1e-12)
+    assert_allclose((corners - points[0]) @ normal, -height[0], atol=1e-12)
     ahead = np.roll(corners, -1, axis=1) - corners
     turns = np.cross(ahead, np.roll(ahead, -1, axis=1)) @ normal
     assert ((turns > -1e-9).all(axis=1) | (turns < 1e-9).all(axis=1)).all()

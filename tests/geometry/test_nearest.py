@@ -4,6 +4,7 @@ tests/measure/test_fidelity.py.
 
 import naive
 import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
 
 from tetopt.geometry.nearest import triangle_distances
 
@@ -25,12 +26,12 @@ def test_distances_against_twin():
     distances = triangle_distances(
         points, np.vstack([[[1e6, -1e6, 0.0]], corners.reshape(-1, 3)]), facets
     )
-    np.testing.assert_allclose(distances, expected, rtol=1e-9, atol=1e-9)
+    assert_allclose(distances, expected, rtol=1e-9, atol=1e-9)
 
 
 def test_a_point_for_all_triangles():
     """Triangles that are one point have a bin, too."""
     facets = np.zeros((2, 3), dtype=np.int64)
-    np.testing.assert_array_equal(
+    assert_array_equal(
         triangle_distances(np.array([[3.0, 4.0, 0.0]]), np.zeros((1, 3)), facets), [5.0]
     )
