@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
@@ -31,6 +30,7 @@ from tetopt.job.options import (
     option_name,
     option_of,
 )
+from tetopt.job.texts import value_of_text
 from tetopt.system.arrays import Json
 from tetopt.system.files import check_output, name_files, save_json
 
@@ -185,38 +185,15 @@ def _annotation_of(name: str, kind: Any, default: Any, panel: str | None) -> Any
     long = f"--{long}/--no-{long}" if default is True else f"--{long}"
     names = [f"-{own.letter}"] * bool(own.letter) + [long]
     # `of_option` has plainer words than typer for what is none
-    if (number := _number_of(kind)) is not None:
-        about |= {"parser": str, "callback": _converter(name, kind, number)}
-    return Annotated[
-        get_args(kind)[0], typer.Option(*names, **about, min=own.least, rich_help_panel=panel)
-    ]
+    value = get_args(kind)[0]
+    if value in (int, float, int | None, float | None):
+        about |= {"parser": str, "callback": _converter(name, kind)}
+    return Annotated[value, typer.Option(*names, **about, min=own.least, rich_help_panel=panel)]
 
 
-def _number_of(kind: Any) -> type[int] | type[float] | None:
-    """Return the type of a number's option; None for other options and parameters."""
-    return next(
-        (
-            own
-            for own in (int, float)
-            if has_option(kind) and get_args(kind)[0] in (own, own | None)
-        ),
-        None,
-    )
-
-
-def _converter(name: str, kind: Any, number: Callable[[str], int | float]) -> Callable[[Any], Any]:
-    """Return a function that converts an option's string, or raises InputError for what is no
-    number of its kind.
-    """
-
-    def converted(value: Any) -> Any:
-        text = value
-        for convert in (float, number):  # 5e3 is a whole number, too
-            with suppress(ValueError, TypeError):  # a string that `of_option` rejects, or None
-                value = convert(text)
-        return of_option(name, kind, value)
-
-    return converted
+def _converter(name: str, kind: Any) -> Callable[[Any], Any]:
+    """Return a function that converts a number's string, or raises InputError for what is none."""
+    return lambda text: of_option(name, kind, value_of_text(get_args(kind)[0], text))
 
 
 def _of_values(kind: Any, name: str, values: Json) -> Any:

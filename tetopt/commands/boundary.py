@@ -23,7 +23,7 @@ from tetopt.measure.fidelity import FacetSurface, surface_areas
 from tetopt.model.file import MeshFile
 from tetopt.model.label_names import LABEL_FIELD, label_words, labels_named
 from tetopt.model.model import SPACES
-from tetopt.model.sets import FACE_NAMES, boundary_rows, face_sets
+from tetopt.model.sets import FACE_NAMES, Names, boundary_rows, face_sets
 from tetopt.system.arrays import Ints, Json
 
 MOST_LISTED = 12  # interfaces in the table; the file of numbers has all
@@ -113,7 +113,7 @@ def _check_part(part: SurfacePart, output: Path) -> None:
 
 
 def _write_closed(
-    loaded: MeshFile, path: Path, output: Path, part: SurfacePart, names: dict[int, str]
+    loaded: MeshFile, path: Path, output: Path, part: SurfacePart, names: Names
 ) -> WrittenSurface:
     """Write the boundary of a structure, or of the whole mesh, and read it back."""
     if part.label is not None:
@@ -152,7 +152,7 @@ def _write_closed(
 
 
 def _write_interfaces(
-    loaded: MeshFile, path: Path, output: Path, part: SurfacePart, names: dict[int, str]
+    loaded: MeshFile, path: Path, output: Path, part: SurfacePart, names: Names
 ) -> WrittenSurface:
     """Write the mesh's facets between labels, with normals out of the smaller label, and read
     them back.
@@ -188,7 +188,7 @@ def _of_interfaces(
     output: Path,
     surface: Surface,
     shown: LabelSurfaces,
-    names: dict[int, str],
+    names: Names,
     written: SurfaceCheck,
 ) -> WrittenSurface:
     """Return area and triangles of each pair of labels, and the numbers for the file of numbers."""
@@ -233,7 +233,7 @@ def _of_interfaces(
     return WrittenSurface(numbers, (output.name, "triangles", "area, mm2"), rows, [last])
 
 
-def _two_sides(text: str, names: dict[int, str]) -> tuple[list[int], list[int]]:
+def _two_sides(text: str, names: Names) -> tuple[list[int], list[int]]:
     """Parse "J,K" into the labels on both sides of the interface."""
     sides = text.split(",")
     if len(sides) != 2:
@@ -247,7 +247,7 @@ def _two_sides(text: str, names: dict[int, str]) -> tuple[list[int], list[int]]:
     return one, other
 
 
-def _with_label(loaded: MeshFile, path: Path, chosen: list[int], names: dict[int, str]) -> Ints:
+def _with_label(loaded: MeshFile, path: Path, chosen: list[int], names: Names) -> Ints:
     """Return the numbers of the cells with these labels."""
     labels = cell_field(loaded, path, LABEL_FIELD)
     cells = np.flatnonzero(np.isin(labels, chosen))

@@ -39,6 +39,7 @@ from tetopt.measure.measures import fidelity
 from tetopt.measure.quality import Quality, quality
 from tetopt.model.file import MASK_TEXT, MeshFile, words_of_other_box
 from tetopt.model.label_names import LABEL_FIELD
+from tetopt.model.sets import Names
 from tetopt.report.summary import size_summary
 from tetopt.system.arrays import Json
 
@@ -293,7 +294,7 @@ def _merged_numbers(inputs: Mapping[str, Any], labels: Path, part: ImagePart) ->
     )
 
 
-def _measure_fit(judgement: Judgement, names: Mapping[int, str]) -> Judgement:
+def _measure_fit(judgement: Judgement, names: Names) -> Judgement:
     """Measure the fit of the cells to the image, mask and labels, and judge it."""
     source = cast(Source, judgement.source)
     loaded = judgement.loaded
@@ -350,7 +351,7 @@ def _mesh_problems(judgement: Judgement) -> tuple[list[str], list[str]]:
     return (touching, []) if is_smooth else ([], touching)
 
 
-def _names(rows: Sequence[LabelFidelity], names: Mapping[int, str]) -> dict[str, dict[int, str]]:
+def _names(rows: Sequence[LabelFidelity], names: Names) -> dict[str, dict[int, str]]:
     """Return the names of the labels that have one, as "label_names"; empty if none has."""
     of_rows = {row.label: names[row.label] for row in rows if row.label in names}
     return {"label_names": of_rows} if of_rows else {}

@@ -18,7 +18,7 @@ from tetopt.fem.elasticity import System, lame_constants, on_one_blas_thread, so
 from tetopt.fem.rigidity import rigid_modes
 from tetopt.geometry.box import upright_axis
 from tetopt.image import Image
-from tetopt.system.arrays import Floats, Ints
+from tetopt.system.arrays import Floats, Ints, Shape
 from tetopt.system.budget import at_most, check_memory
 
 DOF_BYTES = 4800.0  # of memory per dof; 4,750 were measured at 12,000, 4,400 at 300,000
@@ -152,12 +152,12 @@ def free_stiffness(modulus: Image, nu: float) -> csr_array:
     ).tocsr()
 
 
-def _corners(n: int) -> list[tuple[int, ...]]:
+def _corners(n: int) -> list[Shape]:
     """Corners of an element, 0 or 1 along each axis."""
     return list(combinations_of((0, 1), repeat=n))
 
 
-def _of_voxels(corner: tuple[int, ...], shape: tuple[int, ...]) -> tuple[slice, ...]:
+def _of_voxels(corner: Shape, shape: Shape) -> tuple[slice, ...]:
     """Where the nodes are, among all, that are this corner of each voxel."""
     return tuple(slice(c, c + s) for c, s in zip(corner, shape, strict=True))
 

@@ -24,7 +24,7 @@ from tetopt.geometry.quadratic import shape_slopes, shape_values
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.model.on_image import places_in_cells
-from tetopt.system.arrays import Bools, Floats, Ints
+from tetopt.system.arrays import Bools, Floats, Ints, Shape
 
 # ratio of successive voxel sizes tried for the grid, which misses the limit by less than 6 %
 STEP_GROWTH = 1.02
@@ -133,7 +133,7 @@ def _strain_energy(modulus: Image, nu: float, u: Floats) -> float:
     return 0.5 * float((u * stiffness_product(modulus, nu, u)).sum())
 
 
-def interpolate_nodes(u: Floats, shape: tuple[int, ...]) -> Floats:
+def interpolate_nodes(u: Floats, shape: Shape) -> Floats:
     """Displacements of a grid's nodes at the nodes of another grid of this shape over the same
     box.
     """
@@ -231,7 +231,7 @@ def near_interface(labels: NDArray) -> Bools:
     return ndimage.distance_transform_edt(~is_edge) <= INTERFACE_BAND_VOXELS - 0.5
 
 
-def average_voxels(image: Image, shape: tuple[int, ...]) -> Image:
+def average_voxels(image: Image, shape: Shape) -> Image:
     """The image on a coarser grid over the same box: means over new voxels, with cut voxels
     weighted by their fraction.
 
@@ -258,7 +258,7 @@ def _fractions(new: int, old: int) -> csr_array:
     return csr_array((length * new / old, (row, middle.astype(np.int64))), shape=(new, old))
 
 
-def reference_shape(shape: Sequence[int], spacing: Floats, dofs: int) -> tuple[int, ...]:
+def reference_shape(shape: Sequence[int], spacing: Floats, dofs: int) -> Shape:
     """The finest grid of nearly cubic voxels over the image's box with at most `dofs`, no finer
     than the image.
     """
@@ -272,7 +272,7 @@ def reference_shape(shape: Sequence[int], spacing: Floats, dofs: int) -> tuple[i
         step *= STEP_GROWTH
 
 
-def refine_voxels(image: Image, shape: tuple[int, ...]) -> Image:
+def refine_voxels(image: Image, shape: Shape) -> Image:
     """The same field on evenly divided voxels, about `shape` along the axes.
 
     All voxels have the same number of parts, so that means over parts of the box are those of the

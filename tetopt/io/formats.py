@@ -29,7 +29,7 @@ from tetopt.model.loads import known_set
 from tetopt.model.materials import Materials
 from tetopt.model.model import Model, in_space, in_units, locking_words
 from tetopt.model.sets import MOST_LETTERS, SET_NAME, Sets, is_set
-from tetopt.system.arrays import Arrays, Ints, Json
+from tetopt.system.arrays import Arrays, Ints, Json, Shape
 
 
 class Format(NamedTuple):
@@ -337,7 +337,7 @@ def _check_model(path: Path, model: Model) -> Model:
 
 
 def _check_sets(
-    path: Path, sets: Mapping[str, ArrayLike], ends: tuple[int, ...], what: str
+    path: Path, sets: Mapping[str, ArrayLike], ends: Shape, what: str
 ) -> dict[str, Ints]:
     """Return the sets as arrays; InputError unless each has ascending rows of integers from 0 to
     below `ends`.

@@ -48,7 +48,7 @@ from tetopt.io.volumes import (
     plane_affine,
     volume_index,
 )
-from tetopt.system.arrays import Floats
+from tetopt.system.arrays import Floats, Shape
 from tetopt.system.incoming import irregular
 
 NIFTI_HEAD_BYTES = 1024  # read from a file: the longest header has 540
@@ -94,12 +94,12 @@ def read_nibabel(path: Path, request: Request) -> Voxels:
     return data, affine
 
 
-def nibabel_shape(path: Path) -> tuple[int, ...]:
+def nibabel_shape(path: Path) -> Shape:
     """Return the lengths of all axes in the header."""
     return _shape_of(_header_of(_files_of(path)[0])[0])
 
 
-def _shape_of(header: Any) -> tuple[int, ...]:
+def _shape_of(header: Any) -> Shape:
     return tuple(int(size) for size in header.get_data_shape())
 
 
@@ -212,7 +212,7 @@ def _check_nifti(header: Any) -> None:
         raise InputError(f"{DAMAGED_FILE} (its voxels would begin at byte {offset:g})")
 
 
-def _note_place(header: Any, shape: tuple[int, ...], head: bytes) -> None:
+def _note_place(header: Any, shape: Shape, head: bytes) -> None:
     """Note a header without orientation, which nibabel guesses, or with two."""
     if isinstance(header, MGHHeader):
         if not any(head[MGH_FLAG]):
@@ -244,7 +244,7 @@ def _units(header: Any) -> Floats | None:
 def _voxels(
     path: Path,
     header: Any,
-    shape: tuple[int, ...],
+    shape: Shape,
     volume: int,
     bounds: list[tuple[int, int]],
 ) -> NDArray:

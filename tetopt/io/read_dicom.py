@@ -38,7 +38,7 @@ from tetopt.io.volumes import (
     volume_index,
 )
 from tetopt.model.label_names import LabelTable
-from tetopt.system.arrays import Floats, Ints, Json
+from tetopt.system.arrays import Floats, Ints, Json, Shape
 from tetopt.system.extras import install_hint
 from tetopt.system.incoming import irregular
 
@@ -112,7 +112,7 @@ class Frame(NamedTuple):
     thickness: float  # 0 if unknown
     scale: tuple[float, float]  # slope and intercept of its values
     volume: tuple[str, int]  # stack, and time
-    others: tuple[int, ...]  # indices of other dimensions than these and the position
+    others: Shape  # indices of other dimensions than these and the position
     segment: int
 
 

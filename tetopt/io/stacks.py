@@ -36,7 +36,7 @@ from tetopt.io.volumes import (
     note,
     one_line,
 )
-from tetopt.system.arrays import Floats
+from tetopt.system.arrays import Floats, Shape
 from tetopt.system.extras import install_hint
 from tetopt.system.incoming import irregular
 
@@ -372,7 +372,7 @@ def _stack_shape(file: Any, axes: dict[str, int]) -> list[int]:
     return shape
 
 
-def _axes_to_flip(page: Any) -> tuple[int, ...]:
+def _axes_to_flip(page: Any) -> Shape:
     """Return the axes of a stack that run the other way; InputError for colours, or swapped
     axes.
     """

@@ -33,10 +33,11 @@ from tetopt.model.sets import (
     FACE_NAMES,
     MASK_SURFACE_SET,
     MOST_LETTERS,
+    Names,
     free_name,
     label_set_names,
 )
-from tetopt.system.arrays import Arrays, Ints
+from tetopt.system.arrays import Arrays, Ints, Shape
 
 UNNAMED_GROUP = "unnamed"  # the group of cells in no other group
 LEAST_ROOM = 1000  # numbers reserved for labels
@@ -195,7 +196,7 @@ def _part(
     dim: int,
     of_items: Tagged,
     groups_of: list[list[int]],
-    names: dict[int, str],
+    names: Names,
     first: int,
     room: int,
 ) -> Part:
@@ -374,7 +375,7 @@ def without_data(model: Model) -> list[str]:
     ]
 
 
-def as_columns(fields: Arrays, shapes: Container[tuple[int, ...]]) -> Arrays:
+def as_columns(fields: Arrays, shapes: Container[Shape]) -> Arrays:
     """Split cell or point data into scalars by name: columns are numbered NAME_0, NAME_1, ...
 
     Rows with one of the `shapes` are kept whole. A column with the name of another field is

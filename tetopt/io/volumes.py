@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.system.arrays import Floats
+from tetopt.system.arrays import Floats, Shape
 from tetopt.system.budget import check_memory
 
 IMAGE_BYTES = 8  # per voxel of an `Image`, at most
@@ -86,16 +86,16 @@ class Reader(NamedTuple):
     suffixes: tuple[str, ...]
     read: Callable[[Path, Request], Voxels]
     is_this: Callable[[Path], bool] = lambda _path: False
-    shape: Callable[[Path], tuple[int, ...] | None] = lambda _path: None
+    shape: Callable[[Path], Shape | None] = lambda _path: None
     # of a pyramid, the numbers of voxels by the level's folder
-    levels: Callable[[Path], Mapping[str, tuple[int, ...]]] = lambda _path: {}
+    levels: Callable[[Path], Mapping[str, Shape]] = lambda _path: {}
     other_files: Callable[[Path], Sequence[Path]] = lambda _path: ()
     has_spacing: bool = True
     reads_crop: bool = False
     reads_slice: bool = False
 
 
-def volume_index(trailing: Sequence[int], volume: int | None, axes: str = "") -> tuple[int, ...]:
+def volume_index(trailing: Sequence[int], volume: int | None, axes: str = "") -> Shape:
     """Return the index into the axes beyond the third (or beyond a picture's two) for the requested
     volume.
 

@@ -34,7 +34,7 @@ from tetopt.io.volumes import (
     one_line,
     volume_index,
 )
-from tetopt.system.arrays import Floats, Json
+from tetopt.system.arrays import Floats, Json, Shape
 from tetopt.system.budget import check_memory
 from tetopt.system.extras import install_hint
 from tetopt.system.files import folder_written_whole
@@ -80,16 +80,16 @@ class ZarrLevel(NamedTuple):
     folder: Path
     array: Any
     names: tuple[str, ...]  # of all axes
-    space: tuple[int, ...]  # the three spatial axes, in order
+    space: Shape  # the three spatial axes, in order
     affine: Floats  # (4, 4), from indices along these three axes to world, mm
 
     @property
-    def shape(self) -> tuple[int, ...]:
+    def shape(self) -> Shape:
         """Number of voxels along the three spatial axes."""
         return tuple(int(self.array.shape[axis]) for axis in self.space)
 
     @property
-    def others(self) -> tuple[int, ...]:
+    def others(self) -> Shape:
         """The axes that are not spatial."""
         return tuple(axis for axis in range(len(self.names)) if axis not in self.space)
 
@@ -139,7 +139,7 @@ def read_zarr(path: Path, request: Request) -> Voxels:
     return values, shifted_affine(level.affine, [start for start, _ in bounds])
 
 
-def zarr_shape(path: Path) -> tuple[int, ...]:
+def zarr_shape(path: Path) -> Shape:
     """Return the number of voxels along the three spatial axes, then the lengths of the others."""
     level = zarr_levels(path)[0]
     return (*level.shape, *(int(level.array.shape[axis]) for axis in level.others))

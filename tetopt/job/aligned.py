@@ -35,6 +35,7 @@ from tetopt.job.option_values import file_and_volume
 from tetopt.job.options import BoxPart, ImagePart, MaskedPart, SourceOptions
 from tetopt.model.file import MeshFile, count_of_other_voxels, own_mask
 from tetopt.model.label_names import label_words, labels_named
+from tetopt.system.arrays import Shape
 
 # of a mask's or labels' voxels: grids' differences do not explain more outside the image
 OUTSIDE_FRACTION = 0.02
@@ -64,7 +65,7 @@ class Aligned(NamedTuple):
 
     image: Image
     beside: Beside
-    factors: tuple[int, ...]  # parts of the file's voxels along each axis
+    factors: Shape  # parts of the file's voxels along each axis
 
 
 def image_and_others(image: Image, path: Path, part: ImagePart, originals: Originals) -> Aligned:
@@ -121,7 +122,7 @@ def warn_of_other_world(path: Path, other: Path) -> None:
         )
 
 
-def _divisions(image: Image, others: Mapping[Path, Image], across: int | None) -> tuple[int, ...]:
+def _divisions(image: Image, others: Mapping[Path, Image], across: int | None) -> Shape:
     """Return the parts of the image's voxels along each axis, with a message; fewer if there
     would be more than `MOST_DIVIDED`.
 
@@ -154,7 +155,7 @@ def _say_resampled(
     path: Path,
     original: Image,
     moved: Image,
-    shape: tuple[int, ...],
+    shape: Shape,
     *,
     is_contrast: bool,
     is_cropped: bool,

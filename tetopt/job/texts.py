@@ -51,7 +51,7 @@ def with_options(options: RunOptions, texts: dict[str, str]) -> RunOptions:
             raise InputError(f"{name}: not an option of tetopt mesh" + near_hint(name, kinds))
         field, kind = kinds[name]
         try:
-            values[field] = of_option(field, kind, _of_text(get_args(kind)[0], text))
+            values[field] = of_option(field, kind, value_of_text(get_args(kind)[0], text))
         except InputError as error:
             point = text.replace(",", ".")
             is_comma = point != text and re.fullmatch(r"-?[0-9]*\.[0-9]+", point)
@@ -61,16 +61,14 @@ def with_options(options: RunOptions, texts: dict[str, str]) -> RunOptions:
     return replace(options, **values)
 
 
-def _of_text(kind: Any, text: str) -> Any:
+def value_of_text(kind: Any, text: Any) -> Any:
     """Return the value of a kind that a text stands for; the text itself if it stands for none."""
     own = get_args(kind)[0] if get_origin(kind) in (Union, UnionType) else kind
     if own is bool:
         return SWITCH_WORDS.get(text.lower(), text)
     if get_origin(own) is list:
         return [part.strip() for part in text.split(";") if part.strip()] or None
-    if own is int:
-        text = re.sub(r"\.0+$", "", text)  # as spreadsheets write whole numbers
-    if own in (int, float):
-        with suppress(ValueError):
-            return own(text)
+    for convert in (own, float) if own in (int, float) else ():  # 5e3 is a whole number, too
+        with suppress(ValueError, TypeError):
+            return convert(text)
     return text

@@ -66,7 +66,7 @@ from tetopt.model.materials import (
     materials,
 )
 from tetopt.model.model import Model
-from tetopt.model.sets import Box, Sets, box_of, box_text, standard_sets, with_requested
+from tetopt.model.sets import Box, Names, Sets, box_of, box_text, standard_sets, with_requested
 from tetopt.system.arrays import Arrays, Floats, Ints, Json, plain_array
 
 
@@ -428,7 +428,7 @@ class _ModelCells(NamedTuple):
     image: Image | None
     mean: Floats | None  # (M,)
     labels: Ints | None  # (M,)
-    names: dict[int, str]  # of labels
+    names: Names  # of labels
 
 
 def _cells_of(mesh: Mesh, image: Image | None, cell_data: Arrays, about: Json) -> _ModelCells:

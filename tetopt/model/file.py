@@ -26,6 +26,7 @@ from tetopt.model.materials import BinningError
 from tetopt.model.model import STRESS_UNITS, Model, half_turned, scale_load
 from tetopt.model.sets import (
     Box,
+    Names,
     Sets,
     boundary_rows,
     facet_triples,
@@ -261,8 +262,8 @@ def sets_beside(
     box: Box | None,
     fields: Mapping[str, NDArray],
     own: Sets,
-    names: Mapping[int, str],
-    former: Mapping[int, str] | None = None,
+    names: Names,
+    former: Names | None = None,
     kept: Iterable[str] = (),
 ) -> tuple[Sets, dict[str, str]]:
     """Return the standard sets together with the mesh's own, and the new names of own sets, by old

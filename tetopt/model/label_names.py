@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tetopt.contents.labels import BACKGROUND_LABEL, colours_by_number, hex_colour
 from tetopt.errors import InputError, prefix_errors
-from tetopt.model.sets import label_set_names
+from tetopt.model.sets import Names, label_set_names
 from tetopt.system.arrays import Ints
 
 # key in a mesh's file and in a model's `about` for the result of `table_words`
@@ -58,12 +58,12 @@ def count_of_labels(labels: Collection[int], noun: str = "") -> str:
     )
 
 
-def label_words(label: int, names: Mapping[int, str]) -> str:
+def label_words(label: int, names: Names) -> str:
     """Format a label: "5 (liver)", or "5" if it has no name."""
     return f"{label} ({names[label]})" if label in names else f"{label}"
 
 
-def labels_named(text: str, names: Mapping[int, str]) -> list[int]:
+def labels_named(text: str, names: Names) -> list[int]:
     """Return the labels, ascending, that a text refers to: those with this name, or the one whose
     set has this name.
 
@@ -104,7 +104,7 @@ def labels_named(text: str, names: Mapping[int, str]) -> list[int]:
 
 
 def kept_labels(
-    keep: str | None, drop: str | None, present: Sequence[int], names: Mapping[int, str]
+    keep: str | None, drop: str | None, present: Sequence[int], names: Names
 ) -> list[int]:
     """Return the labels, of those present, that stay: those of a text "2,liver", and none of a
     second one.

@@ -6,7 +6,6 @@ Isotropic linear elasticity at the undeformed state, which one modulus per cell,
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
@@ -16,6 +15,7 @@ from tetopt.energy.sampling import ranges_of
 from tetopt.errors import InputError, Remark, warn
 from tetopt.model.label_names import label_words, labels_named
 from tetopt.model.mappings import ByLabel, check_cells, check_nu, check_young
+from tetopt.model.sets import Names
 from tetopt.system.arrays import Floats, Ints
 
 # Poisson's ratio of soft tissue that linear cells still represent: they lock closer to 0.5
@@ -146,7 +146,7 @@ def cells_of(table: Materials) -> list[Ints]:
 
 
 def by_label(
-    mapping: ByLabel, labels: NDArray[np.integer] | None, names: Mapping[int, str] | None = None
+    mapping: ByLabel, labels: NDArray[np.integer] | None, names: Names | None = None
 ) -> Floats:
     """Return the value of each cell by its label, (M,) float64.
 

@@ -22,7 +22,7 @@ from tetopt.geometry.simplex import area_normals, outward_facet_nodes
 from tetopt.geometry.topology import connected_sets, facets, largest_component
 from tetopt.image import Image, transform_vectors
 from tetopt.mesh import Mesh
-from tetopt.system.arrays import Bools, Floats, Ints, Json
+from tetopt.system.arrays import Bools, Floats, Ints, Json, Shape
 
 BOUNDARY_SET = "boundary"  # all facets that belong to only one cell
 MASK_SURFACE_SET = "mask_surface"  # boundary facets that are not on the faces of the image's box
@@ -43,6 +43,9 @@ SET_NAME = re.compile(rf"[A-Za-z][A-Za-z0-9_-]{{0,{MOST_LETTERS - 1}}}")
 # Names that labels must not have: those of other labels, interfaces, and names that formats use
 # themselves.
 RESERVED_NAME = re.compile(r"label_\d+|interface_.*|material_\d+|unnamed|all_cells", re.IGNORECASE)
+
+
+Names = Mapping[int, str]  # of labels
 
 
 class Sets(NamedTuple):
@@ -89,7 +92,7 @@ class Box(NamedTuple):
     True
     """
 
-    shape: tuple[int, ...]
+    shape: Shape
     affine: Floats
 
 
@@ -107,7 +110,7 @@ def facet_triples(cells: Ints, rows: Ints) -> Ints:
     return cells[rows[:, :1], outward_facet_nodes(cells.shape[1] - 1)[rows[:, 1]]]
 
 
-def is_set(values: NDArray, ends: tuple[int, ...]) -> bool:
+def is_set(values: NDArray, ends: Shape) -> bool:
     """Return whether values are ascending rows of integers from 0 to below `ends`."""
     if values.dtype.kind not in "iu":
         return False
@@ -138,7 +141,7 @@ def standard_sets(
     mesh: Mesh,
     box: Box | None = None,
     labels: NDArray[np.integer] | None = None,
-    names: Mapping[int, str] | None = None,
+    names: Names | None = None,
     own: Mapping[str, Ints] | None = None,
 ) -> Sets:
     """Return the standard sets of a mesh.
@@ -185,7 +188,7 @@ def standard_sets(
     )
 
 
-def label_sets(mesh: Mesh, labels: NDArray[np.integer], names: Mapping[int, str]) -> Sets:
+def label_sets(mesh: Mesh, labels: NDArray[np.integer], names: Names) -> Sets:
     """Return the cells of each label, and the facets between two labels, as rows of cells with the
     smaller label.
 
@@ -207,7 +210,7 @@ def label_sets(mesh: Mesh, labels: NDArray[np.integer], names: Mapping[int, str]
     )
 
 
-def label_set_names(labels: Iterable[int], names: Mapping[int, str]) -> dict[int, str]:
+def label_set_names(labels: Iterable[int], names: Names) -> dict[int, str]:
     """Return the name of each label's set of cells: the label's name in letters that all formats
     support, or "label_5".
 
@@ -243,7 +246,7 @@ def _plain_name(name: str) -> str:
 
 
 def interface_names(
-    pairs: Iterable[tuple[int, int]], of_label: Mapping[int, str]
+    pairs: Iterable[tuple[int, int]], of_label: Names
 ) -> dict[tuple[int, int], str]:
     """Return the names of interfaces between labels: "interface_liver_spleen", or by number
     "interface_1_5".

@@ -17,6 +17,7 @@ from tetopt.errors import InputError, prefix_errors
 from tetopt.image import Image
 from tetopt.model.label_names import labels_named
 from tetopt.model.mappings import named_file
+from tetopt.model.sets import Names
 from tetopt.system.arrays import Ints, Json
 from tetopt.system.incoming import rows_of, toml_of
 
@@ -58,7 +59,7 @@ class Merged(NamedTuple):
     numbers: dict[int, int]
 
 
-def merge_labels(labels: Image, merge: str, names: Mapping[int, str] | None = None) -> Merged:
+def merge_labels(labels: Image, merge: str, names: Names | None = None) -> Merged:
     """Merge labels into tissues.
 
     Parameters
@@ -124,7 +125,7 @@ def renumber_labels(labels: Image, numbers: Mapping[int, int]) -> Image:
     return Image(new[np.searchsorted(present, labels.data)], labels.affine)
 
 
-def numbers_by_name(names: Mapping[int, str]) -> dict[int, int]:
+def numbers_by_name(names: Names) -> dict[int, int]:
     """Map each label to the smallest label of the same name, if that is another one."""
     first: dict[str, int] = {}
     for label in sorted(names):
@@ -196,7 +197,7 @@ def _check_groups(rows: list[tuple[str | None, str, tuple[str, ...]]]) -> list[L
 
 
 def _members(
-    groups: list[LabelGroup], names: Mapping[int, str], present: Ints
+    groups: list[LabelGroup], names: Names, present: Ints
 ) -> tuple[dict[int, int], int | None]:
     """Return the number of the group of each label, in ranges of those present, and that of all
     other labels.
@@ -218,7 +219,7 @@ def _members(
     return owner, rest
 
 
-def _labels_of(word: str, names: Mapping[int, str], present: Ints) -> list[int]:
+def _labels_of(word: str, names: Names, present: Ints) -> list[int]:
     """Return the labels that a number, a range or a name refers to."""
     if (match := RANGE.fullmatch(word)) is None:
         with prefix_errors("`merge`"):

@@ -13,6 +13,7 @@ from tetopt.errors import InputError
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
+Shape = tuple[int, ...]  # numbers of voxels along the axes
 Arrays = dict[str, NDArray]  # by name: fields of cells or of nodes
 Json = dict[str, Any]  # an object of JSON, or what one states: values by name
 
