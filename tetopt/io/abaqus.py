@@ -195,16 +195,13 @@ def _law(model: Model, materials: Materials, k: int) -> str:
             else 2
         )
         young = np.unique(np.geomspace(low, high, count).clip(low, high))
-    temperatures = () if model.node_young is None else (_fitting(_temperatures(model, young)),)
-    if not model.is_nonlinear:
-        constants = (young, np.full(len(young), nu))
-        return f"*ELASTIC\n{rows(*map(_fitting, constants), *temperatures, separator=', ')}"
-    # C10 = mu / 2 and D1 = 2 / bulk modulus, so that the response at small strains is the same.
-    constants = (young / (4.0 + 4.0 * nu), 6.0 * (1.0 - 2.0 * nu) / young)
-    return (
-        "*HYPERELASTIC, NEO "
-        f"HOOKE\n{rows(*map(_fitting, constants), *temperatures, separator=', ')}"
-    )
+    temperatures = () if model.node_young is None else (_temperatures(model, young),)
+    law, constants = "*ELASTIC", (young, np.full(len(young), nu))
+    if model.is_nonlinear:
+        # C10 = mu / 2 and D1 = 2 / bulk modulus, so that the response at small strains is the same.
+        law = "*HYPERELASTIC, NEO HOOKE"
+        constants = (young / (4.0 + 4.0 * nu), 6.0 * (1.0 - 2.0 * nu) / young)
+    return f"{law}\n{rows(*map(_fitting, (*constants, *temperatures)), separator=', ')}"
 
 
 def _temperatures(model: Model, young: Floats) -> Floats:

@@ -19,7 +19,6 @@ from tetopt.io.febio import febio
 from tetopt.io.gmsh import gmsh22, gmsh41
 from tetopt.io.medit import medit
 from tetopt.io.mfem import mfem
-from tetopt.io.readback import save_checked
 from tetopt.io.text import file_name, legacy_name, names_apart, plain, short_name
 from tetopt.io.vtk import VTK_SUFFIXES, vtk, vtu
 from tetopt.io.xdmf import xdmf
@@ -30,6 +29,7 @@ from tetopt.model.materials import Materials
 from tetopt.model.model import Model, in_space, in_units, locking_words
 from tetopt.model.sets import MOST_LETTERS, SET_NAME, Sets, is_set
 from tetopt.system.arrays import Arrays, Ints, Json, Shape
+from tetopt.system.files import save_bytes
 
 
 class Format(NamedTuple):
@@ -179,7 +179,7 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
         supported by all formats; data, sets or materials do not fit the mesh. Nothing is written
         then.
     OSError
-        For the reasons of `tetopt.io.readback.save_checked`.
+        For the reasons of `tetopt.system.files.save_bytes`.
 
     Warns
     -----
@@ -201,7 +201,7 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
     ...     tetopt.save_model(name, model)
     """
     path = Path(path)
-    save_checked(path, file_bytes(path, model, space=space, units=units))
+    save_bytes(path, file_bytes(path, model, space=space, units=units))
     if path.suffix.lower() not in VTK_SUFFIXES and (words := locking_words(model)):
         warn(f"{path}: {words}")
 

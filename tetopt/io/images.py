@@ -25,7 +25,6 @@ from tetopt.image import Image
 from tetopt.io.nifti import NIFTI
 from tetopt.io.read_dicom import DICOM
 from tetopt.io.read_itk import ITK
-from tetopt.io.readback import save_checked
 from tetopt.io.stacks import PICTURES, SLICES, check_spacing
 from tetopt.io.volumes import Reader, Request, collect_notes, one_line, plane_affine
 from tetopt.io.zarr_images import (
@@ -36,7 +35,7 @@ from tetopt.io.zarr_images import (
     is_zarr,
     save_zarr,
 )
-from tetopt.system.files import check_suffix
+from tetopt.system.files import check_suffix, save_bytes
 from tetopt.system.incoming import irregular
 
 Bounds = Sequence[tuple[int | None, int | None]]
@@ -221,7 +220,7 @@ def save_image(path: str | Path, image: Image) -> None:
     InputError
         The name has another suffix; the reasons of `save_zarr`.
     OSError
-        For the reasons of `tetopt.io.readback.save_checked`.
+        For the reasons of `tetopt.system.files.save_bytes`.
 
     Examples
     --------
@@ -260,7 +259,7 @@ def save_voxels(path: Path, values: NDArray, image: Image) -> None:
         with gzip.GzipFile("", "wb", GZIP_LEVEL, packed, mtime=0) as stream:
             stream.write(whole)
         whole = packed.getvalue()
-    save_checked(path, whole)
+    save_bytes(path, whole)
 
 
 def _for_file(data: NDArray[np.floating]) -> NDArray:

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 from tetopt.geometry.surface import Surface
 from tetopt.interop.conversions import check_fields
-from tetopt.io.readback import save_checked
 from tetopt.io.text import plain
 from tetopt.io.vtk import LEGACY_VERSION, written_bytes, xml_bytes
 from tetopt.model.model import SPACES, half_turn
 from tetopt.model.sets import MOST_LETTERS, SET_NAME
 from tetopt.system.arrays import simplex_arrays
+from tetopt.system.files import save_bytes
 
 if TYPE_CHECKING:
     import pyvista
@@ -109,7 +109,7 @@ def save_surface(
     if space == "lps":
         surface = surface._replace(points=half_turn(surface.points))
     whole = writers[path.suffix.lower()](surface, f"mm {about}", space, labels)
-    save_checked(path, whole)
+    save_bytes(path, whole)
 
 
 def _check_arrays(path: Path, surface: Surface, labels: Labels | None) -> tuple[Surface, Labels]:

@@ -57,7 +57,7 @@ def plain(text: str) -> str:
     return "".join(
         letter
         if letter.isprintable() or unicodedata.category(letter) == "Zs"
-        else _escape_letter(letter)
+        else letter.encode("unicode_escape").decode("ascii")
         for letter in text
     )
 
@@ -65,10 +65,6 @@ def plain(text: str) -> str:
 def count_text(number: int, noun: str) -> str:
     """Format a number of things."""
     return f"{number} {noun}{'s' * (number != 1)}"
-
-
-def _escape_letter(letter: str) -> str:
-    return letter.encode("unicode_escape").decode("ascii")
 
 
 def last_line(text: str) -> str:

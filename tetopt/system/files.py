@@ -23,6 +23,7 @@ import numpy as np
 
 from tetopt.errors import InputError
 
+COMPARED_BYTES = 2**24  # compared at a time, which limits additional memory
 # letters of an output's name in its temporary name: the name may have the maximum length
 TEMPORARY_LETTERS = 40
 # Errors of folders that cannot be synchronised at all, as on some network file systems.
@@ -323,9 +324,25 @@ def telling(path: Path, n_bytes: int | None = None, folder: Path | None = None) 
 
 
 def save_bytes(path: str | Path, whole: bytes) -> None:
-    """Write a file, whole or not at all; raises the errors of `written_whole`."""
+    """Write a file, whole or not at all, and compare it with what reads back before it takes its
+    name.
+
+    Raises
+    ------
+    OSError
+        For the reasons of `written_whole`; the file reads back differently.
+    """
     with written_whole(Path(path), len(whole)) as temporary:
         temporary.write_bytes(whole)
+        with temporary.open("rb") as file:
+            starts = range(0, len(whole) + 1, COMPARED_BYTES)
+            is_same = all(
+                file.read(COMPARED_BYTES) == whole[at : at + COMPARED_BYTES] for at in starts
+            )
+        if not is_same:
+            raise OSError(
+                errno.EIO, "the file reads back differently from what was written; check the disk"
+            )
 
 
 def save_text(path: str | Path, text: str) -> None:

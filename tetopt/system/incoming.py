@@ -90,7 +90,8 @@ def text_of(path: str | Path, noun: str) -> str:
         raise InputError(f"{path}: cannot be read ({error.strerror}); expected a {noun}") from error
     if len(raw) > TEXT_BYTES:
         raise InputError(
-            f"{path}: expected a {noun} of at most {TEXT_BYTES / 1e6:.0f} MB, got {_size(path)}"
+            f"{path}: expected a {noun} of at most {TEXT_BYTES / 1e6:.0f} MB, got "
+            f"{path.stat().st_size / 1e6:.0f} MB"
         )
     try:
         return raw.decode("utf-8-sig")
@@ -195,7 +196,3 @@ def _whole_numbers(value: Any) -> Iterator[int]:
 def _short(error: Exception) -> str:
     words = " ".join(str(error).split())
     return words if len(words) <= 200 else f"{words[:197]}..."  # 200: a line or two of a terminal
-
-
-def _size(path: Path) -> str:
-    return f"{path.stat().st_size / 1e6:.0f} MB"
