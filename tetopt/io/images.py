@@ -11,10 +11,9 @@ import io
 import math
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import nibabel
 import numpy as np
@@ -419,20 +418,21 @@ def sha256(path: str | Path) -> str:
     path = Path(path)
     digest = hashlib.sha256()
     with errors_named(path):
-        if is_zarr(path):
-            return folder_checksum(path, lambda _: True)
-        for file in image_files(path):
-            _digest_file(digest, file)
+        has_names = is_zarr(path)
+        for name, file in image_files(path).items():
+            if has_names:
+                digest.update(f"{name}\0{file.stat().st_size}\0".encode("utf-8", "surrogateescape"))
+            with file.open("rb") as stream:
+                hashlib.file_digest(stream, lambda: digest)
     return digest.hexdigest()
 
 
 def status_checksum(path: str | Path) -> str:
     """Return a SHA-256 that changes with an image, without reading its voxels.
 
-    For a Zarr folder it covers names, lengths and modification times of all files, and the contents
-    of metadata files. For a file, and the data files of a header, it covers name, length and
-    modification time. Two copies of an image have different checksums; `sha256` is the same for
-    both, but takes as long as reading them.
+    It covers names, lengths and modification times of all files that `sha256` reads. Two copies of
+    an image have different checksums; `sha256` is the same for both, but takes as long as reading
+    them.
 
     Raises
     ------
@@ -441,45 +441,44 @@ def status_checksum(path: str | Path) -> str:
     """
     path = Path(path)
     with errors_named(path):
-        if is_zarr(path):
-            return folder_checksum(path, lambda file: file.name in METADATA_FILES)
-        words = []
-        for file in image_files(path):
-            status = file.stat()
-            words.append(f"{file.name}\0{status.st_size}\0{status.st_mtime_ns}\0")
-    return hashlib.sha256("".join(words).encode("utf-8", "surrogateescape")).hexdigest()
+        status = ((name, file.stat()) for name, file in image_files(path).items())
+        words = "".join(f"{name}\0{each.st_size}\0{each.st_mtime_ns}\0" for name, each in status)
+    return hashlib.sha256(words.encode("utf-8", "surrogateescape")).hexdigest()
 
 
-def image_files(path: Path) -> list[Path]:
-    """Return the files of an image other than Zarr: the file itself with the data files of a
-    header or the other one of a pair, or those in a folder.
+def image_files(path: Path) -> dict[str, Path]:
+    """Return the files of an image by name: the file itself with the data files of a header or the
+    other one of a pair, or those in a folder; for Zarr also those in its subfolders.
 
     Raises
     ------
     InputError
-        With the path: it is neither a regular file nor a folder.
+        With the path: one is neither a regular file nor a folder.
     """
-    if (other := irregular(path)) not in (None, "a folder"):
-        raise InputError(
-            f"{path}: expected a regular file, got {other}; copy its content into a file"
-        )
+    if is_zarr(path):
+        return _zarr_files(path)
+    _check_regular(path, (None, "a folder"))
     # A DICOM series is read from the folder itself, not from its subfolders; so is its checksum.
     files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
     with contextlib.suppress(InputError):  # an unreadable header has no other files
         for reader in _named_readers(path):
             files += reader.other_files(path)
-    return files
+    return {file.name: file for file in files}
 
 
-def folder_checksum(path: Path, is_read: Callable[[Path], bool]) -> str:
-    """Return the SHA-256 of the relative names, lengths and contents of all files in a folder, in
-    order.
+def _check_regular(path: Path, kinds: Sequence[str | None] = (None,)) -> None:
+    if (other := irregular(path)) not in kinds:
+        raise InputError(
+            f"{path}: expected a regular file, got {other}; copy its content into a file"
+        )
 
-    For files that are not read, by `is_read`, the time of their last change replaces their
-    contents. Links are followed, but no folder is visited twice. For a level of an OME-Zarr image,
-    the image's metadata count, too.
+
+def _zarr_files(path: Path) -> dict[str, Path]:
+    """Return all files in a folder by their relative names, in order.
+
+    Links are followed, but no folder is visited twice. For a level of an OME-Zarr image, the
+    image's metadata count, too.
     """
-    digest = hashlib.sha256()
     known = set()
     files: dict[str, Path] = {}
     for folder, folders, names in os.walk(path, followlinks=True, onerror=_raise_error):
@@ -494,23 +493,9 @@ def folder_checksum(path: Path, is_read: Callable[[Path], bool]) -> str:
         }
     if (image := image_folder(path)) is not None:
         files |= {f"../{name}": image / name for name in METADATA_FILES if (image / name).exists()}
-    for name, file in sorted(files.items()):
-        if (other := irregular(file)) is not None:
-            raise InputError(
-                f"{file}: expected a regular file, got {other}; copy its content into a file"
-            )
-        status = file.stat()
-        digest.update(f"{name}\0{status.st_size}\0".encode("utf-8", "surrogateescape"))
-        if is_read(file):
-            _digest_file(digest, file)
-        else:
-            digest.update(f"{status.st_mtime_ns}\0".encode())
-    return digest.hexdigest()
-
-
-def _digest_file(digest: Any, file: Path) -> None:
-    with file.open("rb") as stream:
-        hashlib.file_digest(stream, lambda: digest)
+    for file in files.values():
+        _check_regular(file)
+    return dict(sorted(files.items()))
 
 
 def _raise_error(error: OSError) -> None:
@@ -551,8 +536,7 @@ def _named_readers(path: Path) -> list[Reader]:
 
 def _check_beginning(path: Path) -> None:
     """Raise InputError if the first bytes of a file do not fit its format."""
-    if (other := irregular(path)) is not None:
-        raise InputError(f"expected a regular file, got {other}; copy its content into a file")
+    _check_regular(path)
     with path.open("rb") as stream:
         beginning = stream.read(BEGINNING_BYTES)
     if not beginning:
