@@ -236,7 +236,7 @@ def test_options_of_a_row_replace_those_of_all():
     ("texts", "words"),
     [
         ({"nods": "1"}, "did you mean nodes"),
-        ({"nodes": "1e3"}, "`nodes`: expected a whole number, got .1e3."),
+        ({"nodes": "1.5"}, "`nodes`: expected a whole number, got 1.5"),
         ({"nonlinear": "maybe"}, "expected True or False"),
         ({"iterations": "-1"}, "`iterations`: expected 0 or more"),
         ({"method": "Fast"}, "expected fast or paper, got .Fast."),
