@@ -135,7 +135,7 @@ measured: $(VENV)/.test
 
 # Whether meshes are still those of the version that wrote tests/fingerprints.json, to the last bit.
 fingerprints: $(VENV)/.test
-	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python benchmarks/fingerprints.py -o fingerprints.json --against tests/fingerprints.json --force
+	PYTHONPATH=scripts NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python benchmarks/fingerprints.py -o fingerprints.json --against tests/fingerprints.json --force
 
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

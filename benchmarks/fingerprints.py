@@ -1,8 +1,8 @@
 """Checksums of meshes over the ground that tetopt covers: the same before and after a change that
 is to change nothing.
 
-    python benchmarks/fingerprints.py -o new.json [--against tests/fingerprints.json] [--only
-    NAME ...]
+    PYTHONPATH=scripts python benchmarks/fingerprints.py -o new.json
+        [--against tests/fingerprints.json] [--only NAME ...]
 
 Each row is one run of the command: the sha256 of its points and cells, and of its whole file. They
 are the same on any number of threads. Between kinds of processors, or versions of numpy and scipy,
@@ -25,9 +25,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+from paper.tissue import mni_tissue
 
 import tetopt
-from tetopt.io.mni import mni_path, mni_tissue
+from tetopt.io.mni import mni_path
 from tetopt.report.summary import versions
 from tetopt.system.files import check_output, save_json
 

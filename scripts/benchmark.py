@@ -23,9 +23,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from paper.tissue import mni_tissue
 
 import tetopt
-from tetopt.io.mni import mni_path, mni_tissue
+from tetopt.io.mni import mni_path
 from tetopt.report.summary import versions
 from tetopt.start.label_sizes import parse_label_sizes
 from tetopt.system.files import check_output, save_json

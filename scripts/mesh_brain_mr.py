@@ -15,13 +15,14 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from paper.scenes import structure_before_slices
 
 import tetopt
 from tetopt.engine.loop import IterationRecord
 from tetopt.geometry.topology import boundary_facets, components, facets
 from tetopt.io.images import sha256
 from tetopt.report.figures import save_run_figures
-from tetopt.report.scene import save_scenes, structure_before_slices
+from tetopt.report.scene import save_scenes
 from tetopt.report.summary import run_summary
 from tetopt.system.files import check_output, save_json, written_whole
 
@@ -98,7 +99,9 @@ def _run(options: argparse.Namespace) -> int:
     save_run_figures(figures, image, initial, result)
     save_scenes(picture_path, [("", structure_before_slices(image, mesh, structure))])
     volume = float(fields["volume"][structure].sum())
-    summary = run_summary(image, initial, result, about, {"all": result.history[-1].seconds})
+    shapes = tuple(tetopt.quality(each.points, each.cells) for each in (initial, mesh))
+    seconds = {"all": result.history[-1].seconds}
+    summary = run_summary(image, initial, result, about, seconds, shapes)
     pinches = int((np.unique(surface.edges_sorted, axis=0, return_counts=True)[1] > 2).sum())
     summary["structure"] = {
         "n_cells": len(structure),

@@ -12,7 +12,7 @@ LONGEST_FILES = (
     "hostile/test_hostile.py",
     "test_cli_domains.py",
     "test_cli.py",
-    "study/test_paper_files.py",
+    "test_reproduce_paper.py",
     "start/test_sizes.py",
     "test_workers.py",
     "io/test_zarr_chunks.py",

@@ -13,6 +13,13 @@ import numpy as np
 
 from paper import experiments
 from paper.figures import landscape_figure, relaxation_figure
+from paper.scenes import (
+    dark_structure_surface,
+    isosurface_before_slices,
+    slices_in_mesh,
+    structure_before_slices,
+)
+from paper.tissue import mni_tissue
 from tetopt.commands.beside import image_and_labels
 from tetopt.contents.labels import check_labels
 from tetopt.contents.phantom import load_phantom
@@ -22,20 +29,14 @@ from tetopt.geometry.simplex import rho
 from tetopt.geometry.topology import largest_component
 from tetopt.image import Image
 from tetopt.io.images import sha256
-from tetopt.io.mni import mni_path, mni_tissue
+from tetopt.io.mni import mni_path
 from tetopt.job.events import note
 from tetopt.job.options import WHOLE_BOX
 from tetopt.measure.segmentation import dice, segment, threshold_image
 from tetopt.mesh import Mesh
 from tetopt.report.figures import save_figure, slice_figure
 from tetopt.report.page import render_page, write_page
-from tetopt.report.scene import (
-    dark_structure_surface,
-    isosurface_before_slices,
-    save_scenes,
-    slices_in_mesh,
-    structure_before_slices,
-)
+from tetopt.report.scene import save_scenes
 from tetopt.report.summary import versions
 from tetopt.system.files import check_outputs, results_folder, save_json
 

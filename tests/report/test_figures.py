@@ -45,14 +45,17 @@ from tetopt.report.tables import nodes_in_words
 from tetopt.report.thumbnail import thumbnail_png
 from tetopt.start.lattice import lattice_mesh
 
-DOLLARS = LabelTable({1: r"5 $\frac$ and a_b"}, {})
 SHAPE = (5, 7, 9)
 SPACING = (2.0, 1.0, 3.0)
 OBLIQUE = np.array(
     [[-0.75, 0.31, 1.1, 12.5], [0.12, 0.68, -0.9, -33.0], [0.05, -0.22, 5.1, 7.25], [0, 0, 0, 1.0]]
 )
-SHEARED = np.array([[-2.0, 0.5, 1.0], [0.3, 1.0, 5.0], [0, 0, 1.0]])
 WORLD_LETTERS = ["LR", "PA", "IS"]
+# of 48: the world axis that each voxel axis runs along, and in which direction
+ORIENTATIONS = [(w, s) for w in permutations(range(3)) for s in product((1, -1), repeat=3)][::5]
+each_orientation = pytest.mark.parametrize(("worlds", "signs"), ORIENTATIONS)
+some_orientations = pytest.mark.parametrize(("worlds", "signs"), ORIENTATIONS[::3])
+each_dimension = pytest.mark.parametrize("n", [2, 3])
 
 
 def noise(shape, affine=None):
@@ -60,28 +63,30 @@ def noise(shape, affine=None):
     return Image(np.random.default_rng(0).normal(size=shape), affine)
 
 
+def spaced(n):
+    return noise(SHAPE[:n], np.diag([*SPACING[:n], 1.0]))
+
+
 def oriented_image(worlds, signs):
     """Noise whose voxel axis a runs along world axis worlds[a], in the direction signs[a]."""
-    affine = np.eye(4)
-    affine[:3, :3] = 0.0
-    for axis, (world, sign) in enumerate(zip(worlds, signs, strict=True)):
-        affine[world, axis] = sign * SPACING[axis]
-    affine[:3, 3] = [11.0, -22.0, 33.0]
-    return noise(SHAPE, affine)
+    n = len(worlds)
+    affine = np.zeros((n + 1, n + 1))
+    affine[worlds, range(n)] = np.multiply(signs, SPACING[:n])
+    affine[:, n] = [*(11.0, -22.0, 33.0)[:n], 1.0]
+    return noise(SHAPE[:n], affine)
 
 
-def image_steps(image, view):
-    """Size of the picture's pixels in mm."""
-    return image.spacing[view.axes]
+def middle_view(image):
+    return SliceView(image, None, None)
 
 
-# of 48
-ORIENTATIONS = [(w, s) for w in permutations(range(3)) for s in product((1, -1), repeat=3)][::5]
+def lattice(image, blocks=(2, 2, 2), *kind):
+    return lattice_mesh(image, *kind, blocks=blocks[: image.ndim])
 
 
-def bent(image, blocks):
+def bent(image, blocks=(2, 3, 2)):
     """A lattice of the image's box with its inner nodes moved; the box stays covered."""
-    mesh = lattice_mesh(image, blocks=blocks)
+    mesh = lattice(image, blocks)
     index = image.to_index(mesh.points)
     is_inside = ((index > -0.4) & (index < np.array(image.shape) - 0.6)).all(axis=1)
     index[is_inside] += np.random.default_rng(1).uniform(-0.2, 0.2, (is_inside.sum(), image.ndim))
@@ -102,40 +107,61 @@ def contains(polygon, point):
     return bool((side > 1e-9).all() or (side < -1e-9).all())
 
 
+def drawn(axes, kind=PolyCollection):
+    return [each for each in axes.collections if isinstance(each, kind)]
+
+
+def assert_drawn(collection, polygons):
+    middles = [path.vertices[:-1].mean(axis=0) for path in collection.get_paths()]
+    assert_allclose(middles, polygons.mean(axis=1))
+
+
+def assert_pixels(axes, view):
+    """The slice of the view, as large as it is."""
+    assert_array_equal(axes.images[0].get_array(), view.pixels.T)
+    assert axes.images[0].get_extent() == [0.0, view.size[0], 0.0, view.size[1]]
+    assert axes.images[0].origin == "lower"
+
+
+def texts(parts):
+    return [part.get_text() for part in parts]
+
+
 # --------------------------------------------------------------------------------------------------
 # Sides and places
 
 
-@pytest.mark.parametrize(("worlds", "signs"), ORIENTATIONS)
+def assert_in_place(view, horizontal, vertical):
+    """Pixels are the slice's voxels in rising order of two coordinates of their world places."""
+    image = view.image
+    index = np.array(list(np.ndindex(image.shape)))
+    if view.across is not None:
+        index = index[index[:, view.across] == view.index]
+    x, y = image.to_world(index).T[[horizontal, vertical]]
+    assert_array_equal(view.pixels.ravel(), image.data[tuple(index[np.lexsort((y, x))].T)])
+    assert_allclose(view.size, [np.ptp(x), np.ptp(y)] + image.spacing[view.axes])
+
+
+@each_orientation
 @pytest.mark.parametrize("normal", [0, 1, 2])
 def test_pixels_lie_where_the_letters_say(worlds, signs, normal):
     """Sagittal, coronal, axial: right of the patient's left, up from posterior or inferior."""
-    image = oriented_image(worlds, signs)
-    view = SliceView(image, axis=worlds.index(normal), index=3)
-    horizontal, vertical = (w for w in range(3) if w != normal)
+    view = SliceView(oriented_image(worlds, signs), axis=worlds.index(normal), index=3)
+    horizontal, vertical = np.delete(range(3), normal)
     assert view.letters == [WORLD_LETTERS[horizontal], WORLD_LETTERS[vertical]]
-    # The world place of every voxel in the slice, and its value, put in rising order of the two
-    # coordinates.
-    index = np.array([i for i in np.ndindex(SHAPE) if i[view.across] == 3])
-    place = image.to_world(index)
-    order = np.lexsort((place[:, vertical], place[:, horizontal]))
-    assert np.ptp(place[:, normal]) == 0.0
-    assert_array_equal(view.pixels.ravel(), image.data[tuple(index[order].T)])
-    assert_allclose(
-        view.size, np.ptp(place[:, (horizontal, vertical)], axis=0) + image_steps(image, view)
-    )
+    assert_in_place(view, horizontal, vertical)
 
 
-@pytest.mark.parametrize(("worlds", "signs"), ORIENTATIONS)
+@each_orientation
 def test_the_default_slice_is_axial_and_in_the_middle(worlds, signs):
-    view = SliceView(oriented_image(worlds, signs), None, None)
+    view = middle_view(oriented_image(worlds, signs))
     assert view.across == worlds.index(2)
     assert view.index == SHAPE[view.across] // 2
 
 
 def test_an_oblique_image_is_laid_out_by_its_nearest_axes():
     image = noise(SHAPE, OBLIQUE)
-    view = SliceView(image, None, None)
+    view = middle_view(image)
     assert (view.across, view.axes, view.letters) == (2, [0, 1], ["LR", "PA"])
     # the first axis runs to the left
     assert_array_equal(view.pixels, image.data[::-1, :, 4])
@@ -145,40 +171,27 @@ def test_an_oblique_image_is_laid_out_by_its_nearest_axes():
 @pytest.mark.parametrize("signs", list(product((1, -1), repeat=2)))
 @pytest.mark.parametrize("worlds", [(0, 1), (1, 0)])
 def test_a_2d_image_has_x_to_the_right_and_y_up(worlds, signs):
-    affine = np.eye(3)
-    affine[:2, :2] = 0.0
-    for axis in range(2):
-        affine[worlds[axis], axis] = signs[axis] * SPACING[axis]
-    image = noise((5, 7), affine)
-    view = SliceView(image, None, None)
-    index = np.array(list(np.ndindex(5, 7)))
-    place = image.to_world(index)
-    order = np.lexsort((place[:, 1], place[:, 0]))
-    assert_array_equal(view.pixels.ravel(), image.data[tuple(index[order].T)])
+    view = middle_view(oriented_image(worlds, signs))
+    assert_in_place(view, 0, 1)
     assert view.letters == ["", ""]
 
 
-@pytest.mark.parametrize(("worlds", "signs"), ORIENTATIONS[::3])
+@some_orientations
 def test_cells_and_pixels_share_their_places(worlds, signs):
     """The polygon around a pixel's centre is of the cell that holds the voxel."""
     image = oriented_image(worlds, signs)
     mesh = bent(image, (3, 3, 2))
-    view = SliceView(image, None, None)
+    view = middle_view(image)
     polygons, cells = view.section(mesh)
     is_wide = areas(polygons) > 1e-9
-    polygons, cells = polygons[is_wide], cells[is_wide]
-    owner = SliceView(Image(cell_of_voxel(image, mesh), image.affine), None, None).pixels
-    steps = image_steps(image, view)
+    owner = middle_view(Image(cell_of_voxel(image, mesh), image.affine)).pixels
     n_inside = 0
     for pixel in np.ndindex(owner.shape):
-        point = (np.array(pixel) + 0.5) * steps
-        around = [
-            cell for polygon, cell in zip(polygons, cells, strict=True) if contains(polygon, point)
-        ]
-        assert len(around) <= 1
-        if around:
+        point = (np.array(pixel) + 0.5) * image.spacing[view.axes]
+        around = cells[is_wide][[contains(polygon, point) for polygon in polygons[is_wide]]]
+        if len(around):
             n_inside += 1
-            assert around == [owner[pixel]]
+            assert around.tolist() == [owner[pixel]]
     assert n_inside > 0.9 * owner.size
 
 
@@ -194,31 +207,29 @@ def test_cells_and_pixels_share_their_places(worlds, signs):
 def test_a_section_tiles_the_slice(affine, kind, axis):
     image = noise((8, 9, 10), affine)
     # 9 voxels in 3 blocks: the planes of nodes at index 2.5 and 5.5; 8 and 10 in 2: at 3.5 and 4.5.
-    mesh = bent(image, (2, 3, 2)) if kind == "bent" else lattice_mesh(image, kind, blocks=(2, 3, 2))
+    mesh = bent(image) if kind == "bent" else lattice(image, (2, 3, 2), kind)
     for index in range(image.shape[axis]):
-        polygons, cells = SliceView(image, axis, index).section(mesh)
-        size = np.delete(image.spacing * image.shape, axis)
-        assert areas(polygons).sum() == pytest.approx(size.prod(), rel=1e-12)
+        view = SliceView(image, axis, index)
+        polygons, cells = view.section(mesh)
+        assert areas(polygons).sum() == pytest.approx(np.prod(view.size), rel=1e-12)
         assert polygons.min() >= -1e-9
-        assert (
-            polygons.max(axis=(0, 1)) <= np.array(SliceView(image, axis, index).size) + 1e-9
-        ).all()
+        assert (polygons.max(axis=(0, 1)) <= np.array(view.size) + 1e-9).all()
         assert len(np.unique(cells)) == len(cells)
 
 
+@pytest.mark.parametrize("kind", ["bcc", "five-tet"])
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_section_through_a_plane_of_nodes_tiles_it_once(axis):
+def test_a_section_through_a_plane_of_nodes_tiles_it_once(kind, axis):
     """7 voxels in 2 blocks: the middle voxel's plane is a plane of nodes, and of facets."""
     image = noise((7, 7, 7))
-    for kind in ("bcc", "five-tet"):
-        polygons, _ = SliceView(image, axis, 3).section(lattice_mesh(image, kind, blocks=(2, 2, 2)))
-        assert areas(polygons).sum() == pytest.approx(49.0, rel=1e-12)
+    polygons, _ = SliceView(image, axis, 3).section(lattice(image, (2, 2, 2), kind))
+    assert areas(polygons).sum() == pytest.approx(49.0, rel=1e-12)
 
 
 def test_a_2d_mesh_is_shown_whole():
-    image = noise((6, 7), SHEARED)
-    mesh = bent(image, (2, 3))
-    polygons, cells = SliceView(image, None, None).section(mesh)
+    image = noise((6, 7), np.array([[-2.0, 0.5, 1.0], [0.3, 1.0, 5.0], [0, 0, 1.0]]))
+    mesh = bent(image)
+    polygons, cells = middle_view(image).section(mesh)
     assert_array_equal(cells, np.arange(len(mesh.cells)))
     assert areas(polygons).sum() == pytest.approx((image.spacing * image.shape).prod(), rel=1e-12)
 
@@ -227,65 +238,49 @@ def test_a_2d_mesh_is_shown_whole():
 # The slice figure
 
 
-def collections(axes):
-    return [c for c in axes.collections if isinstance(c, PolyCollection)]
-
-
-def corners(collection):
-    """Sum over a collection of each polygon's corners; closing points left out."""
-    return np.array([path.vertices[:-1].mean(axis=0) for path in collection.get_paths()])
-
-
-@pytest.mark.parametrize("n", [2, 3])
+@each_dimension
 def test_slice_figure_holds_each_mesh_under_its_title(n):
-    image = noise(SHAPE[:n], np.diag([*SPACING[:n], 1.0]))
-    first, second = lattice_mesh(image, blocks=(2, 2, 2)[:n]), bent(image, (2, 3, 2)[:n])
-    figure = slice_figure(image, [("first", first), ("second", second)])
-    view = SliceView(image, None, None)
-    grid = np.array(figure.axes).reshape(2, 2)
-    for column, (title, mesh) in enumerate([("first", first), ("second", second)]):
-        over, flat = grid[:, column]
+    image = spaced(n)
+    meshes = [("first", lattice(image)), ("second", bent(image))]
+    view = middle_view(image)
+    grid = np.array(slice_figure(image, meshes).axes).reshape(2, 2)
+    for (over, flat), (title, mesh) in zip(grid.T, meshes, strict=True):
         polygons, cells = view.section(mesh)
         assert over.get_title() == title
-        assert_array_equal(over.images[0].get_array(), view.pixels.T)
-        assert over.images[0].get_extent() == [0.0, view.size[0], 0.0, view.size[1]]
-        assert over.images[0].origin == "lower"
-        assert_allclose(corners(collections(over)[0]), polygons.mean(axis=1))
-        assert_allclose(corners(collections(flat)[0]), polygons.mean(axis=1))
-        assert_array_equal(collections(flat)[0].get_array(), cell_moments(image, mesh).mean[cells])
-        assert collections(flat)[0].get_clim() == over.images[0].get_clim()
+        assert_pixels(over, view)
+        for axes in (over, flat):
+            assert_drawn(drawn(axes)[0], polygons)
+        means = drawn(flat)[0]
+        assert_array_equal(means.get_array(), cell_moments(image, mesh).mean[cells])
+        assert means.get_clim() == over.images[0].get_clim()
 
 
 def test_letters_stand_on_their_sides():
     image = oriented_image((2, 0, 1), (-1, 1, -1))
-    figure = slice_figure(image, [("", lattice_mesh(image, blocks=(1, 1, 1)))])
-    assert len(figure.axes) == 2
-    for axes in figure.axes:
+    over, flat = slice_figure(image, [("", lattice(image))]).axes
+    for axes in (over, flat):
         sides = {text.get_text(): text.get_position() for text in axes.texts}
         assert sides == {"L": (0.02, 0.5), "R": (0.98, 0.5), "P": (0.5, 0.02), "A": (0.5, 0.98)}
-        assert axes.get_xlim() == (0.0, 7.0)  # x is the second axis, of 1 mm; y the third, of 3
-        assert axes.get_ylim() == (0.0, 27.0)
+        # x is the second axis, of 1 mm; y the third, of 3
+        assert (axes.get_xlim(), axes.get_ylim()) == ((0.0, 7.0), (0.0, 27.0))
         assert axes.get_aspect() == 1.0
 
 
 def lower_part(image, axis, count):
     """A lattice that covers the first `count` voxels along an axis only."""
-    part = np.take(image.data, range(count), axis=axis)
-    return lattice_mesh(Image(part, image.affine), blocks=(2, 2, 2)[: image.ndim])
+    return lattice(Image(np.take(image.data, range(count), axis=axis), image.affine))
 
 
-@pytest.mark.parametrize("n", [2, 3])
+@each_dimension
 def test_nothing_is_drawn_where_a_mesh_leaves_the_image_uncovered(n):
-    image = noise(SHAPE[:n], np.diag([*SPACING[:n], 1.0]))
-    figure = slice_figure(image, [("part", lower_part(image, 0, 2))])
-    for axes in figure.axes:
-        (drawn,) = collections(axes)
-        polygons = np.concatenate([path.vertices for path in drawn.get_paths()])
-        assert_allclose(
-            [polygons.min(axis=0), polygons.max(axis=0)], [[0.0, 0.0], [4.0, 7.0]], atol=1e-9
-        )
+    image = spaced(n)
+    over, flat = slice_figure(image, [("part", lower_part(image, 0, 2))]).axes
+    for axes in (over, flat):
+        polygons = np.concatenate([path.vertices for path in drawn(axes)[0].get_paths()])
+        ends = polygons.min(axis=0), polygons.max(axis=0)
+        assert_allclose(ends, [[0.0, 0.0], [4.0, 7.0]], atol=1e-9)
         assert axes.get_xlim() == (0.0, 10.0)  # the whole image stays in view
-    assert figure.axes[1].get_facecolor() == to_rgba(UNCOVERED_COLOUR)
+    assert flat.get_facecolor() == to_rgba(UNCOVERED_COLOUR)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -313,11 +308,8 @@ TO_XYZ = [
 def cielab(colours, seen):
     """CIELAB (K, 3) of sRGB colours as seen with given cones."""
     linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
-    xyz = (
-        np.clip(linear @ np.transpose(seen), 0.0, 1.0)
-        @ np.transpose(TO_XYZ)
-        / [0.95047, 1.0, 1.08883]
-    )
+    light = np.clip(linear @ np.transpose(seen), 0.0, 1.0)
+    xyz = light @ np.transpose(TO_XYZ) / [0.95047, 1.0, 1.08883]
     x, y, z = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16.0 / 116.0).T
     return np.column_stack([116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z)])
 
@@ -335,27 +327,22 @@ def test_colours_are_told_apart_by_the_colour_blind(seen):
 
 def test_a_label_has_one_colour_whatever_else_is_there():
     """So that the cells' labels look as the voxels', and a subject's as another's; in the file's
-    table, too.
+    table, too. A label keeps a colour of its own, the background does not.
     """
-    few, many = (label_colours(np.arange(n)) for n in (8, 10))
-    assert (few.shape, many.shape) == ((8, 3), (10, 3))
-    assert_array_equal(few, many[:8])
-    assert_array_equal(many, to_rgba_array([BACKGROUND_COLOUR, *LABEL_PALETTE[:9]])[:, :3])
-    words = table_words(colour_labels(LabelTable({}, {2: (1.0, 0.0, 0.0)}), np.array([0, 7, 2, 7])))
-    assert words == {
+    palette = to_rgba_array([BACKGROUND_COLOUR, *LABEL_PALETTE])[:, :3]
+    for n in (8, 10):
+        assert_array_equal(label_colours(np.arange(n)), palette[:n])
+    own = {0: (0.0, 0.0, 0.0), 2: (0.1, 0.2, 0.3), 9: (1, 1, 1)}
+    labels = np.array([0, 1, 2, 5, 7])
+    expected = palette[labels]
+    expected[2] = own[2]
+    assert_array_equal(label_colours(labels, own), expected)
+    table = LabelTable({}, {0: (0.0, 0.0, 0.0), 2: (1.0, 0.0, 0.0)})
+    assert table_words(colour_labels(table, np.array([0, 7, 2, 7]))) == {
         "0": {"colour": BACKGROUND_COLOUR},
         "2": {"colour": "#ff0000"},
         "7": {"colour": LABEL_PALETTE[6]},
     }
-    black = colour_labels(LabelTable({}, {0: (0.0, 0.0, 0.0)}), np.array([0, 7]))
-    assert table_words(black)["0"] == {"colour": BACKGROUND_COLOUR}
-
-
-def test_labels_keep_colours_of_their_own_but_the_background():
-    labels = np.array([0, 1, 2, 5, 7])
-    colours = label_colours(labels, {0: (0, 0, 0), 2: (0.1, 0.2, 0.3), 9: (1, 1, 1)})
-    assert_array_equal(colours[2], [0.1, 0.2, 0.3])
-    assert_array_equal(np.delete(colours, 2, axis=0), np.delete(label_colours(labels), 2, axis=0))
 
 
 def test_colours_begin_again_in_other_tints():
@@ -368,21 +355,19 @@ def test_colours_begin_again_in_other_tints():
 
 def test_a_legend_lists_the_largest_and_counts_the_others():
     shown = np.array([50, 0, *range(1, LISTED_LABELS + 2)])  # 0, 2 .. 14; the least are 2 and 3
-    colours = np.random.default_rng(0).uniform(size=(20, 3))
-    entries = legend_patches(np.arange(len(shown)), colours, shown)
-    assert [entry.get_label() for entry in entries] == [
-        *(str(k) for k in (0, *range(4, 15))),
-        "and 2 more",
-    ]
+    numbers, colours = np.arange(len(shown)), np.random.default_rng(0).uniform(size=(20, 3))
+    names = {4: "left lung", 1: "not shown"}
+    entries = legend_patches(numbers, colours, shown, names)
+    labels = ["0", "4 left lung", *map(str, range(5, 15)), "and 2 more"]
+    assert [entry.get_label() for entry in entries] == labels
     assert entries[1].get_facecolor() == (*colours[4], 1.0)
-    dollars = label_figure(
-        blocks_of_labels(2), lattice_mesh(blocks_of_labels(2), blocks=(2, 2, 2)), table=DOLLARS
-    )
-    FigureCanvasAgg(dollars).draw()  # which would parse a formula
-    named = legend_patches(np.arange(len(shown)), colours, shown, {4: "left lung", 1: "not shown"})
-    assert [entry.get_label() for entry in named[:3]] == ["0", "4 left lung", "5"]
-    entries = legend_patches(np.arange(len(shown) - 2), colours, shown[:-2])
+    entries = legend_patches(numbers[:-2], colours, shown[:-2])
     assert [entry.get_label() for entry in entries] == [str(k) for k in (0, *range(2, 13))]
+
+
+def test_a_name_is_no_formula():
+    labels, table = blocks_of_labels(2), LabelTable({1: r"5 $\frac$ and a_b"}, {})
+    FigureCanvasAgg(label_figure(labels, lattice(labels), table=table)).draw()
 
 
 def blocks_of_labels(n_labels, worlds=(0, 1, 2), signs=(1, 1, 1)):
@@ -393,7 +378,7 @@ def blocks_of_labels(n_labels, worlds=(0, 1, 2), signs=(1, 1, 1)):
     return Image(np.repeat(np.arange(n_labels), 2)[:, None, None] + np.zeros((1, 7, 9)), affine)
 
 
-@pytest.mark.parametrize(("worlds", "signs"), ORIENTATIONS[::3])
+@some_orientations
 def test_voxels_and_cells_have_the_same_colours(worlds, signs):
     labels = blocks_of_labels(4, worlds, signs)
     mesh = bent(labels, (3, 3, 2))
@@ -404,54 +389,47 @@ def test_voxels_and_cells_have_the_same_colours(worlds, signs):
         assert_array_equal(left.images[0].get_array(), colours[view.pixels.T.astype(int)])
         assert left.images[0].get_extent() == [0.0, view.size[0], 0.0, view.size[1]]
         polygons, cells = view.section(mesh)
-        (drawn,) = collections(right)
-        assert_allclose(corners(drawn), polygons.mean(axis=1))
-        assert_array_equal(drawn.get_facecolors()[:, :3], colours[of_cell[cells]])
-        # sides alone
-        assert [text.get_text() for text in left.texts] == [text.get_text() for text in right.texts]
-        assert len(left.texts) == 4
+        (painted,) = drawn(right)
+        assert_drawn(painted, polygons)
+        assert_array_equal(painted.get_facecolors()[:, :3], colours[of_cell[cells]])
+        assert texts(left.texts) == texts(right.texts)
+        assert len(left.texts) == 4  # sides alone
     (legend,) = left.figure.legends
-    assert [text.get_text() for text in legend.get_texts()] == ["0", "1", "2", "3"]
+    assert texts(legend.get_texts()) == ["0", "1", "2", "3"]
 
 
-@pytest.mark.parametrize(("worlds", "signs"), ORIENTATIONS[::3])
+@some_orientations
 def test_interfaces_are_drawn_over_the_image(worlds, signs):
     """Slabs whose borders the lattice's cells keep to: the lines lie on the borders, as long as
     these are.
     """
     labels = blocks_of_labels(4, worlds, signs)
-    mesh = lattice_mesh(labels, blocks=(4, 3, 3), kind="five-tet")  # whose cells lie in its blocks
-    image, table = (
-        noise(labels.shape, labels.affine),
-        LabelTable({2: "left lung"}, {2: (0.0, 1.0, 0.5)}),
-    )
+    mesh = lattice(labels, (4, 3, 3), "five-tet")  # whose cells lie in its blocks
+    image = noise(labels.shape, labels.affine)
+    table = LabelTable({2: "left lung"}, {2: (0.0, 1.0, 0.5)})
     figure = label_figure(labels, mesh, image=image, table=table)
-    grid = np.array(figure.axes).reshape(3, 3)
-    of_cell = cell_labels(labels, mesh)
+    colours, of_cell = label_colours(np.arange(4), table.colours), cell_labels(labels, mesh)
     n_cells = np.bincount(of_cell)
-    for axes, normal in zip(grid[:, 2], (2, 1, 0), strict=True):
+    for axes, normal in zip(figure.axes[2::3], (2, 1, 0), strict=True):
         view = SliceView(image, worlds.index(normal), None)
-        assert_array_equal(axes.images[0].get_array(), view.pixels.T)
-        under, over = [each for each in axes.collections if isinstance(each, LineCollection)]
-        lines = np.array(over.get_segments())
-        assert_array_equal(np.array(under.get_segments()), lines)
+        assert_pixels(axes, view)
+        under, over = (each.get_segments() for each in drawn(axes, LineCollection))
+        assert_array_equal(under, over)
         _, sides = view.interfaces(mesh, of_cell)
         rarer = np.where(n_cells[sides[:, 0]] <= n_cells[sides[:, 1]], sides[:, 0], sides[:, 1])
-        assert_array_equal(
-            over.get_colors()[:, :3], label_colours(np.arange(4), table.colours)[rarer]
-        )
+        assert_array_equal(drawn(axes, LineCollection)[1].get_colors()[:, :3], colours[rarer])
         if worlds.index(normal) != 0:
             along = view.axes.index(0)
-            assert_allclose(lines[:, 0, along], lines[:, 1, along], atol=1e-9)
-            lengths = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).sum()
-            assert lengths == pytest.approx(3 * view.size[1 - along])
-    assert "2 left lung" in [text.get_text() for text in figure.legends[0].get_texts()]
+            steps = np.abs(np.diff(over, axis=1))[:, 0]
+            assert_allclose(steps[:, along], 0.0, atol=1e-9)
+            assert steps.sum() == pytest.approx(3 * view.size[1 - along])
+    assert "2 left lung" in texts(figure.legends[0].get_texts())
 
 
 def test_interfaces_of_a_plane():
     labels = Image(np.repeat([0, 3], 4)[:, None] + np.zeros((1, 6)), np.diag([2.0, 1.0, 1.0]))
-    mesh = lattice_mesh(labels, blocks=(2, 2))
-    lines, sides = SliceView(labels, None, None).interfaces(mesh, cell_labels(labels, mesh))
+    mesh = lattice(labels)
+    lines, sides = middle_view(labels).interfaces(mesh, cell_labels(labels, mesh))
     assert_allclose(lines[..., 0], 8.0)
     assert np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).sum() == pytest.approx(6.0)
     assert {tuple(sorted(pair)) for pair in sides.tolist()} == {(0, 3)}
@@ -459,32 +437,29 @@ def test_interfaces_of_a_plane():
 
 def test_labels_of_a_part_and_of_a_plane():
     labels = blocks_of_labels(4)
-    figure = label_figure(labels, lower_part(labels, 0, 4))
-    polygons = np.concatenate(
-        [path.vertices for path in collections(figure.axes[1])[0].get_paths()]
-    )
-    assert polygons[:, 0].max() == pytest.approx(8.0)  # of 16 mm
+    (painted,) = drawn(label_figure(labels, lower_part(labels, 0, 4)).axes[1])
+    farthest = max(path.vertices[:, 0].max() for path in painted.get_paths())
+    assert farthest == pytest.approx(8.0)  # of 16 mm
     flat = Image(labels.data[:, :, 0], np.diag([2.0, 1.0, 1.0]))
-    assert len(label_figure(flat, lattice_mesh(flat, blocks=(2, 2))).axes) == 2
+    assert len(label_figure(flat, lattice(flat)).axes) == 2
 
 
 def test_numbers_stand_in_their_labels_where_a_legend_is_too_short():
     labels = blocks_of_labels(LISTED_LABELS + 3)
-    figure = label_figure(labels, lattice_mesh(labels, blocks=(4, 2, 2)))
+    figure = label_figure(labels, lattice(labels, (4, 2, 2)))
     assert figure.legends[0].get_texts()[-1].get_text() == "and 3 more"
-    view, left = SliceView(labels, None, None), figure.axes[0]
-    numbers = [text for text in left.texts if text.get_text().isdigit()]
-    assert [text.get_text() for text in numbers] == [str(k) for k in range(1, LISTED_LABELS + 3)]
-    for text in numbers:
-        pixel = (np.array(text.get_position()) / view.steps).astype(int)
-        assert view.pixels[tuple(pixel)] == int(text.get_text())
+    view = middle_view(labels)
+    places = {
+        int(text.get_text()): tuple((np.array(text.get_position()) / view.steps).astype(int))
+        for text in figure.axes[0].texts
+        if text.get_text().isdigit()
+    }
+    assert list(places) == list(range(1, LISTED_LABELS + 3))
+    assert [view.pixels[pixel] for pixel in places.values()] == list(places)
     # In slabs of 0.1 mm, beside 7 mm, a number has no room.
     thin = Image(labels.data[::2], labels.affine @ np.diag([0.05, 1.0, 1.0, 1.0]))
-    figure = label_figure(thin, lattice_mesh(thin, blocks=(4, 2, 2)))
-    numbers = [
-        [text.get_text() for text in axes.texts if text.get_text().isdigit()]
-        for axes in figure.axes
-    ]
+    figure = label_figure(thin, lattice(thin, (4, 2, 2)))
+    numbers = [list(filter(str.isdigit, texts(axes.texts))) for axes in figure.axes]
     assert numbers == [[], [], [], [], ["7"], []]  # the sagittal slice is one label alone
 
 
@@ -492,35 +467,26 @@ def test_numbers_stand_in_their_labels_where_a_legend_is_too_short():
 # A mask's outline and a mesh's boundary
 
 
-def lines(axes):
-    """Segments of the outline, and of the boundary, each (K, 2, 2)."""
-    return [np.array(c.get_segments()) for c in axes.collections if isinstance(c, LineCollection)]
-
-
-@pytest.mark.parametrize(("worlds", "signs"), ORIENTATIONS[::3])
+@some_orientations
 def test_boundary_and_outline_lie_between_the_same_pixels(worlds, signs):
     """The mesh covers just the voxels of the mask, which ends in a plane: both lines are where
     the pixels change.
     """
     image = oriented_image(worlds, signs)
-    # ends along the picture's horizontal, seen from the front
-    axis, normal = worlds.index(0), worlds.index(1)
-    mask = Image(np.moveaxis(np.zeros(SHAPE), axis, 0).copy(), np.eye(4)).data.copy()
-    mask[:3] = 1.0
-    mask = Image(np.moveaxis(mask, 0, axis), image.affine)
-    figure = boundary_figure(image, mask, lower_part(image, axis, 3), axis=normal, index=2)
-    pixels = SliceView(mask, normal, 2).pixels
+    axis = worlds.index(0)  # along the picture's horizontal
+    is_inside = np.arange(SHAPE[axis]) < 3
+    data = np.moveaxis(np.zeros(SHAPE), axis, -1) + is_inside
+    mask = Image(np.moveaxis(data, -1, axis), image.affine)
+    figure = boundary_figure(image, mask, lower_part(image, axis, 3), "mask")
+    pixels, top = middle_view(mask).pixels, figure.axes[0].get_ylim()[1]
     place = SPACING[axis] * (np.flatnonzero(np.diff(pixels[:, 0]))[0] + 1)
     for axes in figure.axes:
-        assert_array_equal(axes.images[0].get_array(), SliceView(image, normal, 2).pixels.T)
-        for drawn in lines(axes):
-            assert_allclose(drawn[..., 0], place, atol=1e-4)
-            assert_allclose(
-                [drawn[..., 1].min(), drawn[..., 1].max()], [0.0, figure.axes[0].get_ylim()[1]]
-            )
-            assert np.abs(np.diff(drawn[..., 1], axis=1)).sum() == pytest.approx(
-                figure.axes[0].get_ylim()[1]
-            )
+        assert_pixels(axes, middle_view(image))
+        for each in drawn(axes, LineCollection):
+            x, y = np.moveaxis(each.get_segments(), -1, 0)
+            assert_allclose(x, place, atol=1e-4)
+            assert_allclose([y.min(), y.max()], [0.0, top])
+            assert np.abs(np.diff(y, axis=1)).sum() == pytest.approx(top)
 
 
 @pytest.mark.parametrize("index", range(7))
@@ -529,19 +495,17 @@ def test_a_closed_boundary_is_closed_in_every_slice(index):
     hold.
     """
     image = Image(np.zeros((9, 9, 7)))
-    mesh = lattice_mesh(image, blocks=(3, 3, 2)) if index == 3 else bent(image, (3, 3, 2))
+    mesh = (lattice if index == 3 else bent)(image, (3, 3, 2))
     on_box = (np.abs(image.to_index(mesh.points) - [4.0, 4.0, 3.0]) > [4.4, 4.4, 3.4]).any(axis=1)
     inner = Mesh(mesh.points, mesh.cells[~on_box[mesh.cells].any(axis=1)])
     view = SliceView(image, 2, index)
-    segments = view.boundary(inner)
+    segments, (polygons, _) = view.boundary(inner), view.section(inner)
     ends, times = np.unique(segments.reshape(-1, 2).round(7), axis=0, return_counts=True)
     assert (times % 2 == 0).all()
-    polygons, _ = view.section(inner)
     assert (len(segments) > 0) == (len(polygons) > 0) == (1 < index < 5)
     if len(polygons):
-        assert_allclose(
-            [ends.min(axis=0), ends.max(axis=0)], [polygons.min((0, 1)), polygons.max((0, 1))]
-        )
+        assert_allclose(ends.min(axis=0), polygons.min(axis=(0, 1)))
+        assert_allclose(ends.max(axis=0), polygons.max(axis=(0, 1)))
 
 
 def test_the_detail_is_where_the_outline_bends_most():
@@ -552,7 +516,8 @@ def test_the_detail_is_where_the_outline_bends_most():
     mask = np.zeros((80, 90))
     mask[:40] = 1.0
     mask[28:40, 60:64] = 0.0
-    whole, detail = boundary_figure(image, Image(mask, image.affine), lower_part(image, 0, 40)).axes
+    figure = boundary_figure(image, Image(mask, image.affine), lower_part(image, 0, 40), "mask")
+    whole, detail = figure.axes
     low, high = np.transpose([detail.get_xlim(), detail.get_ylim()])
     assert_allclose(high - low, 2.0 * DETAIL_VOXELS)
     assert (low <= [56.0, 120.0]).all()
@@ -566,74 +531,70 @@ def test_the_slice_is_in_the_middle_of_the_mask():
     image = noise((6, 7, 20))
     mask = np.zeros(image.shape)
     mask[1:4, 2:6, 12:17] = 1.0
-    figure = boundary_figure(image, Image(mask), lattice_mesh(image, blocks=(2, 2, 2)))
-    assert_array_equal(figure.axes[0].images[0].get_array(), image.data[:, :, 14].T)
+    figure = boundary_figure(image, Image(mask), lattice(image), "mask")
+    assert_pixels(figure.axes[0], SliceView(image, 2, 14))
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0])
 def test_a_mask_without_outline_can_be_drawn(tmp_path, value):
     image = noise(SHAPE)
-    figure = boundary_figure(
-        image, Image(np.full(SHAPE, value)), lattice_mesh(image, blocks=(1, 1, 1))
-    )
-    assert [len(drawn) for drawn in lines(figure.axes[0])] == [0, 0]
+    figure = boundary_figure(image, Image(np.full(SHAPE, value)), lattice(image), "mask")
+    assert [each.get_segments() for each in drawn(figure.axes[0], LineCollection)] == [[], []]
     save_figure(figure, tmp_path / "a.png", dpi=40)
 
 
 def test_a_mask_of_another_shape_is_refused():
-    image = Image(np.zeros(SHAPE))
+    image = noise(SHAPE)
     with pytest.raises(InputError, match="mask: expected the image's shape"):
-        boundary_figure(image, Image(np.zeros((5, 7, 8))), lattice_mesh(image, blocks=(1, 1, 1)))
+        boundary_figure(image, Image(np.zeros((5, 7, 8))), lattice(image), "mask")
 
 
-def test_curved_cells_are_drawn_as_straight_pieces(tmp_path):
+def test_curved_cells_are_drawn_as_straight_pieces():
     """Their outline is nearer to the disc than that of the corners; titles say so, and no title
     of straight cells.
     """
     labels = load_phantom("disc_2d").label_image()
     result = mesh_image(content(labels, labels), 300, order=2, iterations=6)
-    mesh, view = result.mesh, SliceView(labels, None, None)
+    mesh, view = result.mesh, middle_view(labels)
+    straight = Mesh(mesh.points, mesh.cells)
     polygons, cells = view.section(mesh)
     pieces, n_pieces = mesh.straight_pieces()
     assert_array_equal(cells, np.repeat(np.arange(len(mesh.cells)), n_pieces))
     assert_allclose(areas(polygons), pieces.cell_volumes)
-    assert len(view.interfaces(mesh, result.labels)[0]) == 2 * len(
-        view.interfaces(Mesh(mesh.points, mesh.cells), result.labels)[0]
-    )
-    words = "\ncurved cells drawn as 4 straight ones"
-    drawn = set()
-    for each, is_curved in ((mesh, True), (Mesh(mesh.points, mesh.cells), False)):
-        figure = label_figure(labels, each, result.labels)
-        assert figure.axes[1].get_title().endswith(words) == is_curved
-        size = f"{len(each.points)} corner nodes, {node_count(each.points, each.cells, 2)} in all"
-        title = label_figure(labels, each, result.labels, order=2).axes[1].get_title()
-        assert title == f"labels of the cells, {size}{words * is_curved}"
-        assert slice_figure(labels, [("a", each)]).axes[0].get_title() == f"a{words * is_curved}"
-        mask = Image(labels.data == 1, labels.affine)
-        (legend,) = boundary_figure(labels, mask, each).legends
-        assert legend.get_texts()[1].get_text().endswith(words) == is_curved
-        drawn.add(thumbnail_png(labels, each, labels=labels, of_cell=result.labels))
-    assert len(drawn) == 2
+    lines, of_corners = (view.interfaces(each, result.labels)[0] for each in (mesh, straight))
+    assert len(lines) == 2 * len(of_corners)
+    size = f"{len(mesh.points)} corner nodes, {node_count(mesh.points, mesh.cells, 2)} in all"
+    mask, thumbnails = Image(labels.data == 1, labels.affine), set()
+    for each, words in ((mesh, "\ncurved cells drawn as 4 straight ones"), (straight, "")):
+        linear, quadratic = (
+            label_figure(labels, each, result.labels, order=order).axes[1].get_title()
+            for order in (1, 2)
+        )
+        assert quadratic == f"labels of the cells, {size}{words}"
+        assert slice_figure(labels, [("a", each)]).axes[0].get_title() == f"a{words}"
+        (legend,) = boundary_figure(labels, mask, each, "mask").legends
+        for text in (linear, legend.get_texts()[1].get_text()):
+            assert text.partition("\n")[2] == words.strip()
+        thumbnails.add(thumbnail_png(labels, each, labels=labels, of_cell=result.labels))
+    assert len(thumbnails) == 2
 
 
 # --------------------------------------------------------------------------------------------------
 # Histograms and energies
 
 
-@pytest.mark.parametrize("n", [2, 3])
+@each_dimension
 def test_histograms_are_fractions(n):
-    image = noise(SHAPE[:n], np.diag([*SPACING[:n], 1.0]))
-    meshes = [
-        ("first", lattice_mesh(image, blocks=(2, 2, 2)[:n])),
-        ("second", bent(image, (2, 3, 2)[:n])),
-    ]
-    figure = histogram_figure(meshes)
-    outlines = [p for p in figure.axes[0].patches if p.get_label()]
-    assert [p.get_label().split(":")[0] for p in outlines] == ["first", "second"]
-    for patch, (_, mesh) in zip(outlines, meshes, strict=True):
-        values, edges, _ = patch.get_data()
-        expected = rho_histogram(mesh.points, mesh.cells)
-        assert_array_equal(values, expected[0])
+    image = spaced(n)
+    meshes = {"first": lattice(image), "second": bent(image)}
+    outlines = {
+        patch.get_label().split(":")[0]: patch.get_data()
+        for patch in histogram_figure(list(meshes.items())).axes[0].patches
+        if patch.get_label()
+    }
+    assert list(outlines) == list(meshes)
+    for name, (values, edges, _) in outlines.items():
+        assert_array_equal(values, rho_histogram(meshes[name].points, meshes[name].cells)[0])
         assert values.sum() == pytest.approx(1.0, abs=1e-12)
         assert (edges[0], edges[-1]) == (0.0, 1.0 / n)
 
@@ -641,15 +602,7 @@ def test_histograms_are_fractions(n):
 def history(*E_D):
     return [
         IterationRecord(
-            k,
-            1.0 - 0.1 * k,
-            2.0 + 0.1 * k,
-            value,
-            0.0 if k == 0 else 0.1**k,
-            k == 2,
-            50,
-            99,
-            float(k),
+            k, 1.0 - 0.1 * k, 2.0 + 0.1 * k, value, 0.1**k * (k > 0), k == 2, 50, 99, float(k)
         )
         for k, value in enumerate(E_D)
     ]
@@ -657,16 +610,12 @@ def history(*E_D):
 
 def test_energy_lines_hold_the_history():
     top, bottom = energy_figure(history(8.0, 4.0, 2.0, 1.0)).axes
-    curves = {line.get_label().split(",")[0]: line for line in top.lines}
-    assert list(curves) == ["E", "E_G", "E_D"]
-    assert_allclose(curves["E"].get_ydata(), [1.0, 0.9, 0.8, 0.7])
-    assert_allclose(curves["E_G"].get_ydata(), [1.0, 1.05, 1.1, 1.15])
-    assert_allclose(curves["E_D"].get_ydata(), [1.0, 0.5, 0.25, 0.125])
-    for line in top.lines:
-        assert_array_equal(line.get_xdata(), [0, 1, 2, 3])
+    energies = {"E": [1, 0.9, 0.8, 0.7], "E_G": [1, 1.05, 1.1, 1.15], "E_D": [1, 0.5, 0.25, 0.125]}
+    assert [line.get_label().split(",")[0] for line in top.lines] == list(energies)
+    for line, values in zip(top.lines, energies.values(), strict=True):
+        assert_allclose(line.get_xydata(), np.column_stack([range(4), values]))
         assert line.get_label().endswith(f": {line.get_ydata()[-1]:.3f}")
-    assert_array_equal(bottom.lines[0].get_xdata(), [1, 2, 3])
-    assert_allclose(bottom.lines[0].get_ydata(), [0.1, 0.01, 0.001])
+    assert_allclose(bottom.lines[0].get_xydata(), [[1, 0.1], [2, 0.01], [3, 0.001]])
     # connected anew in 2
     assert [(p.get_x(), p.get_x() + p.get_width()) for p in top.patches] == [(1.5, 2.5)]
 
@@ -678,20 +627,18 @@ def test_energy_lines_hold_the_history():
 @pytest.fixture(scope="module")
 def run():
     image = Image(np.where(np.arange(12) > 4, 9.0, 1.0)[:, None] + np.zeros((12, 11)))
-    initial = lattice_mesh(image, blocks=(4, 4))
+    initial = lattice(image, (4, 4))
     return image, initial, optimize_paper(image, initial, iterations=2)
 
 
 @pytest.mark.drawn
 def test_pictures_are_written_and_not_blank(tmp_path, run):
     image, initial, result = run
-    paths = [
-        tmp_path / name
-        for name in ("slice.png", "rho.png", "energies.png", "boundary.png", "labels.png")
-    ]
+    names = ("slice.png", "rho.png", "energies.png", "boundary.png", "labels.png")
+    paths = [tmp_path / name for name in names]
     save_run_figures(paths[:3], image, initial, result)
     domain = Image(image.data / 9.0)
-    save_figure(boundary_figure(image, domain, result.mesh), paths[3])
+    save_figure(boundary_figure(image, domain, result.mesh, "mask"), paths[3])
     save_figure(label_figure(image, result.mesh, cell_labels(image, result.mesh)), paths[4])
     for path in paths:
         with PIL.Image.open(path) as picture:
@@ -701,30 +648,34 @@ def test_pictures_are_written_and_not_blank(tmp_path, run):
     assert sorted(tmp_path.iterdir()) == sorted(paths)
 
 
-def test_titles_say_how_many_nodes_and_how_good(monkeypatch, tmp_path, run):
+def test_titles_say_how_many_nodes_and_how_good(monkeypatch, run):
     saved = []
     monkeypatch.setattr(figures, "save_figure", lambda figure, path: saved.append(figure))
     image, initial, result = run
     flat = Image(np.full(image.shape, 7.0))
-    for shown, made, words in (
-        (image, result, f"{result.history[-1].E_D / result.history[0].E_D:.3f} of the initial E_D"),
-        (flat, MeshingResult(initial, history(0.0), "iterations", initial), "constant image"),
+    unmoved = MeshingResult(initial, history(0.0), "iterations", initial)
+    fraction = result.history[-1].E_D / result.history[0].E_D
+    for shown, made, words, n_lines in (
+        (image, result, f"{fraction:.3f} of the initial E_D", 3),
+        (flat, unmoved, "constant image", 2),
     ):
-        save_run_figures([tmp_path / k for k in "abc"], shown, initial, made)
-        before, after, *_ = saved[-3].axes
-        assert before.get_title() == f"lattice, {len(initial.points)} nodes"
-        assert after.get_title() == f"optimised, {words}"
-        drawn = [len(collections(axes)[0].get_paths()) for axes in (before, after)]
-        assert drawn == [len(initial.cells), len(made.mesh.cells)]
-        assert len(saved[-1].axes[0].lines) == (3 if shown is image else 2)
-    save_run_figures([tmp_path / k for k in "abc"], image, initial, result, order=2)
+        save_run_figures("abc", shown, initial, made)
+        slices, _, energies = saved[-3:]
+        titles = [f"lattice, {len(initial.points)} nodes", f"optimised, {words}"]
+        for axes, title, mesh in zip(slices.axes, titles, (initial, made.mesh), strict=False):
+            assert axes.get_title() == title
+            assert len(drawn(axes)[0].get_paths()) == len(mesh.cells)
+        assert len(energies.axes[0].lines) == n_lines
+    save_run_figures("abc", image, initial, result, order=2)
     assert saved[-3].axes[0].get_title() == f"lattice, {nodes_in_words(initial, 2)}"
 
 
 @pytest.mark.parametrize("name", ["a", "a.png.txt"])
 def test_a_picture_is_a_png_or_refused(name, tmp_path):
-    with pytest.raises(InputError, match=r"expected a name ending in \.png"):
-        save_figure(Figure(), tmp_path / name)
-    with pytest.raises(InputError, match=r"expected a name ending in \.png"):
-        save_scenes(tmp_path / name, [("", lambda plotter: None)])
+    for save, shown in (
+        (save_figure, (Figure(), tmp_path / name)),
+        (save_scenes, (tmp_path / name, [("", lambda plotter: None)])),
+    ):
+        with pytest.raises(InputError, match=r"\.png"):
+            save(*shown)
     assert list(tmp_path.iterdir()) == []

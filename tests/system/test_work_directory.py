@@ -42,7 +42,7 @@ def test_an_empty_folder_becomes_one(tmp_path):
 def test_what_is_none_is_one_line_and_stays(tmp_path, kind):
     planted(kind, tmp_path / "work", outside(tmp_path))
     before = content(tmp_path)
-    for act in (check, create, lambda path: lock_directory(path).__enter__()):
+    for act in (check, create, lambda path: lock_directory(path, None).__enter__()):
         with pytest.raises(
             InputError,
             match=rf"^{tmp_path}/work: expected [^\n]*; move it away and run this again$",
@@ -56,7 +56,9 @@ def test_a_lock_says_whose_it_is_and_ends_with_its_process(work):
         "import sys, time; from pathlib import Path; from tetopt.system.work_directory "
         "import lock_directory\n"
     )
-    code += "with lock_directory(Path(sys.argv[1])): print(); sys.stdout.flush(); time.sleep(600)"
+    code += (
+        "with lock_directory(Path(sys.argv[1]), None): print(); sys.stdout.flush(); time.sleep(600)"
+    )
     with subprocess.Popen([sys.executable, "-c", code, work], stdout=subprocess.PIPE) as other:
         other.stdout.readline()
         words = rf"^{work}: another run is writing there \(process {other.pid} on .*\); wait until"
@@ -66,7 +68,7 @@ def test_a_lock_says_whose_it_is_and_ends_with_its_process(work):
                     pass
         finally:
             other.kill()
-    with lock_directory(work):
+    with lock_directory(work, None):
         pass
 
 

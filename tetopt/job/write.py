@@ -250,7 +250,7 @@ def draw(task: Task, outcome: Meshed, model: Model) -> None:
     # none for the mask of a mesh to start from
     if source.mask is not None and "boundary" in pictures[3].stem:
         figures.save_figure(
-            figures.boundary_figure(image, source.mask, mesh, word=source.mask_word), pictures[3]
+            figures.boundary_figure(image, source.mask, mesh, source.mask_word), pictures[3]
         )
     if source.labels is not None:
         other = None if np.array_equal(image.data, source.labels.data) else image

@@ -343,12 +343,10 @@ def boundary_figure(
     image: Image,
     mask: Image,
     mesh: Mesh,
-    axis: int | None = None,
-    index: int | None = None,
-    word: str = "mask",
+    word: str,
 ) -> Figure:
-    """Draw the outline of a mask and the boundary of a mesh over a slice, and an enlarged detail of
-    both.
+    """Draw the outline of a mask and the boundary of a mesh over the axial slice in the middle of
+    the mask, and an enlarged detail of both.
 
     Parameters
     ----------
@@ -358,8 +356,6 @@ def boundary_figure(
         interpolated linearly between voxel centres.
     mesh : Mesh
         Its boundary is drawn, except on the faces of the image's box.
-    axis, index : int, optional
-        The slice, in voxel indices; by default the axial one in the middle of the mask.
     word : str
         Name of the mask in the legend.
 
@@ -378,10 +374,10 @@ def boundary_figure(
         raise InputError(
             f"mask: expected the image's shape {image.shape}, got {mask.shape}; resample it"
         )
-    view = SliceView(image, axis, index)
-    if index is None and view.across is not None:
+    view = SliceView(image, None, None)
+    if view.across is not None:
         filled = np.unique(np.nonzero(mask.data >= 0.5)[view.across])
-        view = SliceView(image, axis, int(filled[len(filled) // 2]) if len(filled) else None)
+        view = SliceView(image, None, int(filled[len(filled) // 2]) if len(filled) else None)
     outline = _half_level(SliceView(mask, view.across, view.index))
     boundary = view.boundary(mesh)
     low, high = _longest_part(outline, view)

@@ -16,7 +16,7 @@ from tetopt.engine.loop import MeshingResult
 from tetopt.geometry.quadratic import node_count
 from tetopt.image import Image
 from tetopt.measure.judge import unexplained_by
-from tetopt.measure.quality import Quality, quality
+from tetopt.measure.quality import Quality
 from tetopt.mesh import Mesh
 from tetopt.model.loads import load_words
 from tetopt.model.model import Model
@@ -71,19 +71,13 @@ def run_summary(
     result: MeshingResult,
     about: dict[str, Any],
     seconds: dict[str, float],
-    shapes: tuple[Quality | None, Quality | None] | None = None,
+    shapes: tuple[Quality | None, Quality | None],
 ) -> dict[str, Any]:
     """Return all numbers of a run: options and file (`about`), versions, energies by iteration,
     quality (both meshes).
 
-    `shapes` are these qualities, if already measured; None for one that could not be measured.
+    `shapes` are these qualities, initial first; None for one that could not be measured.
     """
-    if shapes is None:
-        made = result.mesh
-        shapes = (
-            quality(initial.points, initial.cells),
-            quality(made.points, made.cells, made.midpoints),
-        )
     first, last = result.history[0], result.history[-1]
     own = plain(image)
     is_varied = own.variance > 0.0

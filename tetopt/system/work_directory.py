@@ -43,7 +43,7 @@ def create(path: Path) -> None:
 
 
 @contextmanager
-def lock_directory(path: Path, keys: Sequence[str] | None = None) -> Iterator[None]:
+def lock_directory(path: Path, keys: Sequence[str] | None) -> Iterator[None]:
     """Lock a work directory, created if missing, for a single run; with `keys`, runs of other keys
     may share it.
 

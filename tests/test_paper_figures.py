@@ -9,10 +9,10 @@ import functools
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from paper import experiments as paper
 
 import tetopt
-from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import largest_component
 
 PRINTED = paper.printed_numbers()
@@ -22,29 +22,25 @@ def errors(name):
     return np.array(PRINTED["table1"][name]["errors"])
 
 
-@functools.cache
-def figure_3ef(data_dir):
-    return paper.figure_3ef(
-        tetopt.load_image(data_dir / "mni_icbm152_t1_tal_nlin_sym_09a_converted.nii.gz")
-    )
+figure_2, figure_3cd = map(functools.cache, (paper.figure_2, paper.figure_3cd))
 
 
-@functools.cache
-def figure_2(k_D):
-    return paper.figure_2(k_D)
+@pytest.fixture(scope="module")
+def brain(data_dir):
+    return tetopt.load_image(data_dir / "mni_icbm152_t1_tal_nlin_sym_09a_converted.nii.gz")
 
 
-@functools.cache
-def figure_3cd(snr):
-    return paper.figure_3cd(snr)
+@pytest.fixture(scope="module")
+def case_3ef(brain):
+    return paper.figure_3ef(brain)
 
 
-@functools.cache
-def simulated(snr):
-    case = figure_3cd(snr)
-    return paper.simulate(case.image, case.initial)[0], paper.simulate(
-        case.image, case.result.mesh
-    )[0]
+def counts(mesh):
+    return [len(mesh.points), len(mesh.cells)]
+
+
+def E_D_left(case):
+    return case.result.history[-1].E_D / case.result.history[0].E_D
 
 
 @pytest.mark.full
@@ -56,9 +52,8 @@ def test_row_1_and_2_random_nodes():
     """
     spread = paper.figure_1_spread(8)
     for name in ("fig1a", "fig1b"):
-        median = np.median(spread[name], axis=0)[:4]
-        ratio = median / errors(name)
-        assert np.all((ratio[[0, 2, 3]] > 1 / 1.4) & (ratio[[0, 2, 3]] < 1.4)), (name, ratio)
+        ratio = (np.median(spread[name], axis=0)[:4] / errors(name))[[0, 2, 3]]
+        assert np.abs(np.log(ratio)).max() < np.log(1.4), name
     # Every measure improves on every seed but the harmonic mean, which improves on most.
     improved = spread["fig1b"] < spread["fig1a"]
     assert improved[:, [0, 2, 3]].all()
@@ -88,10 +83,10 @@ def test_geometric_mean_of_other_rows():
     """
     meshes = {"fig2c": figure_2(0.05), "fig2d": figure_2(0.30), "fig3d": figure_3cd(30.0)}
     for name, case in meshes.items():
-        mesh, printed = case.result.mesh, errors(name)[1]
-        ratio = paper.geometric_mean_error(mesh) / printed
-        assert 1 / 1.4 < ratio < 1.4, (name, ratio)
-        assert abs(np.log(ratio)) < abs(np.log(paper.errors_of(mesh).harmonic_mean / printed)), name
+        mesh = case.result.mesh
+        means = paper.geometric_mean_error(mesh), paper.errors_of(mesh).harmonic_mean
+        geometric, harmonic = np.abs(np.log(means / errors(name)[1]))
+        assert geometric < min(np.log(1.4), harmonic), name
 
 
 def test_figure_1c_energy_falls_and_nodes_stop():
@@ -104,11 +99,9 @@ def test_figure_1c_energy_falls_and_nodes_stop():
 
 def test_row_3_to_the_printed_digits():
     """Fig. 2(a) is fully known: 7 x 7 squares cut into four."""
-    case = figure_2(0.05)
-    assert [len(case.initial.points), len(case.initial.cells)] == PRINTED["meshes"]["fig2a"]
-    np.testing.assert_allclose(
-        paper.errors_of(case.initial), errors("fig2a"), rtol=0.0, atol=0.5e-4
-    )
+    initial = figure_2(0.05).initial
+    assert counts(initial) == PRINTED["meshes"]["fig2a"]
+    assert_allclose(paper.errors_of(initial), errors("fig2a"), rtol=0.0, atol=0.5e-4)
 
 
 @pytest.mark.parametrize(("k_D", "name"), [(0.05, "fig2c"), (0.30, "fig2d")])
@@ -135,7 +128,6 @@ def test_more_weight_fits_the_phantom_better():
     low, high = figure_2(0.05), figure_2(0.30)
     assert high.result.history[-1].E_D < 0.5 * low.result.history[-1].E_D
     assert paper.errors_of(high.result.mesh).mean > paper.errors_of(low.result.mesh).mean
-    assert errors("fig2d")[0] > errors("fig2c")[0]
 
 
 @pytest.mark.parametrize("k_D", [0.05, 0.3])
@@ -145,8 +137,7 @@ def test_figure_2b_descent_finds_the_lowest_place(k_D):
     """
     landscape = paper.figure_2b(k_D, n_places=21)
     assert landscape.E_minimum < landscape.E.min() + 0.01 * np.ptp(landscape.E)
-    middle = landscape.E[10, 10]
-    assert middle == pytest.approx(1.0, abs=0.01)
+    assert landscape.E[10, 10] == pytest.approx(1.0, abs=0.01)
 
 
 def test_figure_2b_moves_from_the_middle_to_the_edge():
@@ -161,15 +152,14 @@ def test_figure_2b_moves_from_the_middle_to_the_edge():
 
 
 @pytest.mark.full
-def test_figure_3ab_brain_slice(data_dir):
+def test_figure_3ab_brain_slice(brain):
     """128 nodes and 224 triangles; "a substantial improvement in the representation".
 
     Band: E_D below 0.6 of the initial's on the MNI T1, brain only as in the paper's picture.
     """
-    volume = tetopt.load_image(data_dir / "mni_icbm152_t1_tal_nlin_sym_09a_converted.nii.gz")
-    case = paper.figure_3ab(volume)
-    assert [len(case.initial.points), len(case.initial.cells)] == PRINTED["meshes"]["fig3a"]
-    assert case.result.history[-1].E_D < 0.6 * case.result.history[0].E_D
+    case = paper.figure_3ab(brain)
+    assert counts(case.initial) == PRINTED["meshes"]["fig3a"]
+    assert E_D_left(case) < 0.6
 
 
 def test_row_6_elastography_mesh():
@@ -179,9 +169,9 @@ def test_row_6_elastography_mesh():
     Band: the printed mean, 0.0859, is squares' within 0.0002; the worst, 0.0922, is not, which
     gives the aspect.
     """
-    case = figure_3cd(30.0)
-    assert [len(case.initial.points), len(case.initial.cells)] == PRINTED["meshes"]["fig3c"]
-    assert paper.errors_of(case.initial).mean == pytest.approx(errors("fig3c")[0], abs=2e-4)
+    initial = figure_3cd(30.0).initial
+    assert counts(initial) == PRINTED["meshes"]["fig3c"]
+    assert paper.errors_of(initial).mean == pytest.approx(errors("fig3c")[0], abs=2e-4)
     box = tetopt.Image(np.zeros((100, 102)) + np.arange(102))
     longer = paper.errors_of(tetopt.lattice_mesh(box, blocks=(7, 7)))
     assert longer.worst == pytest.approx(errors("fig3c")[3], abs=2e-3)
@@ -193,10 +183,9 @@ def test_row_7_elastography_optimised(snr):
     noise level, since the gland and its nodules take up as much of the mesh as the paper's; the
     worst cell within a factor of 1.6.
     """
-    ours = np.array(paper.errors_of(figure_3cd(snr).result.mesh))
-    printed = errors("fig3d")
-    np.testing.assert_allclose(ours[[0, 2]], printed[[0, 2]], rtol=0.2)
-    assert printed[3] / 1.6 < ours[3] < printed[3] * 1.6
+    ratio = paper.errors_of(figure_3cd(snr).result.mesh) / errors("fig3d")
+    assert_allclose(ratio[[0, 2]], 1.0, rtol=0.2)
+    assert 1 / 1.6 < ratio[3] < 1.6
 
 
 def test_elastography_recovers_the_stiffness():
@@ -218,40 +207,74 @@ def test_conditioning_and_strain_energy(snr):
     acceptable range"; the strain energy falls, by less than a tenth. Our phantom has sharper
     contrasts, so its cells deform more.
     """
-    before, after = simulated(snr)
+    case = figure_3cd(snr)
+    before, after = (
+        paper.simulate(case.image, mesh)[0] for mesh in (case.initial, case.result.mesh)
+    )
     assert 1.0 < after.lambda_max / before.lambda_max < 2.0
     assert 1.0 < after.cond / before.cond < 2.0
     assert 0.9 < after.strain_energy / before.strain_energy < 1.0
 
 
 @pytest.mark.full
-def test_figure_3e_volume(data_dir):
+def test_figure_3e_volume(case_3ef):
     """1078 nodes and 3900 tetrahedra, 13 x 10 x 6 cubes of five; the optimised mesh fits the
     volume better.
     """
-    case = figure_3ef(data_dir)
-    assert [len(case.initial.points), len(case.initial.cells)] == PRINTED["meshes"]["fig3e"]
-    assert case.result.history[-1].E_D < 0.7 * case.result.history[0].E_D
-    v = volumes(case.result.mesh.points, case.result.mesh.cells)
-    assert v.sum() == pytest.approx(case.image.volume, rel=1e-12)
+    assert counts(case_3ef.initial) == PRINTED["meshes"]["fig3e"]
+    assert E_D_left(case_3ef) < 0.7
+    volume = case_3ef.result.mesh.cell_volumes.sum()
+    assert volume == pytest.approx(case_3ef.image.volume, rel=1e-12)
 
 
 @pytest.mark.full
-def test_figure_3f_ventricles(data_dir):
+def test_figure_3f_ventricles(case_3ef):
     """The largest connected set of tetrahedra under a threshold is the lateral ventricles: on both
     sides of the middle plane, above the anterior commissure (the MNI origin), where the tissue
     labels have CSF.
     """
-    case = figure_3ef(data_dir)
-    mesh = case.result.mesh
-    bright = np.median(case.image.data[case.image.data > case.image.data.mean()])
-    inside = largest_component(
-        mesh.cells, tetopt.cell_moments(case.image, mesh).mean < 0.6 * bright
-    )
-    centres = mesh.points[mesh.cells[inside]].mean(axis=1)
-    v = volumes(mesh.points, mesh.cells)[inside]
-    middle = (v[:, None] * centres).sum(axis=0) / v.sum()
-    assert abs(middle[0]) < 3.0
-    assert 8.0 < middle[2] < 22.0
+    mesh, h = case_3ef.result.mesh, case_3ef.image.data
+    is_dark = tetopt.cell_moments(case_3ef.image, mesh).mean < 0.6 * np.median(h[h > h.mean()])
+    inside = largest_component(mesh.cells, is_dark)
+    centres, v = mesh.points[mesh.cells[inside]].mean(axis=1), mesh.cell_volumes[inside]
+    x, _, z = np.average(centres, axis=0, weights=v)
+    assert abs(x) < 3.0
+    assert 8.0 < z < 22.0
     assert centres[:, 0].min() < -20.0 < 20.0 < centres[:, 0].max()
     assert 1.5e4 < v.sum() < 4.5e4  # lateral ventricles of the template, widened by cells of 10 mm
+
+
+def turned(turn, spacing):
+    """An affine turned about x."""
+    c, s = np.cos(turn), np.sin(turn)
+    rotation = np.array([[1, 0, 0, 0], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1.0]])
+    return rotation @ np.diag([*spacing, 1.0])
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.3])
+def test_simulate_is_the_compression_it_says(turn):
+    """Eq. (2): the mean of the voxels; the high face held, the low one pushed."""
+    affine = turned(turn, [2.0, 1.0, 1.5])
+    image = tetopt.Image(np.random.default_rng(1).uniform(1.0, 5.0, (6, 9, 8)), affine)
+    mesh = tetopt.lattice_mesh(image, nodes=60)
+    simulated, pressed = paper.simulate(image, mesh)
+    owner = tetopt.cell_of_voxel(image, mesh).ravel()
+    n_voxels = np.bincount(owner, minlength=len(mesh.cells))
+    has_voxels = n_voxels > 0
+    sums = np.bincount(owner, weights=image.data.ravel(), minlength=len(mesh.cells))
+    assert_allclose(simulated.young[has_voxels], sums[has_voxels] / n_voxels[has_voxels])
+    k = image.to_index(mesh.points)[:, 2]
+    assert_allclose(pressed.u[k > 7.4], 0.0, atol=1e-12)
+    low = pressed.u[k < -0.4]
+    assert_allclose(low, np.tile(0.01 * 12.0 * affine[:3, 2] / 1.5, (len(low), 1)), atol=1e-12)
+
+
+def test_turning_the_world_changes_nothing():
+    """A body pressed along its own axis: the energy is the same however it lies in the scanner."""
+    data = np.random.default_rng(2).uniform(1.0, 5.0, (6, 5, 7))
+    energies = []
+    for turn in (0.0, 0.7):
+        image = tetopt.Image(data, turned(turn, [1.0] * 3))
+        mesh = tetopt.lattice_mesh(image, blocks=(3, 3, 3))
+        energies.append(paper.simulate(image, mesh)[0].strain_energy)
+    assert_allclose(energies, energies[0], rtol=1e-9)
