@@ -3,7 +3,6 @@ is small.
 """
 
 import io
-from itertools import pairwise
 
 import numpy as np
 import PIL.Image
@@ -19,11 +18,21 @@ LETTER_ROWS = 12  # lowest, with the letters of the sides
 SHAPE, SPACING = (40, 50, 15), np.array([1.0, 1.0, 3.0])
 
 
-def pixels(*arguments):
-    """Red, green and blue (height, width, 3) of the picture, its upper row first."""
-    with PIL.Image.open(io.BytesIO(thumbnail_png(*arguments))) as picture:
+def pixels(image, mesh=None, **others):
+    """Red, green and blue (height, width, 3) of the picture, its upper row first; by default with
+    a mesh of a few cells.
+    """
+    png = thumbnail_png(image, mesh or coarse(image), **others)
+    with PIL.Image.open(io.BytesIO(png)) as picture:
         assert (picture.format, picture.mode) == ("PNG", "P")
         return np.asarray(picture.convert("RGB")).astype(int)
+
+
+def views_of(image):
+    """The axial and the sagittal one."""
+    rgb = pixels(image)
+    assert rgb.shape == (SIDE_PIXELS, 2 * SIDE_PIXELS, 3)
+    return np.split(rgb, 2, axis=1)
 
 
 def is_grey(rgb, least):
@@ -32,11 +41,17 @@ def is_grey(rgb, least):
     return grey
 
 
-def ball(centre=(20.0, 25.0, 21.0), radius=8.0):
+def bright_place(rgb):
+    """Pixels to the right of the middle, and below it."""
+    y, x = np.nonzero(is_grey(rgb, 150))
+    return x.mean() - SIDE_PIXELS / 2, y.mean() - SIDE_PIXELS / 2
+
+
+def ball(centre=(20.0, 25.0, 21.0), radius=8.0, bright=100.0):
     """A bright ball in mm of the world, x to the right, y to the front, z up."""
     affine = np.diag([*SPACING, 1.0])
     world = np.moveaxis(np.indices(SHAPE), 0, -1) * SPACING
-    return Image(100.0 * (((world - centre) ** 2).sum(axis=-1) <= radius**2), affine)
+    return Image(bright * (((world - centre) ** 2).sum(axis=-1) <= radius**2), affine)
 
 
 def coarse(image):
@@ -58,16 +73,12 @@ def reordered(image, order, signs):
 
 def test_left_is_left_and_front_is_up():
     """Of balls in the plane of one view each."""
-    left = ball(centre=(8.0, 38.0, 21.0), radius=7.0)
-    rgb = pixels(left, coarse(left))
-    assert rgb.shape == (SIDE_PIXELS, 2 * SIDE_PIXELS, 3)
-    y, x = np.nonzero(is_grey(rgb[:, :SIDE_PIXELS], 150))
-    assert x.mean() < SIDE_PIXELS / 2 - 10
-    assert y.mean() < SIDE_PIXELS / 2 - 10  # in front
-    high = ball(centre=(20.0, 38.0, 32.0), radius=7.0)
-    y, x = np.nonzero(is_grey(pixels(high, coarse(high))[:, SIDE_PIXELS:], 150))
-    assert x.mean() > SIDE_PIXELS / 2 + 10  # in front
-    assert y.mean() < SIDE_PIXELS / 2 - 10  # above
+    axial, _ = views_of(ball(centre=(8.0, 38.0, 21.0), radius=7.0))
+    assert max(bright_place(axial)) < -10  # left, in front
+    _, sagittal = views_of(ball(centre=(20.0, 38.0, 32.0), radius=7.0))
+    x, y = bright_place(sagittal)
+    assert x > 10  # in front
+    assert y < -10  # above
 
 
 def test_letters_say_which_side_is_which():
@@ -75,18 +86,9 @@ def test_letters_say_which_side_is_which():
     itself on its left.
     """
     image = ball()
-    rgb = pixels(image, coarse(image))
-    is_letter = rgb[-LETTER_ROWS:].min(axis=-1) > 60  # the mesh's orange has no blue
-    ends = [
-        0,
-        12,
-        SIDE_PIXELS - 12,
-        SIDE_PIXELS,
-        SIDE_PIXELS + 12,
-        2 * SIDE_PIXELS - 12,
-        2 * SIDE_PIXELS,
-    ]
-    left, between, right, back, middle, front = (is_letter[:, a:b] for a, b in pairwise(ends))
+    is_letter = pixels(image)[-LETTER_ROWS:].min(axis=-1) > 60  # the mesh's orange has no blue
+    ends = np.add.outer([0, SIDE_PIXELS], [0, 12, SIDE_PIXELS - 12]).ravel()[1:]
+    left, between, right, back, middle, front = np.split(is_letter, ends, axis=1)
     assert not between.any()
     assert not middle.any()
     assert min(each.sum() for each in (left, right, back, front)) >= 5
@@ -95,70 +97,56 @@ def test_letters_say_which_side_is_which():
     # a P on its short one
     assert back[of_back[-1]].sum() < back[of_back[0] : of_back[-1]].sum(axis=1).max()
     plane = Image(image.data[:, :, 7], np.diag([1.0, 1.0, 1.0]))
-    assert not (pixels(plane, coarse(plane))[-LETTER_ROWS:].min(axis=-1) > 60).any()
+    assert not (pixels(plane)[-LETTER_ROWS:].min(axis=-1) > 60).any()
 
 
 @pytest.mark.parametrize(("order", "signs"), [((2, 0, 1), (1, -1, 1)), ((1, 0, 2), (-1, -1, -1))])
 def test_the_order_of_voxels_does_not_matter(order, signs):
-    image = ball(centre=(20.0, 30.0, 21.0), radius=8.0)
+    image = ball(centre=(20.0, 30.0, 21.0))
     mesh = coarse(image)
     change = np.abs(pixels(reordered(image, order, signs), mesh) - pixels(image, mesh)).max(axis=-1)
     assert np.mean(change > 40) < 0.01  # single pixels at the ball's edge, by rounding
 
 
-def test_a_wrong_affine_is_seen():
-    """The same voxels with x and y turned around lie on the other sides."""
-    image = ball(centre=(8.0, 38.0, 21.0), radius=7.0)
-    wrong = Image(image.data, np.diag([-1.0, -1.0, 3.0, 1.0]))
-    sides = []
-    for each in (image, wrong):
-        y, x = np.nonzero(is_grey(pixels(each, coarse(each))[:, :SIDE_PIXELS], 150))
-        sides.append((x.mean() < SIDE_PIXELS / 2, y.mean() < SIDE_PIXELS / 2))
-    assert sides == [(True, True), (False, False)]
-
-
 def test_voxels_of_other_lengths_keep_a_ball_round():
-    image = ball(centre=(19.5, 24.5, 21.0), radius=12.0)
-    rgb = pixels(image, coarse(image))
-    for view in (rgb[:, :SIDE_PIXELS], rgb[:, SIDE_PIXELS:]):
-        y, x = np.nonzero(view[:-LETTER_ROWS, :, 2] > 90)  # orange has no blue
-        assert np.ptp(x) / np.ptp(y) == pytest.approx(1.0, abs=0.2)  # a fifth: voxels are 3 mm high
+    for view in views_of(ball(centre=(19.5, 24.5, 21.0), radius=12.0)):
+        wide, tall = np.ptp(np.argwhere(view[:-LETTER_ROWS, :, 2] > 90), axis=0)[::-1]
+        assert wide / tall == pytest.approx(1.0, abs=0.2)  # a fifth: voxels are 3 mm high
         # mm, of the side's
-        assert np.ptp(x) / SIDE_PIXELS == pytest.approx(24.0 / (1.16 * 50.0), abs=0.06)
+        assert wide / SIDE_PIXELS == pytest.approx(24.0 / (1.16 * 50.0), abs=0.06)
 
 
 def test_mesh_mask_and_labels_are_drawn():
-    image = ball(centre=(19.5, 24.5, 21.0), radius=12.0)
-    mesh, dark = coarse(image), Image(np.zeros(SHAPE), image.affine)
-    plain = pixels(dark, mesh)
+    labels = ball(centre=(19.5, 24.5, 21.0), radius=12.0, bright=1.0)
+    mesh, dark = coarse(labels), Image(np.zeros(SHAPE), labels.affine)
+    plain = pixels(dark)
     red, green, blue = np.moveaxis(plain, -1, 0)
     # the boundary, at least, in both views
     assert ((red > 200) & (green > 120) & (blue < 80)).sum() > 4 * 80
-    masked = pixels(dark, mesh, Image(image.data / 100.0, image.affine))
-    assert (masked[..., 2] > 150).sum() > 60 > (plain[..., 2] > 150).sum()
-    labels = Image(image.data / 100.0, image.affine)
+    masked = pixels(dark, mask=labels)
+    assert (masked[..., 2] > 150).sum() > 60 > (blue > 150).sum()
     of_cell = np.arange(len(mesh.cells)) % 2
-    coloured = pixels(dark, mesh, None, labels, of_cell)
+    coloured = pixels(dark, labels=labels, of_cell=of_cell)
     assert (np.abs(coloured - plain).max(axis=-1) > 40).sum() > 2000
-    np.testing.assert_array_equal(pixels(dark, mesh, None, labels, 0 * of_cell), plain)
-    green = pixels(dark, mesh, None, labels, of_cell, LabelTable({}, {1: (0.0, 1.0, 0.0)}))
-    assert (green[..., 1] - coloured[..., 1] > 40).sum() > 2000  # blue by its number
+    np.testing.assert_array_equal(pixels(dark, labels=labels, of_cell=0 * of_cell), plain)
+    table = LabelTable({}, {1: (0.0, 1.0, 0.0)})  # blue by its number
+    recoloured = pixels(dark, labels=labels, of_cell=of_cell, table=table)
+    assert (recoloured[..., 1] - coloured[..., 1] > 40).sum() > 2000
 
 
 def test_two_lungs_are_cut_through_one():
     """Where the middle is hollow, the sagittal view is not empty."""
-    left = lattice_mesh(Image(np.zeros((10, 10, 10)), np.eye(4)), blocks=(1, 1, 1))
+    left = coarse(Image(np.zeros((10, 10, 10))))
     points = np.concatenate([left.points, left.points + np.array([40.0, 0.0, 0.0])])
     mesh = Mesh(points, np.concatenate([left.cells, left.cells + len(left.points)]))
-    rgb = pixels(Image(np.zeros((50, 10, 10)), np.eye(4)), mesh)
+    rgb = pixels(Image(np.zeros((50, 10, 10))), mesh)
     assert (rgb[:, SIDE_PIXELS:, 0] > 200).any()
 
 
-def test_an_image_in_the_plane_has_one_view(tmp_path):
-    image = Image(np.random.default_rng(0).normal(size=(20, 30)))
-    assert pixels(image, coarse(image)).shape == (SIDE_PIXELS, SIDE_PIXELS, 3)
-    flat = Image(np.full((20, 30), 7.0))
-    assert pixels(flat, coarse(flat)).shape == (SIDE_PIXELS, SIDE_PIXELS, 3)
+@pytest.mark.parametrize("spread", [0.0, 1.0])
+def test_an_image_in_the_plane_has_one_view(spread):
+    image = Image(7.0 + spread * np.random.default_rng(0).normal(size=(20, 30)))
+    assert pixels(image).shape == (SIDE_PIXELS, SIDE_PIXELS, 3)
 
 
 def test_a_mesh_beside_the_image_is_drawn_alone():
@@ -170,8 +158,7 @@ def test_a_mesh_beside_the_image_is_drawn_alone():
 
 
 def test_its_bytes_are_few_and_always_the_same():
-    rng = np.random.default_rng(0)
-    image = Image(rng.normal(size=(40, 50, 15)), np.diag([*SPACING, 1.0]))
+    image = Image(np.random.default_rng(0).normal(size=SHAPE), np.diag([*SPACING, 1.0]))
     mesh = lattice_mesh(image, nodes=2000)
     png = thumbnail_png(image, mesh)
     assert thumbnail_png(image, mesh) == png
