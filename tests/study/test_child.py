@@ -21,14 +21,13 @@ from tetopt.system.child import signal_words
 
 IMAGE = tetopt.load_phantom("sphere").image(voxel_mm=4.0)
 JOB = PipelineInput(IMAGE, None, 300, classes=2, iterations=3)
-LABELS = tetopt.Image((IMAGE.data > 50) + (np.indices(IMAGE.shape)[0] > 12), IMAGE.affine)
 
 
 @pytest.mark.deep
 def test_same_bits_as_in_process():
-    job = JOB._replace(labels=LABELS)
-    outcome = run_in_child(PIPELINES["tetopt-uniform"].function, job, max_seconds=300.0)
-    here = PIPELINES["tetopt-uniform"].function(job)
+    labels = tetopt.Image((IMAGE.data > 50) + (np.indices(IMAGE.shape)[0] > 12), IMAGE.affine)
+    job, pipeline = JOB._replace(labels=labels), PIPELINES["tetopt-uniform"].function
+    outcome, here = run_in_child(pipeline, job, max_seconds=300.0), pipeline(job)
     assert outcome.failure is None
     assert outcome.mesh.points.tobytes() == here.mesh.points.tobytes()
     assert outcome.mesh.cells.tobytes() == here.mesh.cells.tobytes()
@@ -38,13 +37,16 @@ def test_same_bits_as_in_process():
     assert 2e7 < outcome.peak_bytes < 4e9
 
 
+def ended(pipeline, job=JOB, max_seconds=60.0, **limits):
+    return run_in_child(pipeline, job, max_seconds=max_seconds, **limits)
+
+
 def test_job_arrives_whole():
     """Affine, labels, seconds in their order, and notes."""
-    image = tetopt.Image(
-        IMAGE.data + 0.1, np.array([[0, -2.0, 0, 5], [3, 0, 0.5, 1], [0, 0, 1.5, 2], [0, 0, 0, 1]])
-    )
-    labels = tetopt.Image((IMAGE.data > 50).astype(int), image.affine)
-    outcome = run_in_child(pipes.fine, PipelineInput(image, labels, 200), max_seconds=60.0)
+    affine = np.array([[0, -2.0, 0, 5], [3, 0, 0.5, 1], [0, 0, 1.5, 2], [0, 0, 0, 1]])
+    image = tetopt.Image(IMAGE.data + 0.1, affine)
+    labels = tetopt.Image((IMAGE.data > 50).astype(int), affine)
+    outcome = ended(pipes.fine, PipelineInput(image, labels, 200))
     assert outcome.mesh.points.tobytes() == tetopt.lattice_mesh(image, nodes=200).points.tobytes()
     assert list(outcome.seconds.items()) == [("first", 1.5), ("second", 0.25)]
     assert outcome.notes == ["a note"]
@@ -63,7 +65,7 @@ def test_job_arrives_whole():
     ],
 )
 def test_failure_is_one_line(pipeline, line):
-    outcome = run_in_child(pipeline, JOB, max_seconds=60.0)
+    outcome = ended(pipeline)
     assert outcome.mesh is None
     assert outcome.failure == line
 
@@ -74,7 +76,7 @@ def test_a_crash_is_repeated_once(tmp_path, monkeypatch):
     monkeypatch.setenv("PIPES_PID", str(tmp_path / "pid"))
     events = []
     with listen_with(events.append):
-        outcome = run_in_child(pipes.crash_once, JOB, "mine", max_seconds=60.0)
+        outcome = ended(pipes.crash_once, title="mine")
     said = "mine: crashed: signal 11, SIGSEGV; running it again, with smoother surfaces"
     assert events == [Event("note", said)]
     assert (outcome.failure, outcome.is_crash) == (None, False)
@@ -82,11 +84,11 @@ def test_a_crash_is_repeated_once(tmp_path, monkeypatch):
     assert first.startswith("the first run crashed: signal 11, SIGSEGV; this is the second")
     assert last == "smoothing 2"
     (tmp_path / "pid").unlink()
-    outcome = run_in_child(pipes.crash_and_refuse, JOB, max_seconds=60.0)
+    outcome = ended(pipes.crash_and_refuse)
     assert outcome.failure == "crashed: signal 11, SIGSEGV; then thing: expected a, got b; do c"
     events.clear()
     with listen_with(events.append):
-        outcome = run_in_child(pipes.absent, JOB, max_seconds=60.0)
+        outcome = ended(pipes.absent)
     assert (outcome.failure, events) == ("thing: not installed", [])
 
 
@@ -96,7 +98,7 @@ def test_modules_of_the_current_folder_are_not_run(tmp_path, monkeypatch):
     for name in ("numpy", "json", "tempfile"):
         (tmp_path / f"{name}.py").write_text("open('executed', 'w')\n")
     monkeypatch.chdir(tmp_path)
-    assert run_in_child(pipes.fine, JOB, max_seconds=60.0).failure is None
+    assert ended(pipes.fine).failure is None
     assert not (tmp_path / "executed").exists()
 
 
@@ -117,7 +119,7 @@ def test_what_escapes_its_group_ends_too(tmp_path, monkeypatch):
     """Orphans in sessions of their own end with the child; the temporary folder has gone."""
     monkeypatch.setenv("PIPES_PID", str(tmp_path / "pid"))
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    outcome = run_in_child(pipes.escape, JOB, max_seconds=6.0)
+    outcome = ended(pipes.escape, max_seconds=6.0)
     assert outcome.failure == "out of time: killed after 6 s"
     pids = [int(pid) for pid in (tmp_path / "pid").read_text().split()]
     assert len(pids) == 2
@@ -127,7 +129,7 @@ def test_what_escapes_its_group_ends_too(tmp_path, monkeypatch):
 
 @pytest.mark.deep
 def test_memory_of_a_session_below_counts():
-    outcome = run_in_child(pipes.hoard_below, JOB, max_seconds=60.0, max_bytes=600_000_000)
+    outcome = ended(pipes.hoard_below, max_bytes=600_000_000)
     assert outcome.failure.startswith("too much memory: ")
 
 
@@ -136,7 +138,7 @@ def test_time_out_kills_the_whole_group(tmp_path, monkeypatch):
     pid = tmp_path / "pid"
     monkeypatch.setenv("PIPES_PID", str(pid))
     for most in (4.0, 16.0, 64.0):  # a busy machine may not have started the process earlier
-        outcome = run_in_child(pipes.sleep, JOB, max_seconds=most)
+        outcome = ended(pipes.sleep, max_seconds=most)
         assert outcome.failure == f"out of time: killed after {most:g} s"
         if pid.exists():
             break
@@ -145,7 +147,7 @@ def test_time_out_kills_the_whole_group(tmp_path, monkeypatch):
 
 @pytest.mark.deep
 def test_too_much_memory():
-    outcome = run_in_child(pipes.hoard, JOB, max_seconds=60.0, max_bytes=600_000_000)
+    outcome = ended(pipes.hoard, max_bytes=600_000_000)
     assert outcome.failure.startswith("too much memory: ")
     assert outcome.failure.endswith(" MB resident, 600 MB allowed")
     assert 600e6 < outcome.peak_bytes < 1500e6
@@ -155,7 +157,7 @@ def test_too_much_memory():
 def test_peak_is_the_childs_own():
     """Not that of a large parent, which ru_maxrss would begin with."""
     hoard = np.ones(100_000_000)
-    outcome = run_in_child(pipes.fine, JOB, max_seconds=60.0)
+    outcome = ended(pipes.fine)
     assert outcome.peak_bytes < 0.7 * hoard.nbytes
 
 

@@ -9,7 +9,6 @@ from test_compare_page import fake_report, finished, meshes_of, with_runs
 
 import tetopt
 from tetopt.energy.discretization import cell_E_D
-from tetopt.geometry.simplex import volumes
 from tetopt.report.figures import SliceView
 from tetopt.study.compare_figures import (
     cutaways,
@@ -38,19 +37,21 @@ def test_slices_hold_means_and_losses(small, n_meshes):
     figure = slices_figure(image, meshes, means)
     grid = np.array(figure.axes[: 3 * (n_meshes + 1)]).reshape(3, n_meshes + 1)
     view = SliceView(image, None, None)
-    assert_array_equal(grid[0, 0].images[0].get_array(), view.pixels.T)
-    for column, ((title, mesh), mean) in enumerate(zip(meshes, means, strict=True), 1):
+    voxels = grid[0, 0].images[0]
+    assert_array_equal(voxels.get_array(), view.pixels.T)
+    scales = set()
+    for column, (title, mesh), mean in zip(grid.T[1:], meshes, means, strict=True):
         polygons, cells = view.section(mesh)
-        assert grid[0, column].get_title() == title
-        assert len(painted(grid[0, column]).get_paths()) == len(polygons)
-        assert_array_equal(painted(grid[1, column]).get_array(), mean[cells])
-        density = cell_E_D(image, mesh) / volumes(mesh.points, mesh.cells)
-        assert_array_equal(painted(grid[2, column]).get_array(), density[cells])
-    # one scale for all
-    assert len({painted(grid[2, column]).get_clim() for column in range(1, n_meshes + 1)}) == 1
-    assert {painted(grid[1, c]).get_clim() for c in range(1, n_meshes + 1)} == {
-        grid[0, 0].images[0].get_clim()
-    }
+        assert column[0].get_title() == title
+        over, of_means, of_losses = map(painted, column)
+        assert len(over.get_paths()) == len(polygons)
+        assert_array_equal(of_means.get_array(), mean[cells])
+        assert of_means.get_clim() == voxels.get_clim()
+        assert_array_equal(
+            of_losses.get_array(), (cell_E_D(image, mesh) / mesh.cell_volumes)[cells]
+        )
+        scales.add(of_losses.get_clim())
+    assert len(scales) == 1  # one for all
 
 
 def test_label_marks_are_those_of_the_report():
@@ -60,31 +61,21 @@ def test_label_marks_are_those_of_the_report():
     for pipeline in done:
         pipeline.median.measurement.labels.reverse()
     dice, distance = labels_figure(report).axes
-    assert [text.get_text() for text in distance.get_xticklabels()] == [
-        "0 (9000)",
-        "1 (2250)",
-        "2 (562)",
-        "3 (140)",
-    ]
+    ticks = [text.get_text() for text in distance.get_xticklabels()]
+    assert ticks == ["0 (9000)", "1 (2250)", "2 (562)", "3 (140)"]
     for axes, name, n in ((dice, "dice", 4), (distance, "distance_mean", 3)):
-        marks = {
-            line.get_label(): line.get_xydata()
-            for line in axes.lines
-            if line.get_markerfacecolor() != "none"
-        }
-        assert list(marks) == [p.title for p in done]
-        for pipeline in done:
-            values = {row.label: getattr(row, name) for row in pipeline.median.measurement.labels}
-            assert_array_equal(marks[pipeline.title][:n, 1], [values[k] for k in range(n)])
-            assert_array_equal(np.rint(marks[pipeline.title][:n, 0]), np.arange(n))
-        is_open = [
-            line.get_markerfacecolor() == "none" and len(line.get_xdata()) > 0
-            for line in axes.lines
-        ]
-        own = axes.lines[is_open.index(True)].get_xydata()
-        assert sum(is_open) == 1  # of all meshes but the first
-        own_rows = {row.label: getattr(row, name) for row in done[0].median.measurement.own_labels}
-        assert_array_equal(own[:n, 1], [own_rows[k] for k in range(n)])
+
+        def assert_marks(line, rows, name=name, n=n):
+            values = {row.label: getattr(row, name) for row in rows}
+            assert_array_equal(line.get_ydata()[:n], [values[k] for k in range(n)])
+
+        full = [line for line in axes.lines if line.get_markerfacecolor() != "none"]
+        (own,) = (line for line in set(axes.lines) - set(full) if len(line.get_xdata()))
+        assert_marks(own, done[0].median.measurement.own_labels)  # the others have none
+        assert [line.get_label() for line in full] == [p.title for p in done]
+        for line, pipeline in zip(full, done, strict=True):
+            assert_marks(line, pipeline.median.measurement.labels)
+            assert_array_equal(np.rint(line.get_xdata()[:n]), np.arange(n))
 
 
 def test_histograms_are_those_of_the_report():
@@ -92,12 +83,12 @@ def test_histograms_are_those_of_the_report():
     for axes, name in zip(
         histograms_figure(report).axes, ("rho_histogram", "dihedral_histogram"), strict=True
     ):
-        outlines = {p.get_label(): p.get_data() for p in axes.patches if p.get_label()}
-        assert list(outlines) == [p.title for p in finished(report)]
-        for pipeline in finished(report):
+        outlines = [patch for patch in axes.patches if patch.get_label()]
+        for patch, pipeline in zip(outlines, finished(report), strict=True):
+            assert patch.get_label() == pipeline.title
             histogram = getattr(pipeline.median.measurement, name)
-            assert_array_equal(outlines[pipeline.title].values, histogram.fraction)
-            assert_array_equal(outlines[pipeline.title].edges, histogram.edges)
+            assert_array_equal(patch.get_data().values, histogram.fraction)
+            assert_array_equal(patch.get_data().edges, histogram.edges)
 
 
 def test_bars_are_the_steps():
@@ -122,19 +113,12 @@ def test_bars_are_the_steps():
 
 @pytest.mark.full
 def test_cutaways_are_drawn(small, tmp_path, opengl):
-    image, both = small
-    meshes = [both[0], both[1], both[0], both[1]]
-    cutaways(
-        meshes, [tetopt.cell_moments(image, mesh).mean for _, mesh in meshes], tmp_path / "a.png"
-    )
+    image, meshes = small
+    means = [tetopt.cell_moments(image, mesh).mean for _, mesh in meshes]
+    cutaways(meshes * 2, means * 2, tmp_path / "a.png")
     pixels = np.asarray(PIL.Image.open(tmp_path / "a.png").convert("L"))
     assert pixels.shape == (2000, 2200)
-    for part in (
-        pixels[:1000, :1100],
-        pixels[:1000, 1100:],
-        pixels[1000:, :1100],
-        pixels[1000:, 1100:],
-    ):
+    for part in pixels.reshape(2, 1000, 2, 1100).swapaxes(1, 2).reshape(4, 1000, 1100):
         assert part[200:800, 200:900].std() > 15.0
 
 
@@ -147,6 +131,7 @@ def test_colours_do_not_depend_on_what_failed():
         {line.get_label(): line.get_color() for line in labels_figure(each).axes[0].lines}
         for each in (report, fewer)
     )
-    for each in finished(fewer):
-        assert part[each.title] == whole[each.title]
+    assert [part[each.title] for each in finished(fewer)] == [
+        whole[each.title] for each in finished(fewer)
+    ]
     assert first.title not in part

@@ -16,9 +16,7 @@ def inner(surfaces: Surfaces):
 
 
 def edge_counts(triangles):
-    edges = np.sort(
-        np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1
-    )
+    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     return np.unique(edges, axis=0, return_counts=True)
 
 
@@ -31,9 +29,8 @@ def test_thresholds_are_multi_otsu(classes):
     values = np.concatenate([rng.normal(40.0 * k, 6.0, 400 * (k + 1)) for k in range(5)])
     # Theirs are the centres of the classes' last bins; a class ends where that bin ends.
     theirs = filters.threshold_multiotsu(values, classes) + 0.5 * np.ptp(values) / 256
-    assert np.array_equal(
-        np.digitize(values, class_thresholds(values, classes)), np.digitize(values, theirs)
-    )
+    classes_of = [np.digitize(values, each) for each in (class_thresholds(values, classes), theirs)]
+    assert np.array_equal(*classes_of)
 
 
 @pytest.mark.parametrize(("labels", "tolerance"), [(None, 0.5), (LABELS, 1.0)])
@@ -42,12 +39,9 @@ def test_sphere(labels, tolerance):
     depth.
     """
     surfaces = interfaces(IMAGE, 5.0, classes=2, labels=labels)
-    centre = IMAGE.to_index(np.zeros(3)) * IMAGE.spacing
-    corners = surfaces.points[inner(surfaces)]
-    assert np.abs(np.linalg.norm(corners - centre, axis=2) - 20.0).max() < tolerance
-    assert (
-        np.abs(np.linalg.norm(corners.mean(axis=1) - centre, axis=1) - 20.0).max() < tolerance + 0.2
-    )
+    corners = surfaces.points[inner(surfaces)] - IMAGE.to_index(np.zeros(3)) * IMAGE.spacing
+    for places, near in ((corners, tolerance), (corners.mean(axis=1), tolerance + 0.2)):
+        assert np.abs(np.linalg.norm(places, axis=-1) - 20.0).max() < near
     _, count = edge_counts(inner(surfaces))
     assert (count == 2).all()  # closed
     assert surfaces.notes == []
@@ -65,10 +59,10 @@ def test_labels_conform_where_three_meet():
     edges, count = edge_counts(inner(surfaces))
     assert set(np.unique(count)) == {1, 2, 3}
     rim = surfaces.points[edges[count == 1]]
-    is_on_face = ((rim == surfaces.low) | (rim == surfaces.high)).any(axis=2)
-    assert is_on_face.all()  # open only on the box
-    assert np.any(rim[..., 1] == surfaces.low[1])
-    assert np.any(rim[..., 1] == surfaces.high[1])
+    is_low, is_high = rim == surfaces.low, rim == surfaces.high
+    assert (is_low | is_high).any(axis=2).all()  # open only on the box
+    assert is_low[..., 1].any()
+    assert is_high[..., 1].any()
 
 
 def test_isosurfaces_reach_the_box_and_nest():

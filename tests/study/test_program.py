@@ -2,7 +2,6 @@
 refusal.
 """
 
-import json
 import os
 import shlex
 import subprocess
@@ -12,18 +11,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import assert_refused, exit_code, numbers_in
 from numpy.testing import assert_array_equal
 from test_child import is_running, wait_for
 
 import tetopt
-from tetopt.cli import main
 from tetopt.fem.elasticity import check_fills_box
 from tetopt.geometry.simplex import orient_cells, volumes
 from tetopt.geometry.topology import boundary_facets
 from tetopt.study.isosurfaces import class_labels
-from tetopt.study.pipeline_process import run_in_child
 from tetopt.study.pipelines import PipelineInput
-from tetopt.study.program import by_program, parse_program, pipelines_with, put_on_sides
+from tetopt.study.program import by_program, parse_program, put_on_sides
 
 IMAGE = tetopt.load_phantom("sphere").image(voxel_mm=4.0)
 JOB = PipelineInput(IMAGE, None, 1000, classes=3)
@@ -65,10 +63,9 @@ def covered(mesh):
     the dent.
     """
     points = mesh.points.copy()
-    low = points[:, 2].min()
-    middle = points[:, :2].mean(axis=0)
-    on_side = np.flatnonzero(points[:, 2] == low)
-    node = on_side[np.argmin(np.linalg.norm(points[on_side, :2] - middle, axis=1))]
+    on_side = np.flatnonzero(points[:, 2] == points[:, 2].min())
+    away = points[on_side, :2] - points[:, :2].mean(axis=0)
+    node = on_side[np.argmin(np.linalg.norm(away, axis=1))]
     points[node, 2] += 2e-4
     facets = boundary_facets(mesh.cells)
     around = facets[(facets == node).any(axis=1)]
@@ -106,10 +103,8 @@ def test_labels_go_to_the_program_and_come_back(tmp_path):
     """Those of the image, on the cells that are left when flat ones are taken off; not others,
     nor without labels.
     """
-    given, mesh = (
-        tetopt.Image(7 * class_labels(IMAGE, 2).data, IMAGE.affine),
-        covered(scaled(lattice(300), 1)),
-    )
+    given = tetopt.Image(7 * class_labels(IMAGE, 2).data, IMAGE.affine)
+    mesh = covered(scaled(lattice(300), 1))
     number = np.arange(len(mesh.cells))
     labels = np.where(number % 2 == 0, 7 * (number // 2 % 2), 99)
     program = mesher(tmp_path, mesh, mesh, words="{labels} {output}", label=labels)
@@ -118,10 +113,8 @@ def test_labels_go_to_the_program_and_come_back(tmp_path):
     n = len(made.mesh.cells)
     assert n < len(mesh.cells)
     assert_array_equal(made.labels, np.where(number % 2 == 0, labels, -1)[:n])
-    assert (
-        made.notes[-1]
-        == f'{(number[:n] % 2 == 0).sum()} of {n} cells use the "label" in their file'
-    )
+    n_used = (number[:n] % 2 == 0).sum()
+    assert made.notes[-1] == f'{n_used} of {n} cells use the "label" in their file'
     assert by_program(JOB, program).labels is None
 
 
@@ -149,9 +142,10 @@ def test_a_boundary_near_the_box_is_put_on_it(shape):
     """Also one whose nodes lie a little inside, under cells that are all but flat: these are
     taken off.
     """
-    mesh, kept, notes = put_on_sides(IMAGE, shape(scaled(lattice(300), 1)))
+    whole = lattice(300)
+    mesh, kept, notes = put_on_sides(IMAGE, shape(scaled(whole, 1)))
     check_fills_box(IMAGE, mesh)
-    assert len(mesh.cells) == len(kept) == len(lattice(300).cells)
+    assert len(mesh.cells) == len(kept) == len(whole.cells)
     assert notes == ["its boundary was moved by up to 0.5 voxels onto the sides of the image's box"]
 
 
@@ -176,42 +170,18 @@ def test_failures(tmp_path):
 
 
 @pytest.mark.deep
-def test_limits_hold_for_what_it_starts(tmp_path):
-    """A program that never ends is killed with the child, and its files are gone."""
-    script = tmp_path / "slow.sh"
-    script.write_text(f'echo "$2" > {tmp_path / "path"}; exec sleep 600\n')
-    pipeline = pipelines_with([parse_program(f"mine=sh {script} {{image}} {{output}}")])["mine"]
-    outcome = run_in_child(pipeline.function, JOB, max_seconds=8.0)
-    assert outcome.failure == "out of time: killed after 8 s"
-    assert not Path((tmp_path / "path").read_text().strip()).parent.exists()
-
-
-@pytest.mark.deep
 def test_sigterm_ends_the_comparison_and_its_programs(tmp_path):
     """As a scheduler sends it: nothing is left running, and no temporary folder or report stays."""
     tetopt.save_image(tmp_path / "image.nii.gz", IMAGE)
     script, pid_file, temporary = tmp_path / "slow.sh", tmp_path / "pid", tmp_path / "temporary"
     script.write_text(f"echo $$ > {pid_file}.new; mv {pid_file}.new {pid_file}; exec sleep 600\n")
     temporary.mkdir()
-    words = [
-        "compare",
-        str(tmp_path / "image.nii.gz"),
-        "-o",
-        str(tmp_path / "out"),
-        "--nodes",
-        "150",
-    ]
-    words += [
-        "--reference-dofs",
-        "1000",
-        "--pipelines",
-        "bcc",
-        "--pipeline",
-        f"mine=sh {script} {{image}} {{output}}",
-    ]
+    words = "compare image.nii.gz -o out --nodes 150 --reference-dofs 1000 --pipelines bcc"
+    program = f"mine=sh {script} {{image}} {{output}}"
     paths = os.pathsep.join([str(Path(tetopt.__file__).parents[1]), *filter(None, sys.path)])
     command = subprocess.Popen(
-        [sys.executable, "-m", "tetopt", *words],
+        [sys.executable, "-m", "tetopt", *words.split(), "--pipeline", program],
+        cwd=tmp_path,
         stderr=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         env=os.environ | {"PYTHONPATH": paths, "TMPDIR": str(temporary)},
@@ -246,60 +216,43 @@ def test_sigterm_ends_the_comparison_and_its_programs(tmp_path):
         ("tetopt=sh {image} {output}", 'expected unique names, got "tetopt" again'),
     ],
 )
-def test_bad_commands(text, words, tmp_path, capsys):
+def test_bad_commands(text, words, here, capsys):
     """One line, exit 2, before anything runs."""
-    tetopt.save_image(tmp_path / "image.nii.gz", IMAGE)
-    assert (
-        main(
-            [
-                "compare",
-                str(tmp_path / "image.nii.gz"),
-                "-o",
-                str(tmp_path / "out"),
-                "--pipeline",
-                text,
-            ]
-        )
-        == 2
-    )
-    assert words in capsys.readouterr().err.strip().splitlines()[-1]
-    assert not (tmp_path / "out").exists()
+    tetopt.save_image("image.nii.gz", IMAGE)
+    command = f"compare image.nii.gz -o out --pipeline {shlex.quote(text)}"
+    assert_refused(capsys, command, words)
 
 
 @pytest.mark.slow
-def test_programs_in_the_comparison(tmp_path, opengl):
+def test_programs_in_the_comparison(here, opengl):
     """A row as the others have; one that does not fill the box has all but the compression."""
-    tetopt.save_image(tmp_path / "image.nii.gz", IMAGE)
-    script, out = tmp_path / "mesher.py", tmp_path / "out"
-    script.write_text(
+    tetopt.save_image("image.nii.gz", IMAGE)
+    Path("mesher.py").write_text(
         "import sys, tetopt\nimage = tetopt.load_image(sys.argv[2])\n"
         "mesh = tetopt.lattice_mesh(image, nodes=round(2 / 3 * int(sys.argv[3])))\n"
         "tetopt.save_mesh(sys.argv[4], tetopt.Mesh(float(sys.argv[1]) * mesh.points, mesh.cells))\n"
     )
-    options = ["--nodes", "300", "--reference-dofs", "6000", "--pipelines", "bcc"]
-    fine, small = (
-        f"{name}={PYTHON} {script} {factor} {{image}} {{nodes}} {{output}}"
-        for name, factor in (("mine", "1"), ("other", "0.7"))
-    )
-    words = ["compare", str(tmp_path / "image.nii.gz"), "-o", str(out), *options]
-    assert main([*words, "--pipeline", fine, "--pipeline", small]) == 0
-    report = json.loads((out / "report.json").read_text())
+    programs = {
+        name: f"{PYTHON} {here}/mesher.py {factor} {{image}} {{nodes}} {{output}}"
+        for name, factor in (("mine", 1), ("other", 0.7))
+    }
+    words = "compare image.nii.gz -o out --nodes 300 --reference-dofs 6000 --pipelines bcc"
+    for name, program in programs.items():
+        words += f" --pipeline {shlex.quote(f'{name}={program}')}"
+    assert exit_code(words) == 0
+    report = numbers_in("out/report.json")
     bcc, mine, other = report["pipelines"]
-    assert [mine["kind"], mine["title"], mine["about"]] == [
-        "peer",
-        "mine",
-        f"a program: {fine.partition('=')[2]}",
-    ]
+    about = [mine["kind"], mine["title"], mine["about"]]
+    assert about == ["peer", "mine", f"a program: {programs['mine']}"]
     assert report["options"]["programs"] == [
-        {"name": name, "command": text.partition("=")[2]}
-        for name, text in (("mine", fine), ("other", small))
+        {"name": name, "command": program} for name, program in programs.items()
     ]
-    assert [abs(each["median"]["n_nodes"] / 300 - 1) < 0.2 for each in report["quadratic"]] == [
-        True
-    ] * 3
-    assert set(mine["median"]["fem"]) == set(bcc["median"]["fem"]) == {"0.3", "0.45"}
-    assert mine["median"]["E_D_fraction"] == pytest.approx(bcc["median"]["E_D_fraction"], rel=0.1)
-    assert other["median"]["fem"] == {}
-    assert "of its boundary facets lie off" in other["median"]["not_compressed"]
-    assert 0.0 < other["median"]["labels"][0]["dice"] < 1.0
-    assert "other: not compressed: " in (out / "report.html").read_text()
+    n_nodes = [each["median"]["n_nodes"] for each in report["quadratic"]]
+    assert n_nodes == pytest.approx([300] * 3, rel=0.2)
+    mine, bcc, other = (each["median"] for each in (mine, bcc, other))
+    assert set(mine["fem"]) == set(bcc["fem"]) == {"0.3", "0.45"}
+    assert mine["E_D_fraction"] == pytest.approx(bcc["E_D_fraction"], rel=0.1)
+    assert other["fem"] == {}
+    assert "of its boundary facets lie off" in other["not_compressed"]
+    assert 0.0 < other["labels"][0]["dice"] < 1.0
+    assert "other: not compressed: " in Path("out/report.html").read_text()
