@@ -7,7 +7,6 @@ import json
 
 import numpy as np
 import PIL.Image
-import PIL.ImageDraw
 
 from tetopt.cohort.layout import failure_path, log_path, mesh_name, numbers_path, subject_folder
 
@@ -21,10 +20,14 @@ def key_of(k):
 
 def run_of(rng, affine=None, mask_volume=None, lost=None, violated=None, absent=None):
     """What run.json holds of a run, but for what nobody reads here."""
+
+    def scattered(value, spread):
+        return value * float(np.exp(spread * rng.normal()))
+
     affine = np.diag([1.0, 1.0, 1.2, 1.0]) if affine is None else affine
-    volume = 1.43e6 * float(np.exp(0.09 * rng.normal())) if mask_volume is None else mask_volume
-    seconds = 120.0 * float(np.exp(0.2 * rng.normal()))
-    n_cells = round(45000 * float(np.exp(0.03 * rng.normal())))
+    volume = scattered(1.43e6, 0.09) if mask_volume is None else mask_volume
+    seconds = scattered(120.0, 0.2)
+    n_cells = round(scattered(45000, 0.03))
     sizes = volume * np.array([0.9, 0.003, 0.003]) * np.exp(0.1 * rng.normal(size=3))
     labels = [
         {
@@ -56,7 +59,7 @@ def run_of(rng, affine=None, mask_volume=None, lost=None, violated=None, absent=
         "versions": {"tetopt": "0.1.0", "numpy": "2.4.6"},
         "energies": {
             "E": 0.8,
-            "E_D_fraction_of_variance": float(0.12 * np.exp(0.08 * rng.normal())),
+            "E_D_fraction_of_variance": scattered(0.12, 0.08),
         },
         "quality": {
             "ndim": 3,
@@ -70,7 +73,7 @@ def run_of(rng, affine=None, mask_volume=None, lost=None, violated=None, absent=
         "seconds": {"load": 0.1 * seconds, "optimize": 0.8 * seconds, "all": seconds},
         "memory": {
             "predicted_bytes": 1.3e9,
-            "peak_bytes": round(1.1e9 * float(np.exp(0.04 * rng.normal()))),
+            "peak_bytes": round(scattered(1.1e9, 0.04)),
         },
         "violated": violated or {},
         "size": {"order": 1, "n_nodes": 8000, "n_nodes_in_all": 8000, "n_cells": n_cells},
@@ -86,23 +89,10 @@ def run_of(rng, affine=None, mask_volume=None, lost=None, violated=None, absent=
     }
 
 
-def thumbnail(rng, is_flipped=False):
-    """A picture of 256 x 128 in a palette: two heads."""
-    picture = PIL.Image.new("L", (256, 128))
-    draw = PIL.ImageDraw.Draw(picture)
-    for left in (0, 128):
-        wide, tall = rng.integers(38, 50), rng.integers(48, 60)
-        draw.ellipse(
-            (left + 64 - wide, 64 - tall, left + 64 + wide, 64 + tall), fill=170, outline=250
-        )
-        y = 90 if is_flipped else 30
-        draw.ellipse((left + 54, y - 10, left + 74, y + 10), fill=90)
-    noise = rng.integers(0, 3, (128, 256)) * 12
-    pixels = np.where(
-        np.asarray(picture) > 0, np.clip(np.asarray(picture) + noise, 0, 255), 0
-    ).astype(np.uint8)
+def thumbnail(k):
+    """A picture of 256 x 128 in a palette, of a grey of its own."""
     stream = io.BytesIO()
-    PIL.Image.fromarray(pixels // 8 * 8).convert("P").save(stream, "PNG", optimize=True)
+    PIL.Image.new("L", (256, 128), k).convert("P").save(stream, "PNG")
     return stream.getvalue()
 
 
@@ -143,17 +133,16 @@ def save_cohort(out, n):
     """
     rng = np.random.default_rng(n)
     out.mkdir(parents=True, exist_ok=True)
-    pictures = [thumbnail(rng, k == 0) for k in range(21)]
+    reasons = (
+        "image.nii.gz: expected a NIfTI image, got a file that ends early",
+        f"ended by SIGKILL {HOSTILE}",
+    )
     for k in range(n):
-        if k % 20 == 2 and k % 100 != 82:
-            reason = [
-                "image.nii.gz: expected a NIfTI image, got a file that ends early",
-                f"ended by SIGKILL {HOSTILE}",
-            ]
-            save_failure(out, key_of(k), reason[(k // 20) % 2])
-        elif k % 100 != 82:
+        if k % 100 == 82:
+            continue
+        if k % 20 == 2:
+            save_failure(out, key_of(k), reasons[(k // 20) % 2])
+        else:
             odd = ODD.get(k % 100, {})
-            save_run(
-                out, key_of(k), run_of(rng, **odd), pictures[0 if "affine" in odd else 1 + k % 20]
-            )
+            save_run(out, key_of(k), run_of(rng, **odd), thumbnail(k % 20))
     return [key_of(k) for k in range(n)]

@@ -21,7 +21,11 @@ def cohort(tmp_path_factory):
     """Its folder and its page, of 100 subjects."""
     out = tmp_path_factory.mktemp("cohort")
     save_cohort_files(out, collect(out, save_cohort(out, 100)))
-    return out, (out / "cohort.html").read_text(encoding="utf-8")
+    return out, page_of(out)
+
+
+def page_of(out):
+    return (out / "cohort.html").read_text(encoding="utf-8")
 
 
 def data_of(text):
@@ -32,27 +36,22 @@ def data_of(text):
 
 def test_failures_are_on_top_with_their_logs(cohort):
     out, text = cohort
-    assert sorted(path.name for path in out.glob("cohort.*")) == [
-        "cohort.html",
-        "cohort.json",
-        "cohort.tsv",
-    ]
+    names = {path.name for path in out.glob("cohort.*")}
+    assert names == {"cohort.html", "cohort.json", "cohort.tsv"}
     assert "100 subjects: 94 done, 1 with a violated requirement, 4 failed, 1 not run." in text
-    assert (
-        text.index("<h2>Failed: 4</h2>")
-        < text.index("<h2>Distributions</h2>")
-        < text.index("<h2>Subjects</h2>")
-    )
-    failures = re.findall(
-        r"<tr><td>([^<]*)</td><td>(.*?)</td></tr>", text[: text.index("<h2>Distributions")]
-    )
-    early, killed = (
+    top, _, rest = re.split("<h2>Distributions</h2>|<h2>Subjects</h2>", text)
+    assert "<h2>Failed: 4</h2>" in top
+    # the colours of pictures are told above them
+    words = "Orange is the mesh, blue the outline of the mask, other colours are labels."
+    assert words in rest[: rest.index('<div id="subjects">')]
+    reasons, links = zip(*re.findall(r"<tr><td>([^<]*)</td><td>(.*?)</td></tr>", top), strict=True)
+    assert list(map(html.unescape, reasons)) == [
         "image.nii.gz: expected a NIfTI image, got a file that ends early",
         f"ended by SIGKILL {plain(HOSTILE)}",
-    )
-    assert [html.unescape(reason) for reason, _ in failures] == [early, killed]
-    links = [re.findall(r'<a href="logs/([^"]*).log">([^<]*)</a>', names) for _, names in failures]
-    assert links == [[(key_of(k), key_of(k)) for k in ks] for ks in ((2, 42), (22, 62))]
+    ]
+    for names, ks in zip(links, ((2, 42), (22, 62)), strict=True):
+        keys = re.findall(r'<a href="logs/([^"]*).log">([^<]*)</a>', names)
+        assert keys == [(key_of(k), key_of(k)) for k in ks]
 
 
 def test_what_differs_is_said_with_how_many(tmp_path):
@@ -64,29 +63,16 @@ def test_what_differs_is_said_with_how_many(tmp_path):
         if k == 9:
             # the latter is options.k_D
             run["request"]["options"] |= {"gradation": HOSTILE, "k-d": "0.9"}
-        save_run(tmp_path, key_of(k), run, thumbnail(rng))
+        save_run(tmp_path, key_of(k), run, thumbnail(k))
     save_cohort_files(tmp_path, collect(tmp_path))
-    text = (tmp_path / "cohort.html").read_text(encoding="utf-8")
+    text = page_of(tmp_path)
     hostile = html.escape(plain(plain(HOSTILE)))
     words = f"nodes: 300 (8), 250 (2); k_D: 10 values; gradation: none (9), {hostile} (1)."
     assert f"Differences, with numbers of subjects: {words}" in text
-    assert {"options.nodes", "options.k_D", "request.options.gradation"} <= {
-        column["name"] for column in data_of(text)["columns"]
-    }
+    columns = {column["name"] for column in data_of(text)["columns"]}
+    assert {"options.nodes", "options.k_D", "request.options.gradation"} <= columns
     assert "Common to all meshes: tetopt 0.1.0, method fast, young 3.0, format .vtu." in text
-    assert re.search(
-        r"Meshing took [\d.]+ min of computing time, excluding start-up and pictures[.]", text
-    )
-
-
-def test_the_colours_of_pictures_are_told_above_them(cohort, tmp_path):
-    _, text = cohort
-    words = "Orange is the mesh, blue the outline of the mask, other colours are labels."
-    assert text.index("<h2>Subjects</h2>") < text.index(words) < text.index('<div id="subjects">')
-    save_run(tmp_path, "sub-1", {"violated": {}})
-    save_cohort_files(tmp_path, collect(tmp_path))
-    # there is no picture
-    assert words not in (tmp_path / "cohort.html").read_text(encoding="utf-8")
+    assert re.search(r"Meshing took [\d.]+ min of computing time, ", text)
 
 
 def test_names_do_no_harm(cohort):
@@ -117,16 +103,19 @@ def test_of_many_subjects_the_odd_have_pictures(cohort, monkeypatch):
     rows = collect(out)
     monkeypatch.setattr(page, "PAGE_PICTURES", 20)
     save_cohort_files(out, rows)
-    text = (out / "cohort.html").read_text(encoding="utf-8")
+    text = page_of(out)
     pictured = {int(place) for place in data_of(text)["pictures"]}
     assert len(pictured) == 20
     assert {place for place, own in enumerate(flags_of(rows)) if own} <= pictured
     assert "The page has 20 of them, flagged subjects first; the rest are linked." in text
 
 
-def test_a_cohort_of_nothing_has_a_page(tmp_path):
+def test_a_page_without_subjects_or_pictures(tmp_path):
     save_cohort_files(tmp_path, [])
-    assert "0 subjects: none." in (tmp_path / "cohort.html").read_text(encoding="utf-8")
+    assert "0 subjects: none." in page_of(tmp_path)
+    save_run(tmp_path, "sub-1", {"violated": {}})
+    save_cohort_files(tmp_path, collect(tmp_path))
+    assert "Orange is the mesh" not in page_of(tmp_path)
 
 
 # What a reader does, one step after the other, and what is there then.
@@ -164,18 +153,13 @@ def test_a_browser_sorts_and_filters(cohort, tmp_path):
     out, text = cohort
     made = document(copied(text, tmp_path / "a.html", FRAMES, STEPS), "--window-size=1280,900")
     said = re.findall(r'<p class="said"[^>]*>([^<]*)</p>', made)
-    rows = [row for row in collect(out) if row.numbers.get("quality.mean_rho") is not None]
-    rising = [
-        row.key
-        for row in sorted(rows, key=lambda row: float(f"{row.numbers['quality.mean_rho']:.4g}"))
-    ]
+    rho = {row.key: row.numbers.get("quality.mean_rho") for row in collect(out)}
+    rising = sorted(filter(rho.get, rho), key=lambda key: float(f"{rho[key]:.4g}"))
+    n_odd = sum(map(bool, flags_of(collect(out)))) + 5
     assert said[0].startswith(key_of(43))  # a requirement violated
-    assert said[3] == said[0]
-    assert said[1].split()[0] == rising[0]
-    assert said[2].split()[0] == rising[-1]
-    assert said[4] == " ".join(map(key_of, range(3)))
-    assert said[5] == " ".join(map(key_of, range(20, 23))) + "‹ before 21 to 40 of 100 next ›"
-    n_odd = sum(bool(own) for own in flags_of(collect(out))) + 5
+    assert [words.split()[0] for words in said[1:3]] == [rising[0], rising[-1]]
+    page = " ".join(map(key_of, range(20, 23))) + "‹ before 21 to 40 of 100 next ›"
+    assert said[3:6] == [said[0], " ".join(map(key_of, range(3))), page]
     assert f" of {n_odd} (100 in all)" in said[6]
     assert " of 4 (100 in all)" in said[7]
     assert said[8] == key_of(7)
@@ -205,7 +189,7 @@ def test_a_bar_says_what_lies_beyond_it(tmp_path):
     for k, volume in enumerate(volumes):
         save_run(tmp_path, key_of(k), run_of(rng, mask_volume=volume))
     save_cohort_files(tmp_path, collect(tmp_path))
-    text = (tmp_path / "cohort.html").read_text(encoding="utf-8")
+    text = page_of(tmp_path)
     made = document(copied(text, tmp_path / "a.html", FRAMES, BARS))
     lowest, highest, left, right = re.findall(r'<p class="said">([^<]*)</p>', made)
     assert re.fullmatch(

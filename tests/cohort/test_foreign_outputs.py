@@ -4,12 +4,13 @@ of no harm.
 
 import json
 import shutil
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 from attacks import KINDS, content, outside, planted
 from cohorts import run_of, save_run, thumbnail
-from commands import assert_refused, exit_code
+from commands import assert_refused, exit_code, numbers_in
 
 from tetopt.cohort import cohort_plan
 from tetopt.cohort.cohort_page import save_cohort_files
@@ -34,10 +35,9 @@ def out(tmp_path, image):
     (tmp_path / "t.tsv").write_text(f"subject\timage\n01\t{image}\n")
     out = tmp_path / "out"
     begin(out)
-    rng = np.random.default_rng(1)
-    run = run_of(rng)
+    run = run_of(np.random.default_rng(1))
     run["request"]["files"] = {}
-    save_run(out, KEY, run, thumbnail(rng))
+    save_run(out, KEY, run, thumbnail(1))
     log_path(out, KEY).write_text("all went well")
     save_cohort_files(out, collect(out))
     return out
@@ -45,6 +45,20 @@ def out(tmp_path, image):
 
 def words(out, *options):
     return ["cohort", out.parent / "t.tsv", "-o", out, *options]
+
+
+@contextmanager
+def unchanged(folder):
+    before = content(folder)
+    yield
+    assert content(folder) == before
+
+
+def said_of(capfd):
+    """The line of each fault, where nothing else was said."""
+    captured = capfd.readouterr()
+    assert captured.out == ""
+    return [line for line in captured.err.splitlines() if line.startswith("tetopt: ")]
 
 
 ATTACKS = [
@@ -60,23 +74,20 @@ ATTACKS = [
 @pytest.mark.parametrize(("name", "kind"), ATTACKS)
 def test_what_is_not_tetopts_is_one_line_and_stays(out, capfd, name, kind):
     planted(kind, out / name, outside(out.parent))
-    before = content(out.parent)
     for options in (["--collect"], []):
-        assert exit_code(*words(out, *options)) == 2
-        captured = capfd.readouterr()
-        (line,) = [each for each in captured.err.splitlines() if each.startswith("tetopt: ")]
+        with unchanged(out.parent):
+            assert exit_code(*words(out, *options)) == 2
+        (line,) = said_of(capfd)
         assert line.startswith(f"tetopt: {out / name}: "), line
-        assert captured.out == ""
-        assert content(out.parent) == before
 
 
 def test_a_description_that_is_a_link_is_not_taken_for_a_cohorts(out, capfd):
     elsewhere = outside(out.parent)
     shutil.move(out / "dataset_description.json", elsewhere / "notes.txt")
     planted("file link", out / "dataset_description.json", elsewhere)
-    before = content(out.parent)
-    assert_refused(capfd, words(out, "--collect"), "dataset_description.json: expected no link")
-    assert content(out.parent) == before
+    with unchanged(out.parent):
+        said = "dataset_description.json: expected no link"
+        assert_refused(capfd, words(out, "--collect"), said)
 
 
 def moved(out, place):
@@ -90,27 +101,19 @@ def moved(out, place):
 
 @pytest.mark.parametrize("name", [KEY, f"{KEY}/figures"])
 def test_a_subjects_folder_that_is_a_link_is_read_and_not_replaced(out, capfd, monkeypatch, name):
-    elsewhere = moved(out, out / name)
-    before = content(elsewhere)
-    assert exit_code(*words(out, "--collect")) == 0
-    with monkeypatch.context() as patch:  # what is asked for is what is there
-        patch.setattr(
-            cohort_plan,
-            "job_request",
-            lambda *_: json.loads(numbers_path(out, KEY).read_text())["request"],
-        )
-        assert exit_code(*words(out)) == 0
-    assert "1 subject: 1 done; 0 to run" in capfd.readouterr().err
-    whole = content(out.parent)
-    assert exit_code(*words(out)) == 2
-    assert (
-        f"tetopt: {out / name}: expected the subject's folder, got a link to"
-        in capfd.readouterr().err
-    )
-    assert content(out.parent) == whole
-    with pytest.raises(InputError, match=f"^{out / name}: expected the subject's folder"):
-        publish(out / ".work" / "sub-01.run-1", out, KEY)
-    assert content(elsewhere) == before
+    expected = f"{out / name}: expected the subject's folder, got a link to"
+    with unchanged(moved(out, out / name)):
+        assert exit_code(*words(out, "--collect")) == 0
+        request = numbers_in(numbers_path(out, KEY))["request"]
+        with monkeypatch.context() as patch:  # what is asked for is what is there
+            patch.setattr(cohort_plan, "job_request", lambda *_: request)
+            assert exit_code(*words(out)) == 0
+        assert "1 subject: 1 done; 0 to run" in capfd.readouterr().err
+        with unchanged(out.parent):
+            assert exit_code(*words(out)) == 2
+            assert f"tetopt: {expected}" in capfd.readouterr().err
+        with pytest.raises(InputError, match=f"^{expected}"):
+            publish(out / ".work" / "sub-01.run-1", out, KEY)
 
 
 def test_sessions_of_a_subject_that_is_a_link_are_not_replaced(out, image, capfd):
@@ -119,27 +122,21 @@ def test_sessions_of_a_subject_that_is_a_link_are_not_replaced(out, image, capfd
     shutil.move(place, outside(out.parent) / "disk")
     place.symlink_to(out.parent / "outside" / "disk")
     (out.parent / "t.tsv").write_text(f"subject\tsession\timage\n02\ta\t{image}\n02\tb\t{image}\n")
-    before = content(out.parent)
-    assert exit_code(*words(out)) == 2
-    assert (
-        capfd.readouterr().err.count(
-            f"tetopt: {place}: expected the subject's folder, got a link to"
-        )
-        == 1
-    )
-    assert content(out.parent) == before
+    with unchanged(out.parent):
+        assert exit_code(*words(out)) == 2
+    (line,) = said_of(capfd)
+    assert line.startswith(f"tetopt: {place}: expected the subject's folder, got a link to")
 
 
 def test_links_that_a_user_has_put_beside_a_mesh_stay_links(out):
     elsewhere = outside(out.parent)
     (out / KEY / "results").symlink_to(elsewhere)
-    before = content(elsewhere)
     work = out / ".work" / "sub-01.run-1"
     work.mkdir()
     (work / "a.txt").write_text("new")
-    publish(work, out, KEY)
+    with unchanged(elsewhere):
+        publish(work, out, KEY)
     assert (out / KEY / "results").readlink() == elsewhere
-    assert content(elsewhere) == before
 
 
 def test_foreign_files_in_the_work_directory_stay(out):
@@ -149,30 +146,28 @@ def test_foreign_files_in_the_work_directory_stay(out):
     (out / ".work" / "sub-01.run-1").mkdir()
     (out / ".work" / "sub-01.run-1" / "link").symlink_to(elsewhere)
     (out / ".work" / "sub-01.run-3").symlink_to(elsewhere)
-    before = content(elsewhere)
-    clean(out)
+    with unchanged(elsewhere):
+        clean(out)
     assert content(out / ".work") == mine
-    assert content(elsewhere) == before
 
 
-def test_outputs_that_are_links_are_read_and_replaced(out, monkeypatch):
+def test_outputs_that_are_links_are_read_and_replaced(out):
     """As those of a folder under version control."""
-    elsewhere = outside(out.parent)
-    for number, path in enumerate((numbers_path(out, KEY), thumbnail_path(out, KEY))):
+    elsewhere, paths = outside(out.parent), (numbers_path(out, KEY), thumbnail_path(out, KEY))
+    for number, path in enumerate(paths):
         shutil.move(path, elsewhere / str(number))
         path.symlink_to(elsewhere / str(number))
-    before = content(elsewhere)
-    assert exit_code(*words(out, "--collect")) == 0
-    page = (out / "cohort.html").read_text()
-    assert len(json.loads(page.partition('"pictures":')[2].partition("}")[0] + "}")) == 1
-    work = out / ".work" / "sub-01.run-1"
-    (work / "figures").mkdir(parents=True)
-    for path in (numbers_path(out, KEY), thumbnail_path(out, KEY)):
-        (work / path.relative_to(out / KEY)).write_text("new")
-    publish(work, out, KEY)
-    assert numbers_path(out, KEY).read_text() == thumbnail_path(out, KEY).read_text() == "new"
-    assert not numbers_path(out, KEY).is_symlink()
-    assert content(elsewhere) == before
+    with unchanged(elsewhere):
+        assert exit_code(*words(out, "--collect")) == 0
+        page = (out / "cohort.html").read_text()
+        assert len(json.loads(page.partition('"pictures":')[2].partition("}")[0] + "}")) == 1
+        work = out / ".work" / "sub-01.run-1"
+        (work / "figures").mkdir(parents=True)
+        for path in paths:
+            (work / path.relative_to(out / KEY)).write_text("new")
+        publish(work, out, KEY)
+        assert [path.read_text() for path in paths] == ["new", "new"]
+        assert not paths[0].is_symlink()
 
 
 def test_a_description_that_is_no_file_is_not_read(out, capfd):

@@ -53,15 +53,14 @@ def test_a_file_and_no_folder_are_refused(tmp_path):
 
 def test_what_is_published_takes_the_place_of_what_was_there(out):
     """A crash before its numbers are there leaves a subject without any, which is run again."""
+    key = "sub-1_ses-a"
+    place, numbers = subject_folder(out, key), mesh_name(key, ".json")
     for text in ("first", "second"):
-        work = work_of(out, "sub-1_ses-a", text)
+        work = work_of(out, key, text, ".json")
         (work / "figures").mkdir(exist_ok=True)
         (work / "figures" / f"{text}.png").touch()
-        numbers = work / mesh_name("sub-1_ses-a", ".json")
-        numbers.touch()
-        publish(work, out, "sub-1_ses-a")
-        place = subject_folder(out, "sub-1_ses-a")
-        names = ["a.txt", "figures", f"figures/{text}.png", numbers.name]
+        publish(work, out, key)
+        names = ["a.txt", "figures", f"figures/{text}.png", numbers]
         assert sorted(str(each.relative_to(place)) for each in place.rglob("*")) == names
         assert (place / "a.txt").read_text() == text
 
@@ -74,7 +73,7 @@ def test_numbers_come_last(out, monkeypatch):
     publish(work, out, "sub-1")
     assert moved[-1] == mesh_name("sub-1", ".json")
     assert len(moved) == 3
-    assert [each.name for each in subject_folder(out, "sub-1").iterdir()] == ["a.txt"]
+    assert os.listdir(subject_folder(out, "sub-1")) == ["a.txt"]
 
 
 def test_what_ended_runs_have_left_is_removed(out):
@@ -85,11 +84,7 @@ def test_what_ended_runs_have_left_is_removed(out):
     other = work_of(out, "sub-2", "another run's")
     (out / ".work" / "sub-1.lock").touch()
     clean(out, ["sub-1"])
-    assert sorted((out / ".work").iterdir()) == [
-        out / ".work" / "sub-1.lock",
-        other,
-        out / ".work" / "tetopt-lock",
-    ]
+    assert set(os.listdir(out / ".work")) == {"sub-1.lock", other.name, "tetopt-lock"}
     clean(out)
     assert not other.exists()
 
@@ -102,9 +97,5 @@ def test_what_a_user_has_put_beside_a_mesh_stays(out):
     (place / "results" / "stress.frd").write_text("mine")
     work = work_of(out, "sub-1", "second", ".vtu")
     publish(work, out, "sub-1")
-    assert sorted(each.name for each in place.iterdir()) == [
-        "a.txt",
-        "results",
-        "sub-1_desc-tetopt_mesh.vtu",
-    ]
+    assert set(os.listdir(place)) == {"a.txt", "results", "sub-1_desc-tetopt_mesh.vtu"}
     assert (place / "results" / "stress.frd").read_text() == "mine"

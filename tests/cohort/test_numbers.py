@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cohorts import HOSTILE, key_of, run_of, save_cohort, save_failure, save_run
+from nibabel.orientations import aff2axcodes
 
 import tetopt.cohort
-from tetopt.cohort.layout import failure_path, mesh_name, numbers_path, subject_folder
+from tetopt.cohort.layout import failure_path, numbers_path
 from tetopt.cohort.numbers import (
     collect,
     column_names,
@@ -31,8 +32,7 @@ RNG = np.random.default_rng(0)
 @pytest.fixture(scope="module")
 def cohort(tmp_path_factory):
     out = tmp_path_factory.mktemp("cohort")
-    expected = save_cohort(out, 10)
-    return collect(out, [*expected, "sub-none_ses-b"])
+    return collect(out, [*save_cohort(out, 10), "sub-none_ses-b"])
 
 
 def test_rows_are_those_there_and_those_expected(cohort):
@@ -51,11 +51,9 @@ def test_rows_are_those_there_and_those_expected(cohort):
 
 
 def test_sessions_and_what_is_no_subject(tmp_path):
-    save_run(tmp_path, "sub-2_ses-b", run_of(RNG))
-    save_run(tmp_path, "sub-10", run_of(RNG))
-    save_run(
-        tmp_path, "sub-2_ses-a", run_of(RNG, violated={"min_dihedral": "two\nlines", "box": "out"})
-    )
+    violated = {"min_dihedral": "two\nlines", "box": "out"}
+    for key, words in (("sub-2_ses-b", {}), ("sub-10", {}), ("sub-2_ses-a", violated)):
+        save_run(tmp_path, key, run_of(RNG, violated=words))
     save_failure(tmp_path, "sub-1", "x")
     save_failure(tmp_path, "other", "x")
     (tmp_path / "sub-<b>").mkdir()
@@ -72,19 +70,15 @@ def test_numbers_that_are_none_are_a_failure(tmp_path, text):
     save_run(tmp_path, "sub-1", run_of(RNG))
     numbers_path(tmp_path, "sub-1").write_text(text)
     [row] = collect(tmp_path)
-    assert (row.status, row.reason, row.numbers) == (
-        "failed",
-        "its numbers cannot be read; run it again",
-        {},
-    )
+    assert (row.status, row.numbers) == ("failed", {})
+    assert row.reason == "its numbers cannot be read; run it again"
 
 
 def test_a_failure_is_told_instead_of_an_older_mesh(tmp_path):
     save_run(tmp_path, "sub-1", run_of(RNG), b"")
     save_failure(tmp_path, "sub-1", HOSTILE)
     [row] = collect(tmp_path)
-    assert row.files == {"log": "logs/sub-1.log"}
-    assert (row.status, row.numbers) == ("failed", {})
+    assert (row.status, row.numbers, row.files) == ("failed", {}, {"log": "logs/sub-1.log"})
     assert row.reason.isprintable()
     failure_path(tmp_path, "sub-1").write_text("{")
     assert collect(tmp_path)[0].reason == "sub-1.failed.json cannot be read"
@@ -92,33 +86,35 @@ def test_a_failure_is_told_instead_of_an_older_mesh(tmp_path):
 
 def test_numbers_without_a_mesh_are_a_failure(tmp_path):
     save_run(tmp_path, "sub-1", run_of(RNG), suffix=".inp")
-    assert collect(tmp_path)[0].files["mesh"].endswith("_mesh.inp")
-    (subject_folder(tmp_path, "sub-1") / mesh_name("sub-1", ".inp")).unlink()
+    mesh = collect(tmp_path)[0].files["mesh"]
+    assert mesh.endswith("_mesh.inp")
+    (tmp_path / mesh).unlink()
     assert collect(tmp_path)[0].reason == "its numbers exist, but its mesh is missing; run it again"
 
 
 def test_numbers_have_names_with_dots():
-    run = run_of(RNG)
-    run |= {
+    run = run_of(RNG) | {
         "materials": {"young_kPa": [1.0, 2.0], "nu": [0.1] * 5, "binning": None},
         "dropped_components": 2,
+        "contrasts": [{"image": "a", "weight": 2.0}] * 6,
     }
-    run |= {"contrasts": [{"image": "a", "weight": 2.0}] * 6}
     run["labels"][1]["lost_components"] = [{"voxels": 50, "place": [0.0, 1.0, 2.0]}] * 6
     columns = flatten_run(run)
     assert [value for name, value in columns.items() if "lost_components" in name] == [6]
-    assert columns["grid.orientation"] == "RAS"
-    assert columns["grid.spacing_mm"] == "1 x 1 x 1.2"
-    assert columns["grid.shape"] == "180 x 220 x 170"
+    expected = {
+        "grid.orientation": "RAS",
+        "grid.spacing_mm": "1 x 1 x 1.2",
+        "grid.shape": "180 x 220 x 170",
+        "quality.errors.mean": 0.09,
+        "materials.young_kPa.2": 2.0,
+        "contrasts.6.weight": 2.0,
+        "dropped_components": 2,
+        "labels.17.n_cells": 300,
+        "interfaces.0.area": 1000.0,
+        "request.options.young": "3.0",
+    }
+    assert columns | expected == columns
     assert columns["grid.volume_mm"] == pytest.approx(180 * 220 * 170 * 1.2)
-    assert columns["quality.errors.mean"] == 0.09
-    assert columns["materials.young_kPa.2"] == 2.0
-    assert not any(name.startswith("materials.nu") for name in columns)
-    assert columns["contrasts.6.weight"] == 2.0
-    assert columns["dropped_components"] == 2
-    assert columns["labels.17.n_cells"] == 300
-    assert columns["interfaces.0.area"] == 1000.0
-    assert columns["request.options.young"] == "3.0"
     assert "request.options.nodes" not in columns
     left_out = (
         "history",
@@ -128,43 +124,43 @@ def test_numbers_have_names_with_dots():
         "label_names",
         "inputs.sha256",
         "labels.0.label",
+        "materials.nu",
     )
     assert [name for name in columns if name.startswith(left_out)] == []
 
 
-def test_orientation_is_that_of_nibabel():
-    from nibabel.orientations import aff2axcodes
+@pytest.mark.parametrize("order", [[0, 1, 2], [2, 0, 1], [1, 0, 2]])
+@pytest.mark.parametrize("signs", [[1, 1, 1], [-1, 1, -1], [-1, -1, 1]])
+def test_orientation_is_that_of_nibabel(order, signs):
+    affine = np.eye(4)
+    affine[:3, :3] = np.diag(signs)[order] + 0.1
+    assert orientation_code(affine) == "".join(aff2axcodes(affine))
 
-    for order in ([0, 1, 2], [2, 0, 1], [1, 0, 2]):
-        for signs in ([1, 1, 1], [-1, 1, -1], [-1, -1, 1]):
-            affine = np.eye(4)
-            affine[:3, :3] = (np.eye(3) * signs)[order] + 0.1
-            assert orientation_code(affine) == "".join(aff2axcodes(affine))
-    turn = np.radians(12.3)
-    turned = np.array(
-        [[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]]
-    )
-    assert oblique_degrees(np.block([[turned * [1, 2, 3], np.ones((3, 1))], [0, 0, 0, 1]])) == 12.3
+
+def test_oblique_degrees():
+    affine = np.diag([1.0, 2.0, 3.0, 1.0])
+    c, s = np.cos(np.radians(12.3)), np.sin(np.radians(12.3))
+    affine[:2, :2] = [[c, -2 * s], [s, 2 * c]]
+    assert oblique_degrees(affine) == 12.3
 
 
 def test_the_table_reads_back(cohort, tmp_path):
     path = tmp_path / "cohort.tsv"
-    flags = [[HOSTILE, "b"]] + [[] for _ in cohort[1:]]
-    save_table(path, cohort, flags)
+    save_table(path, cohort, [[HOSTILE, "b"], *([] for _ in cohort[1:])])
     text = path.read_text(encoding="utf-8")
     assert text.count("\n") == len(cohort) + 1
-    assert all(line.isprintable() for line in text.replace("\t", "").splitlines())
+    assert text.replace("\t", "").replace("\n", "").isprintable()
     rows = list(csv.DictReader(text.splitlines(), delimiter="\t"))
     assert [row["participant_id"] for row in rows] == [*map(key_of, range(10)), "sub-none"]
     assert [row["session_id"] for row in rows] == ["n/a"] * 10 + ["ses-b"]
     assert rows[0]["flags"].endswith("; b")
     for row, line in zip(cohort, rows, strict=True):
         for name in column_names(cohort):
-            value = row.numbers.get(name)
-            if isinstance(value, int | float) and not isinstance(value, bool):
-                assert float(line[name]) == value  # to the last bit
-            elif value is None:
+            value = row.numbers.get(name, "n/a")
+            if value == "n/a":
                 assert line[name] == "n/a"
+            elif isinstance(value, int | float) and not isinstance(value, bool):
+                assert float(line[name]) == value  # to the last bit
     about = json.loads(path.with_suffix(".json").read_text())
     assert list(about) == list(rows[0])
     assert about["labels.17.volume"] == {
@@ -176,16 +172,12 @@ def test_the_table_reads_back(cohort, tmp_path):
 def test_no_text_is_a_formula():
     for first in "=+-@\uff1d":
         assert field_text(f"{first}1+1") == f"'{first}1+1"
-    assert field_text("\t=1") == r"\t=1"
-    assert field_text(-4.5) == "-4.5"
+    assert (field_text("\t=1"), field_text(-4.5)) == (r"\t=1", "-4.5")
 
 
 def test_every_column_is_described():
-    assert [
-        name
-        for name in flatten_run(run_of(RNG))
-        if description(name)["Description"].endswith("of run.json")
-    ] == []
+    texts = [description(name)["Description"] for name in flatten_run(run_of(RNG))]
+    assert [text for text in texts if text.endswith("of run.json")] == []
     assert description("options.k_D") == {"Description": "Option k_D"}
     assert description("quality_initial.min_edge")["Units"] == "mm"
     assert description("new.thing")["Description"] == "new.thing of run.json"

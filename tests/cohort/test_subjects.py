@@ -33,17 +33,11 @@ def test_a_table_says_what_is_meshed(tmp_path):
         "sub-01\tses-a\ta.nii\tb.nii\tn/a\t500\t\told",
         "02\t\t/c.nii\tn/a\tm.nii\tn/a\t0.3\t",
     )
-    first, second = read_table(path)
-    assert first == Subject(
-        "01", "a", (tmp_path / "a.nii", tmp_path / "b.nii"), {"nodes": "500"}, f"{path}, line 2"
-    )
-    assert second == Subject(
-        "02",
-        "",
-        (Path("/c.nii"),),
-        {"mask": str(tmp_path / "m.nii"), "k_d": "0.3"},
-        f"{path}, line 3",
-    )
+    images = tmp_path / "a.nii", tmp_path / "b.nii"
+    first = Subject("01", "a", images, {"nodes": "500"}, f"{path}, line 2")
+    options = {"mask": str(tmp_path / "m.nii"), "k_d": "0.3"}
+    second = Subject("02", "", (Path("/c.nii"),), options, f"{path}, line 3")
+    assert read_table(path) == [first, second]
     assert [key(first), key(second)] == ["sub-01_ses-a", "sub-02"]
 
 
@@ -54,20 +48,17 @@ def test_files_of_mappings_are_relative_to_the_table(tmp_path):
         "1\ta.nii\tmapping.csv\t0.3\t../rho.TOML",
     )
     (row,) = read_table(path)
-    mappings = {
+    assert row.options == {
         "young": str(tmp_path / "mapping.csv"),
         "nu": "0.3",
         "density": str(tmp_path.parent / "rho.TOML"),
     }
-    assert row.options == mappings
     labels = table(
         tmp_path / "l.tsv", "subject\timage\tmerge\tlabel_size", "1\ta.nii\tgroups.csv\tsizes.csv"
     )
     (other,) = read_table(labels)
-    assert other.options == {
-        "merge": str(tmp_path / "groups.csv"),
-        "label_size": str(tmp_path / "sizes.csv"),
-    }
+    files = {"merge": "groups.csv", "label_size": "sizes.csv"}
+    assert other.options == {name: str(tmp_path / file) for name, file in files.items()}
     (tmp_path / "inner").mkdir()
     write_table(tmp_path / "inner" / "u.tsv", [row])
     assert "\t../../rho.TOML\t0.3\t../mapping.csv\n" in (tmp_path / "inner" / "u.tsv").read_text()
@@ -128,34 +119,24 @@ def test_names_that_no_file_can_have_are_refused():
 
 
 def test_a_table_that_was_written_reads_the_same(tmp_path):
+    images = (tmp_path / "x.nii", Path("/far/y.nii")), (tmp_path / "z\tz.nii",)
     rows = [
-        subject(
-            "01", "a", images=(tmp_path / "x.nii", Path("/far/y.nii")), options={"background": "-5"}
-        ),
-        subject(
-            "02", "b", images=(tmp_path / "z\tz.nii",), options={"labels": str(tmp_path / "l.nii")}
-        ),
+        subject("01", "a", images=images[0], options={"background": "-5"}, place=""),
+        subject("02", "b", images=images[1], options={"labels": str(tmp_path / "l.nii")}, place=""),
     ]
     for name in ("t.tsv", "t.csv"):
         write_table(tmp_path / name, rows)
-        assert [each._replace(place="") for each in read_table(tmp_path / name)] == [
-            each._replace(place="") for each in rows
-        ]
+        assert [each._replace(place="") for each in read_table(tmp_path / name)] == rows
+
+
+PATTERN = "sub-{subject}/ses-{session}/sub-{subject}_ses-{session}_mask.nii"
 
 
 @pytest.mark.parametrize(
     ("pattern", "session", "name"),
     [
-        (
-            "sub-{subject}/ses-{session}/sub-{subject}_ses-{session}_mask.nii",
-            "b",
-            "sub-01/ses-b/sub-01_ses-b_mask.nii",
-        ),
-        (
-            "sub-{subject}/ses-{session}/sub-{subject}_ses-{session}_mask.nii",
-            "",
-            "sub-01/sub-01_mask.nii",
-        ),
+        (PATTERN, "b", "sub-01/ses-b/sub-01_ses-b_mask.nii"),
+        (PATTERN, "", "sub-01/sub-01_mask.nii"),
         ("sub-{subject}/**/*_mask.nii", "b", "sub-01/sub-01_mask.nii"),
         ("atlas.nii", "", "atlas.nii"),
     ],

@@ -94,14 +94,6 @@ def test_image_properties(image):
     )
 
 
-def test_total_variation_is_E_D_of_one_cell_around_everything():
-    image = Image(np.random.default_rng(0).normal(size=(5, 6, 7)), np.diag([0.5, 2.0, 3.0, 1.0]))
-    mesh = Mesh(
-        [[-99, -99, -99], [500, -99, -99], [-99, 500, -99], [-99, -99, 500]], [[0, 1, 2, 3]]
-    )
-    assert image_summary(image)["total_variation"] == pytest.approx(E_D(image, mesh), rel=1e-9)
-
-
 def test_a_constant_image_has_no_fractions(tmp_path):
     image = Image(np.full((8, 9), 7.0))
     made = optimize_paper(image, lattice_mesh(image, blocks=(2, 2)), iterations=1)

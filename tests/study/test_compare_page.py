@@ -275,20 +275,10 @@ def test_columns_without_numbers_are_left_out(tmp_path):
     assert ("Fidelity", "E_D, of the variance") not in shown
 
 
-def test_the_terminal_has_a_column_of_each_kind():
-    report = fake_report()
-    columns = [column for column in columns_of(report) if column.is_short]
-    assert [column.group for column in columns] == [
-        "Fidelity",
-        "Shape",
-        "Shape",
-        "Labels of most voxels",
-        "Error of the compression, ν = 0.3",
-        "Cost",
-        "Cost",
-    ]
-    assert [len(row.cells) for row in rows_of(report, columns)] == [7, 7, 0, 7, 7] * 2
-    arrows = {column.title: column.heading[len(column.title) :] for column in columns_of(report)}
+def test_arrows_point_to_better_values():
+    arrows = {
+        column.title: column.heading[len(column.title) :] for column in columns_of(fake_report())
+    }
     assert {title for title, arrow in arrows.items() if not arrow} == {"nodes", "cells"}
     assert (arrows["mean rho"], arrows["mean Dice"]) == (" ↑", " ↑")
     assert (arrows["seconds"], arrows["displacement"]) == (" ↓", " ↓")
@@ -441,6 +431,7 @@ def test_the_table_in_the_terminal_fits_into_80_columns(tmp_path, monkeypatch, c
     assert "…" not in text
     assert "\\" not in text
     columns = [column for column in columns_of(report) if column.is_short]
+    assert len(columns) == 7  # of each group one or two
     heads = text[: text.index("tetopt")].split()
     assert sorted(heads) == sorted(word for column in columns for word in column.heading.split())
     numbers = [text for row in rows_of(report, columns) for text, _ in row.cells]
