@@ -16,29 +16,8 @@ from unittest import mock
 import numpy as np
 
 # Functions of `os` that change what is in folders; the first argument is a path or an open file.
-STEPS = [
-    "open",
-    "fsync",
-    "replace",
-    "rename",
-    "unlink",
-    "remove",
-    "chmod",
-    "chown",
-    "mkdir",
-    "rmdir",
-]
-ALLOCATIONS = [
-    "empty",
-    "zeros",
-    "ones",
-    "full",
-    "empty_like",
-    "zeros_like",
-    "arange",
-    "concatenate",
-    "column_stack",
-]
+STEPS = "open fsync replace rename unlink remove chmod chown mkdir rmdir"
+ALLOCATIONS = "empty zeros ones full empty_like zeros_like arange concatenate column_stack"
 
 
 class Fault:
@@ -81,7 +60,7 @@ def steps_count(fault, folder):
 
         return step
 
-    def opened(real):
+    def opened(_, real):
         def step(file, mode="r", *others, **options):
             is_written = not isinstance(file, int) and set(mode) & set("wax+") and is_inside(file)
             if is_written:
@@ -91,8 +70,11 @@ def steps_count(fault, folder):
 
         return step
 
-    steps = [(os, name, stepped(name, getattr(os, name))) for name in STEPS if hasattr(os, name)]
-    with _patched([*steps, *((module, "open", opened(module.open)) for module in (io, builtins))]):
+    with (
+        _patched(os, STEPS, stepped),
+        _patched(io, "open", opened),
+        _patched(builtins, "open", opened),
+    ):
         yield fault
 
 
@@ -134,15 +116,17 @@ def arrays_count(fault):
 
         return allocated
 
-    with _patched([(np, name, counted(name, getattr(np, name))) for name in ALLOCATIONS]):
+    with _patched(np, ALLOCATIONS, counted):
         yield fault
 
 
 @contextmanager
-def _patched(functions):
+def _patched(module, names, wrapped):
+    """Within it these functions of a module are wrapped."""
     with ExitStack() as stack:
-        for module, name, function in functions:
-            stack.enter_context(mock.patch.object(module, name, function))
+        for name in names.split():
+            real = getattr(module, name)
+            stack.enter_context(mock.patch.object(module, name, wrapped(name, real)))
         yield
 
 
