@@ -51,7 +51,6 @@ OBLIQUE = np.array(
 WORLD_LETTERS = ["LR", "PA", "IS"]
 # of 48: the world axis that each voxel axis runs along, and in which direction
 ORIENTATIONS = [(w, s) for w in permutations(range(3)) for s in product((1, -1), repeat=3)][::5]
-each_orientation = pytest.mark.parametrize(("worlds", "signs"), ORIENTATIONS)
 some_orientations = pytest.mark.parametrize(("worlds", "signs"), ORIENTATIONS[::3])
 each_dimension = pytest.mark.parametrize("n", [2, 3])
 
@@ -140,21 +139,19 @@ def assert_in_place(view, horizontal, vertical):
     assert_allclose(view.size, [np.ptp(x), np.ptp(y)] + image.spacing[view.axes])
 
 
-@each_orientation
+@pytest.mark.parametrize(("worlds", "signs"), ORIENTATIONS)
 @pytest.mark.parametrize("normal", [0, 1, 2])
 def test_pixels_lie_where_the_letters_say(worlds, signs, normal):
-    """Sagittal, coronal, axial: right of the patient's left, up from posterior or inferior."""
-    view = SliceView(oriented_image(worlds, signs), axis=worlds.index(normal), index=3)
+    """Sagittal, coronal, axial: right of the patient's left, up from posterior or inferior; by
+    default the axial slice in the middle.
+    """
+    image = oriented_image(worlds, signs)
+    view = SliceView(image, worlds.index(normal), index=3)
     horizontal, vertical = np.delete(range(3), normal)
     assert view.letters == [WORLD_LETTERS[horizontal], WORLD_LETTERS[vertical]]
     assert_in_place(view, horizontal, vertical)
-
-
-@each_orientation
-def test_the_default_slice_is_axial_and_in_the_middle(worlds, signs):
-    view = middle_view(oriented_image(worlds, signs))
-    assert view.across == worlds.index(2)
-    assert view.index == SHAPE[view.across] // 2
+    default, across = middle_view(image), worlds.index(2)
+    assert (default.across, default.index) == (across, SHAPE[across] // 2)
 
 
 def test_an_oblique_image_is_laid_out_by_its_nearest_axes():

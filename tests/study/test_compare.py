@@ -267,4 +267,4 @@ def test_a_missing_peer_is_no_failure_of_it(head, tmp_path, monkeypatch, capsys)
 )
 def test_bad_input(head, here, options, words, capsys):
     assert exit_code(head.compare, "-o o", options) == 2
-    assert words in capsys.readouterr().err.splitlines()[-1]
+    assert words in capsys.readouterr().err.strip().splitlines()[-1]
