@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from models import LOAD_CASES, displaced, loaded_model, sample_model, young_of
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import refusal
 
-from tetopt.errors import InputError
 from tetopt.fem.solution import solve
 from tetopt.geometry.simplex import volumes
 from tetopt.io.febio import MOST_MATERIAL_PARTS, febio
@@ -132,26 +132,12 @@ def test_one_ratio_is_no_map():
     assert "v" not in feb.data
 
 
-def test_conditions_move_each_node_of_each_load():
-    model = sample_model()
-    root = ET.fromstring(febio(model))
-    prescribed = {}
-    for bc in root.find("Boundary"):
-        if bc.get("type") == "zero displacement":
-            assert [(dof.tag, dof.text) for dof in bc] == [
-                ("x_dof", "1"),
-                ("y_dof", "1"),
-                ("z_dof", "1"),
-            ]
-            prescribed[bc.get("node_set")] = [0.0, 0.0, 0.0]
-        else:
-            assert bc.get("type") == "prescribed displacement"
-            assert (
-                bc.find("value").get("lc") == "1" == root.find("LoadData/load_controller").get("id")
-            )
-            assert bc.find("dof").text == "xyz"[len(prescribed.setdefault(bc.get("node_set"), []))]
-            prescribed[bc.get("node_set")].append(float(bc.find("value").text))
-    assert prescribed == {load.set_name: load.numbers.tolist() for load in model.loads}
+def test_conditions_grow_with_time():
+    """From nothing to the whole; which node moves how far, the comparison with `fem` tells."""
+    root = ET.fromstring(febio(sample_model()))
+    (controller,) = root.findall("LoadData/load_controller")
+    values = root.findall("Boundary/bc/value")
+    assert {each.get("lc") for each in values} == {"1"} == {controller.get("id")}
     assert [pt.text for pt in root.iter("pt")] == ["0,0", "1,1"]
     steps = root.find("Control")
     assert int(steps.find("time_steps").text) * float(steps.find("step_size").text) == 1.0
@@ -251,12 +237,10 @@ def test_awkward_names():
     ],
 )
 def test_what_it_cannot_carry(model, message):
-    with pytest.raises(InputError, match=message) as caught:
+    with refusal(message):
         febio(model)
-    assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize("case", LOAD_CASES)
 def test_what_the_file_says_is_what_fem_solves(case, order):
     """Pressures on the file's own surfaces, forces, springs at small displacements, conditions;
@@ -320,7 +304,7 @@ def test_what_the_file_says_is_what_fem_solves(case, order):
 
 
 def test_several_steps_are_several_files():
-    with pytest.raises(InputError, match="febio: expected one step, got 2"):
+    with refusal("febio: expected one step, got 2"):
         febio(loaded_model(["1/hold:left", "2/hold:left"]))
 
 

@@ -9,10 +9,10 @@ import meshio
 import numpy as np
 import pytest
 from models import quadratic_model, sample_model
+from refusals import refusal
 from test_writers import READERS
 
 import tetopt
-from tetopt import InputError
 from tetopt.cli import main
 from tetopt.geometry.surface import extract_surface
 from tetopt.io import formats
@@ -20,13 +20,24 @@ from tetopt.io.abaqus import input_sets
 from tetopt.io.formats import FORMATS, file_bytes, save_mesh, save_model
 from tetopt.io.surfaces import save_surface
 from tetopt.io.text import plain
-from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.model.sets import Sets
 
 CORNER = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]]), np.array([[0, 1, 2, 3]])
 # What every format with a place for names can hold, and what none can: by what that is called
 # instead.
 KEPT = [
+    # words of formats
+    "METADATA",
+    "SCALARS",
+    "POINTS",
+    "CELL_DATA",
+    "FIELD",
+    "LOOKUP_TABLE",
+    "$EndNodes",
+    "*NODE",
+    "End",
+    "NumberOfPoints='1e99'",
+    '<Piece NumberOfCells="7">',
     "<x>",
     'a"b',
     "a&b;&lt;",
@@ -52,7 +63,11 @@ SHOWN = {
     "": "unnamed",
     " ": "unnamed_2",
 }
-IMAGE = 'a"<b>&-->\n*NODE\n$EndComments\r\0\x1b]0;title\x07\u202e\udcff é ' + 300 * "x" + ".nii"
+IMAGE = (
+    'a"<b>&-->\n*NODE\n\nVertices\n7\n$EndComments\r\0\x1b]0;title\x07\u202e\udcff é '
+    + 300 * "x"
+    + ".nii"
+)
 
 
 def hostile_model(suffix):
@@ -127,7 +142,7 @@ def test_no_name_breaks_a_file(suffix, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["{", "{0:>9}", "%s%n"])
-def test_braces_in_names_end_no_process(name, tmp_path):
+def test_braces_in_names_end_no_process(name, here):
     """VTK's writer of legacy files reads them as marks of its own, and ends the process."""
     model = sample_model()._replace(loads=())
     values = {
@@ -138,23 +153,22 @@ def test_braces_in_names_end_no_process(name, tmp_path):
     model = model._replace(cell_data=values, point_data=at_nodes, about={name: "x"})
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # they are called otherwise
-        save_model(tmp_path / "a.vtk", model)
-    back = tetopt.load_mesh(tmp_path / "a.vtk").cell_data
+        save_model("a.vtk", model)
+    back = tetopt.load_mesh("a.vtk").cell_data
     assert any(each.ndim == 1 and sorted(each) == sorted(values[name]) for each in back.values())
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".msh"])
-def test_names_come_back(suffix, tmp_path):
+def test_names_come_back(suffix, here):
     """As they were where they are printable text, else as Python escapes them; gmsh has no
     quotes.
     """
     model = hostile_model(suffix)
-    saved(tmp_path / f"a{suffix}", model)
-    back = tetopt.load_mesh(tmp_path / f"a{suffix}")
-    expected = {name: name for name in KEPT} | SHOWN
-    if suffix == ".msh":
-        expected['a"b'] = "a'b"
+    saved(here / f"a{suffix}", model)
+    back = tetopt.load_mesh(f"a{suffix}")
+    quote = "'" if suffix == ".msh" else '"'
+    expected = {name: name.replace('"', quote) for name in KEPT} | SHOWN
     assert {*expected.values()} == back.cell_data.keys() - {"young", "nu", "material"}
     assert {*expected.values()} == back.point_data.keys()
     for name, new in expected.items():
@@ -189,16 +203,16 @@ def test_two_names_never_become_one():
 
 
 @pytest.mark.parametrize("suffix", [".vtk", ".msh", ".feb"])
-def test_names_of_any_length(suffix, tmp_path):
+def test_names_of_any_length(suffix, here):
     mesh = sample_model().mesh
     values = np.arange(len(mesh.cells), dtype=float)
     names = ["x" * 240, "x" * 241, "x" * 100_000, "名" * 100]
     model = sample_model()._replace(
         cell_data={name: values + k for k, name in enumerate(names)}, loads=()
     )
-    saved(tmp_path / f"a{suffix}", model)
+    saved(here / f"a{suffix}", model)
     if suffix != ".feb":
-        back = tetopt.load_mesh(tmp_path / f"a{suffix}").cell_data
+        back = tetopt.load_mesh(f"a{suffix}").cell_data
         assert [each for each in back if each[0] in "x名"] == [
             "x" * 240,
             "x" * 240 + "_2",
@@ -209,20 +223,20 @@ def test_names_of_any_length(suffix, tmp_path):
 
 @pytest.mark.parametrize("name", ["a b", "", "1a", "x" * 73, "a\n", "ä"])
 @pytest.mark.parametrize("suffix", [".inp"])
-def test_sets_that_some_format_cannot_name_are_refused(name, suffix, tmp_path):
+def test_sets_that_some_format_cannot_name_are_refused(name, suffix, here):
     model = sample_model()._replace(loads=())
     sets = Sets(model.sets.facets | {name: model.sets.facets["boundary"]}, model.sets.cells)
-    with pytest.raises(InputError, match=r"expected set names of up to 72 letters") as error:
-        save_model(tmp_path / f"a{suffix}", model._replace(sets=sets))
+    with refusal(r"expected set names of up to 72 letters") as error:
+        save_model(f"a{suffix}", model._replace(sets=sets))
     assert plain(str(error.value)) == str(error.value)
-    assert list(tmp_path.iterdir()) == []
+    assert list(here.iterdir()) == []
 
 
-def test_sets_that_differ_by_case_alone_are_refused(tmp_path):
+def test_sets_that_differ_by_case_alone_are_refused(here):
     model = sample_model()._replace(loads=())
     sets = Sets(model.sets.facets, model.sets.cells | {"BOUNDARY": np.array([0])})
-    with pytest.raises(InputError, match="two sets have the name BOUNDARY"):
-        save_model(tmp_path / "a.vtu", model._replace(sets=sets))
+    with refusal("two sets have the name BOUNDARY"):
+        save_model("a.vtu", model._replace(sets=sets))
 
 
 @pytest.mark.parametrize("suffix", [*FORMATS, ".VTU", ".Inp"])
@@ -230,7 +244,7 @@ def test_a_mesh_is_written_by_its_suffix(suffix, tmp_path):
     """What `save_mesh` writes is what the suffix says, or nothing."""
     mesh, path = sample_model().mesh, tmp_path / f"a{suffix}"
     if suffix == ".feb":
-        with pytest.raises(InputError, match="material"):
+        with refusal("material"):
             save_mesh(path, mesh)
         assert not path.exists()
         return
@@ -249,54 +263,29 @@ def test_a_mesh_is_written_by_its_suffix(suffix, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a", "a.vtu.gz"])
-def test_a_suffix_of_no_format_is_refused(name, tmp_path):
-    with pytest.raises(InputError, match=r"unknown suffix; known suffixes are \.vtu .*, \.inp"):
-        save_mesh(tmp_path / name, sample_model().mesh)
-    assert list(tmp_path.iterdir()) == []
+def test_a_suffix_of_no_format_is_refused(name, here):
+    with refusal(r"unknown suffix; known suffixes are \.vtu .*, \.inp"):
+        save_mesh(name, sample_model().mesh)
+    assert list(here.iterdir()) == []
 
 
-def test_a_pvtu_is_refused_by_the_name_of_what_replaces_it(tmp_path):
-    (tmp_path / "a.PVTU").write_text("<VTKFile/>")
-    with pytest.raises(InputError, match=r"a\.PVTU: cannot read \.pvtu; save the mesh as \.vtu"):
-        tetopt.load_mesh(tmp_path / "a.PVTU")
+def test_a_pvtu_is_refused_by_the_name_of_what_replaces_it(here):
+    (here / "a.PVTU").write_text("<VTKFile/>")
+    with refusal(r"a\.PVTU: cannot read \.pvtu; save the mesh as \.vtu"):
+        tetopt.load_mesh("a.PVTU")
 
 
-def test_labels_of_a_surface_that_its_file_cannot_name_are_refused(tmp_path):
+def test_labels_of_a_surface_that_its_file_cannot_name_are_refused(here):
     mesh = sample_model().mesh
     surface = extract_surface(mesh.points, mesh.cells, np.arange(len(mesh.cells)))
     for suffix in (".ply", ".vtp", ".vtk"):
-        with pytest.raises(InputError, match=r'got "a\\nproperty int b"'):
+        with refusal(r'got "a\\nproperty int b"'):
             save_surface(
-                tmp_path / f"a{suffix}",
+                f"a{suffix}",
                 surface,
                 labels={"a\nproperty int b": np.zeros(len(surface.triangles), int)},
             )
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("suffix", FORMATS)
-def test_names_that_are_words_of_a_format(suffix, tmp_path):
-    words = [
-        "METADATA",
-        "SCALARS",
-        "POINTS",
-        "CELL_DATA",
-        "FIELD",
-        "LOOKUP_TABLE",
-        "$EndNodes",
-        "*NODE",
-        "End",
-    ]
-    words += ["NumberOfPoints='1e99'", '<Piece NumberOfCells="7">', "last"]
-    model = sample_model()
-    fields = {name: np.arange(len(model.mesh.cells)) + 0.5 * k for k, name in enumerate(words)}
-    about = {"tetopt": "0.1.0", "image": "\n\nVertices\n7"}
-    save_model(tmp_path / f"a{suffix}", model._replace(cell_data=fields, about=about, loads=()))
-    assert_whole(tmp_path / f"a{suffix}", model)
-    if suffix in VTK_SUFFIXES:
-        back = tetopt.load_mesh(tmp_path / f"a{suffix}").cell_data
-        assert all(np.array_equal(back[name], values) for name, values in fields.items())
+    assert list(here.iterdir()) == []
 
 
 # Formats of one's own
@@ -312,51 +301,44 @@ def registered(monkeypatch):
 
 
 @pytest.mark.filterwarnings("ignore")  # of a mesh as coarse as this
-def test_a_registered_format_is_written_alike_by_all(registered, tmp_path, capsys):
+def test_a_registered_format_is_written_alike_by_all(registered, here, capsys):
     mesh = sample_model().mesh
-    tetopt.save_mesh(tmp_path / "a.vtu", mesh)
-    tetopt.save_mesh(tmp_path / "a.pts", mesh)
-    whole = (tmp_path / "a.pts").read_text("utf-8")
+    tetopt.save_mesh("a.vtu", mesh)
+    tetopt.save_mesh("a.pts", mesh)
+    whole = (here / "a.pts").read_text("utf-8")
     assert whole == f"é kPa {mesh.points.tolist()}\n"
-    assert main(["convert", str(tmp_path / "a.vtu"), str(tmp_path / "b.pts")]) == 0
+    assert main(["convert", str(here / "a.vtu"), str(here / "b.pts")]) == 0
     assert "points, RAS+ mm" in capsys.readouterr().out
-    assert (tmp_path / "b.pts").read_text("utf-8") == whole
-    tetopt.save_image(tmp_path / "a.nii.gz", tetopt.load_phantom("sphere").image(voxel_mm=8))
-    tetopt.run(
-        tetopt.Job(images=tmp_path / "a.nii.gz", output=tmp_path / "c.pts", nodes=60, iterations=0)
-    )
-    tetopt.run(
-        tetopt.Job(images=tmp_path / "a.nii.gz", output=tmp_path / "c.vtu", nodes=60, iterations=0)
-    )
-    points = tetopt.load_mesh(tmp_path / "c.vtu").mesh.points
-    assert (tmp_path / "c.pts").read_text("utf-8") == f"é kPa {points.tolist()}\n"
+    assert (here / "b.pts").read_text("utf-8") == whole
+    tetopt.save_image("a.nii.gz", tetopt.load_phantom("sphere").image(voxel_mm=8))
+    tetopt.run(tetopt.Job(images=here / "a.nii.gz", output=here / "c.pts", nodes=60, iterations=0))
+    tetopt.run(tetopt.Job(images=here / "a.nii.gz", output=here / "c.vtu", nodes=60, iterations=0))
+    points = tetopt.load_mesh("c.vtu").mesh.points
+    assert (here / "c.pts").read_text("utf-8") == f"é kPa {points.tolist()}\n"
 
 
-def test_what_a_registered_format_does_not_hold_is_refused(registered, tmp_path):
-    with pytest.raises(InputError, match=r"a\.pts: only \.vtu, .* support quadratic cells"):
-        save_model(tmp_path / "a.pts", quadratic_model())
-    assert list(tmp_path.iterdir()) == []
+def test_what_a_registered_format_does_not_hold_is_refused(registered, here):
+    with refusal(r"a\.pts: only \.vtu, .* support quadratic cells"):
+        save_model("a.pts", quadratic_model())
+    assert list(here.iterdir()) == []
 
 
-def test_a_format_that_fails_leaves_the_old_file(registered, tmp_path):
-    (tmp_path / "a.pts").write_text("old")
+def test_a_format_that_fails_leaves_the_old_file(registered, here):
+    (here / "a.pts").write_text("old")
 
     def broken(model):
         raise RuntimeError("broken")
 
     tetopt.register_format(".pts", broken)
     with pytest.raises(RuntimeError, match="broken"):
-        save_model(tmp_path / "a.pts", sample_model())
-    assert [path.read_text() for path in tmp_path.iterdir()] == ["old"]
+        save_model("a.pts", sample_model())
+    assert [path.read_text() for path in here.iterdir()] == ["old"]
 
 
 @pytest.mark.parametrize("suffix", [".INP", "pts", "", ".a/b", ".p\n"])
 def test_suffixes_that_no_format_can_have(suffix):
-    with pytest.raises(
-        InputError, match=r"^suffix: (\.\w+ is a built-in format|expected a dot)"
-    ) as caught:
+    with refusal(r"^suffix: (\.\w+ is a built-in format|expected a dot)"):
         tetopt.register_format(suffix, str)
-    assert "\n" not in str(caught.value)
     assert suffix not in FORMATS.keys() - formats.BUILT_IN
 
 
@@ -375,15 +357,15 @@ def test_the_order_of_bytes_in_memory_is_not_the_file_s(suffix):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", FORMATS)
-def test_a_million_cells(suffix, tmp_path):
+def test_a_million_cells(suffix, here):
     image = tetopt.Image(np.zeros((60, 60, 60)))
     mesh = tetopt.lattice_mesh(image, blocks=(59, 59, 59))
     assert len(mesh.cells) > 10**6
     model = tetopt.build_model(mesh, image, young="2+h", loads=["compress:2%"])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of nearly incompressible cells
-        save_model(tmp_path / f"a{suffix}", model)
-    assert_whole(tmp_path / f"a{suffix}", model)
+        save_model(f"a{suffix}", model)
+    assert_whole(here / f"a{suffix}", model)
 
 
 @pytest.mark.parametrize("suffix", [".vtu"])
@@ -465,47 +447,46 @@ def test_data_that_do_not_fit_leave_the_old_file(suffix, tmp_path):
     path = tmp_path / f"a{suffix}"
     path.write_bytes(b"old")
     for words, model in bad_models():
-        with pytest.raises(InputError, match=words) as caught:
+        with refusal(words):
             save_model(path, model)
-        assert "\n" not in str(caught.value)
         assert [each.name for each in tmp_path.iterdir()] == [path.name]
         assert path.read_bytes() == b"old"
 
 
 @pytest.mark.filterwarnings("ignore:.*linear elements")
 @pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".xdmf", ".msh", ".feb"])
-def test_integers_are_kept_or_refused(suffix, tmp_path):
+def test_integers_are_kept_or_refused(suffix, here):
     model = sample_model()
     for value in (2**53, 2**53 + 1, 2**63 + 1):
         data = {"a": np.full(len(model.mesh.cells), value, dtype=np.uint64)}
         if value > (2**63 if suffix in (".vtu", ".xdmf") else 2**53):
-            with pytest.raises(InputError, match=f"expected integers up to .* in 'a', got {value}"):
-                save_model(tmp_path / f"a{suffix}", model._replace(cell_data=data))
+            with refusal(f"expected integers up to .* in 'a', got {value}"):
+                save_model(f"a{suffix}", model._replace(cell_data=data))
         else:
-            save_model(tmp_path / f"a{suffix}", model._replace(cell_data=data))
+            save_model(f"a{suffix}", model._replace(cell_data=data))
             if suffix in (".vtu", ".vtk", ".msh"):
-                assert int(tetopt.load_mesh(tmp_path / f"a{suffix}").cell_data["a"][0]) == value
+                assert int(tetopt.load_mesh(f"a{suffix}").cell_data["a"][0]) == value
 
 
 @pytest.mark.filterwarnings("ignore:.*linear elements")
-def test_lists_and_tables_are_written_by_all(tmp_path):
+def test_lists_and_tables_are_written_by_all(here):
     """A list is an array, also for sets; rows of more than one axis are flattened."""
     model = sample_model()
     cells = len(model.mesh.cells)
     data = {"a": list(range(cells)), "b": np.ones((cells, 3, 3)), "c": np.arange(cells) > 3}
     model = model._replace(cell_data=data, sets=Sets({"x": [[0, 1]]}, {"y": [3, 5]}), loads=())
     for suffix in FORMATS:
-        save_model(tmp_path / f"a{suffix}", model)
-    back = tetopt.load_mesh(tmp_path / "a.vtu")
+        save_model(f"a{suffix}", model)
+    back = tetopt.load_mesh("a.vtu")
     assert back.cell_data["a"].tolist() == data["a"]
     assert back.cell_data["b"].shape == (cells, 9)
     assert (back.sets.facets["x"].tolist(), back.sets.cells["y"].tolist()) == ([[0, 1]], [3, 5])
 
 
 @pytest.mark.parametrize("suffix", [".stl", ".ply", ".vtp", ".vtk"])
-def test_a_surface_that_does_not_fit_leaves_the_old_file(suffix, tmp_path):
+def test_a_surface_that_does_not_fit_leaves_the_old_file(suffix, here):
     surface = extract_surface(*CORNER, [0])
-    (tmp_path / f"a{suffix}").write_bytes(b"old")
+    (here / f"a{suffix}").write_bytes(b"old")
     bad = [
         {"surface": surface._replace(triangles=surface.triangles + 1)},
         {"surface": surface._replace(triangles=surface.triangles.astype(float))},
@@ -517,6 +498,6 @@ def test_a_surface_that_does_not_fit_leaves_the_old_file(suffix, tmp_path):
     labels = (values[1:], values[:, None], values + 2**31, values * 0.5, values.astype(str), 3)
     bad += [{"labels": {"a": each}} for each in labels if suffix != ".stl"]
     for options in bad:
-        with pytest.raises(InputError, match="expected"):
-            save_surface(tmp_path / f"a{suffix}", **{"surface": surface} | options)
-        assert (tmp_path / f"a{suffix}").read_bytes() == b"old"
+        with refusal("expected"):
+            save_surface(f"a{suffix}", **{"surface": surface} | options)
+        assert (here / f"a{suffix}").read_bytes() == b"old"

@@ -11,9 +11,10 @@ import pytest
 import pyvista_frd
 from models import young_of
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import refusal
 from results import CASES, FOLDER, NU, our_displacement, solved_model
 
-from tetopt import InputError, Mesh
+from tetopt import Mesh
 from tetopt.geometry.quadratic import quadratic
 from tetopt.io.frd import read_frd
 
@@ -117,9 +118,8 @@ def test_what_the_head_does_not_say_is_assumed(tmp_path):
 def refused(tmp_path, words, text=None, mesh=None):
     path = tmp_path / "a.frd"
     path.write_text(path_of(1).read_text() if text is None else text)
-    with pytest.raises(InputError, match=words) as caught:
+    with refusal(words) as caught:
         read_frd(path, solved_model(1).mesh if mesh is None else mesh)
-    assert "\n" not in str(caught.value)
     assert str(path) in str(caught.value)
 
 
@@ -164,7 +164,7 @@ def test_files_without_whole_results_are_refused(tmp_path):
         text.replace("          14    ", "          13    "),
     )
     refused(tmp_path, "DISP of step 1 is not finite at some nodes", _nan(text))
-    with pytest.raises(InputError, match="no such file"):
+    with refusal("no such file"):
         read_frd(tmp_path / "b.frd", solved_model(1).mesh)
 
 
@@ -176,5 +176,5 @@ def _nan(text):
 
 def test_without_the_reader_it_is_said_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyvista_frd", None)
-    with pytest.raises(InputError, match=r'pip install "pyvista-frd-reader(>=[0-9.]+)?"'):
+    with refusal(r'pip install "pyvista-frd-reader(>=[0-9.]+)?"'):
         read_frd(path_of(1), solved_model(1).mesh)

@@ -5,9 +5,9 @@ refused.
 import json
 
 import pytest
+from refusals import assert_refused, refusal
 
 from tetopt.contents.labels import hex_colour
-from tetopt.errors import InputError
 from tetopt.io.label_tables import NO_TABLE, LabelTable, load_label_table
 from tetopt.model.file import table_in
 from tetopt.model.label_names import label_words, labels_named, table_of_labels, table_words
@@ -159,20 +159,17 @@ def test_a_background_without_a_colour_has_none(tmp_path):
     ],
 )
 def test_what_is_refused(tmp_path, text, match):
-    with pytest.raises(InputError, match=match) as caught:
+    with refusal(match) as caught:
         table_of(tmp_path, text)
     assert str(caught.value).startswith(str(tmp_path / "table.txt"))
-    assert "\n" not in str(caught.value)
 
 
-def test_other_files(tmp_path):
-    with pytest.raises(InputError, match="no such file"):
-        load_label_table(tmp_path / "none.txt")
-    with pytest.raises(InputError, match="got a folder"):
-        load_label_table(tmp_path)
+def test_other_files(here):
+    assert_refused("none.txt", "no such file", load_label_table)
+    assert_refused(here, "got a folder", load_label_table)
     for encoding in ("latin-1", "utf-16"):
-        with pytest.raises(InputError, match="expected UTF-8 text"):
-            table_of(tmp_path, SNAP, encoding=encoding)
+        with refusal("expected UTF-8 text"):
+            table_of(here, SNAP, encoding=encoding)
 
 
 # In a mesh's file
@@ -249,13 +246,11 @@ def test_a_name_means_its_labels(text, labels):
 
 
 def test_names_that_no_label_has():
-    with pytest.raises(
-        InputError, match='label "livre": no label has this name; did you mean liver'
-    ):
+    with refusal('label "livre": no label has this name; did you mean liver'):
         labels_named("livre", NAMES)
-    with pytest.raises(InputError, match="known names are Spleen, liver, left lung"):
+    with refusal("known names are Spleen, liver, left lung"):
         labels_named("xyzzy", NAMES)
-    with pytest.raises(InputError, match="labels have no names; give a table of names"):
+    with refusal("labels have no names; give a table of names"):
         labels_named("liver", {})
     assert label_words(5, NAMES) == "5 (liver)"
     assert label_words(55, NAMES) == "55"

@@ -9,13 +9,11 @@ import pytest
 from meshes import with_bent_edges
 from models import each_once, labelled_model, quadratic_model, sample_model
 
-from tetopt.geometry.quadratic import numbered_edges, quadratic
-from tetopt.geometry.simplex import volumes
+from tetopt.geometry.quadratic import numbered_edges
 from tetopt.io.mfem import mfem
 from tetopt.model.materials import materials
 from tetopt.model.sets import Sets, facet_triples
 
-MODELS = [(3, 3), (3, None), (2, 3), (2, None)]
 GEOMETRY = {1: "1", 2: "2", 3: "4"}  # segment, triangle, tetrahedron
 
 
@@ -145,29 +143,3 @@ def test_pymfem_reads_it(n, bins, tmp_path):
         assert each_once(sides[chosen]) == each_once(facet_triples(model.mesh.cells, rows))
     # Nothing had to be turned, and the faces of each boundary element are those of the cells
     assert (read.CheckElementOrientation(False), read.CheckBdrElementOrientation(False)) == (0, 0)
-
-
-@pytest.mark.parametrize("is_turned", [False, True], ids=["as it is", "turned for refinement"])
-@pytest.mark.parametrize("n", [3, 2])
-def test_pymfem_reads_order_2(n, is_turned, tmp_path):
-    """The nodes of each element are ours, to the last bit; and its cells are as large as ours
-    and anywhere straight.
-    """
-    ser = pytest.importorskip("mfem.ser", reason="no PyMFEM (pip install mfem)")
-    model = quadratic_model(n)
-    points, cells = quadratic(model.mesh.points, model.mesh.cells)
-    (tmp_path / "model.mfem").write_bytes(mfem(model))
-    read = ser.Mesh(str(tmp_path / "model.mfem"), 1, int(is_turned))
-    nodes = read.GetNodes()
-    space = nodes.FESpace()
-    assert (space.GetNDofs(), space.GetVDim()) == (len(points), n)
-    places = nodes.GetDataArray().reshape(-1, n)
-    sizes = volumes(model.mesh.points, model.mesh.cells)
-    rule = ser.IntRules.Get(ser.Geometry.TETRAHEDRON if n == 3 else ser.Geometry.TRIANGLE, 3)
-    for k, cell in enumerate(cells):
-        dofs = space.GetElementDofs(k)
-        assert sorted(places[list(dofs)].tolist()) == sorted(points[cell].tolist())
-        mapping = read.GetElementTransformation(k)
-        for j in range(rule.GetNPoints()):
-            mapping.SetIntPoint(rule.IntPoint(j))
-            assert mapping.Weight() == pytest.approx(sizes[k] * (6 if n == 3 else 2), rel=1e-9)

@@ -8,8 +8,8 @@ import nibabel
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import refusal
 
-from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io.images import load_image, save_image
 
@@ -37,20 +37,20 @@ def values(shape, dtype):
 @pytest.mark.parametrize("suffix", [".nii", ".nii.gz"])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("affine", AFFINES.values(), ids=AFFINES)
-def test_round_trip(tmp_path, affine, dtype, suffix):
+def test_round_trip(here, affine, dtype, suffix):
     image = Image(values(SHAPES[len(affine)], dtype), affine)
-    save_image(tmp_path / f"a{suffix}", image)
-    back = load_image(tmp_path / f"a{suffix}")
+    save_image(f"a{suffix}", image)
+    back = load_image(f"a{suffix}")
     assert back.data.dtype == dtype
     assert_array_equal(back.data, image.data)
     # NIfTI's sform is float32.
     assert_array_equal(back.affine, affine.astype(np.float32).astype(np.float64))
-    assert [p.name for p in tmp_path.iterdir()] == [f"a{suffix}"]
+    assert [p.name for p in here.iterdir()] == [f"a{suffix}"]
 
 
-def test_a_plane_lies_at_z_0(tmp_path):
-    save_image(tmp_path / "a.nii", Image(values((5, 7), np.float32), SHEARED))
-    file = nibabel.load(tmp_path / "a.nii")
+def test_a_plane_lies_at_z_0(here):
+    save_image("a.nii", Image(values((5, 7), np.float32), SHEARED))
+    file = nibabel.load(here / "a.nii")
     assert file.shape == (5, 7)
     assert_allclose(
         file.affine @ [2.0, 3.0, 0.0, 1.0], [*(SHEARED @ [2.0, 3.0, 1.0])[:2], 0.0, 1.0]
@@ -58,33 +58,31 @@ def test_a_plane_lies_at_z_0(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a", "a.mha", "a.nii.zip", "a.img", "a.hdr", "a.png", "nii"])
-def test_a_name_of_another_format_is_refused(name, tmp_path):
-    with pytest.raises(InputError, match=r"expected a name ending in \.nii or \.nii\.gz"):
-        save_image(tmp_path / name, Image(np.arange(24.0).reshape(2, 3, 4)))
-    assert list(tmp_path.iterdir()) == []
+def test_a_name_of_another_format_is_refused(name, here):
+    with refusal(r"expected a name ending in \.nii or \.nii\.gz"):
+        save_image(name, Image(np.arange(24.0).reshape(2, 3, 4)))
+    assert list(here.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", ["a.nii.gz", "A.NII"])
-def test_an_image_that_reads_back_otherwise_does_not_replace_the_old_one(
-    name, tmp_path, monkeypatch
-):
+def test_an_image_that_reads_back_otherwise_does_not_replace_the_old_one(name, here, monkeypatch):
     image = Image(np.arange(24.0).reshape(2, 3, 4))
-    save_image(tmp_path / name, image)
-    before, write = (tmp_path / name).read_bytes(), Path.write_bytes
+    save_image(name, image)
+    before, write = (here / name).read_bytes(), Path.write_bytes
     for damaged in (lambda whole: whole[:-5], lambda whole: whole[:-1] + bytes([whole[-1] ^ 1])):
         monkeypatch.setattr(
             Path, "write_bytes", lambda self, whole, damaged=damaged: write(self, damaged(whole))
         )
         with pytest.raises(OSError, match="reads back differently"):
-            save_image(tmp_path / name, image)
-        assert (tmp_path / name).read_bytes() == before
-    assert [path.name for path in tmp_path.iterdir()] == [name]
+            save_image(name, image)
+        assert (here / name).read_bytes() == before
+    assert [path.name for path in here.iterdir()] == [name]
 
 
-def test_an_axis_too_long_for_nifti_1_goes_into_nifti_2(tmp_path):
+def test_an_axis_too_long_for_nifti_1_goes_into_nifti_2(here):
     image = Image(np.arange(32768.0 * 2).reshape(2, 32768), SHEARED)
-    save_image(tmp_path / "a.nii.gz", image)
-    assert isinstance(nibabel.load(tmp_path / "a.nii.gz"), nibabel.Nifti2Image)
-    back = load_image(tmp_path / "a.nii.gz")
+    save_image("a.nii.gz", image)
+    assert isinstance(nibabel.load(here / "a.nii.gz"), nibabel.Nifti2Image)
+    back = load_image("a.nii.gz")
     assert_array_equal(back.data, image.data)
     assert_array_equal(back.affine, image.affine)

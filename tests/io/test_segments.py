@@ -5,10 +5,11 @@ import warnings
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
+from readers import read_warned
+from refusals import assert_refused
 
 import tetopt
 from tetopt.commands.beside import voxels_of
-from tetopt.errors import InputError
 from tetopt.io.images import load_image
 from tetopt.io.label_tables import load_label_table
 from tetopt.job.options import MaskedPart
@@ -41,21 +42,10 @@ def seg_nrrd(folder, layers=LAYERS, segments=SEGMENTS, more="", name="a.seg.nrrd
     return folder / name
 
 
-def read(path):
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        image = load_image(path)
-    return image, [
-        str(each.message).removeprefix(f"{path}: ")
-        for each in caught
-        if each.category is UserWarning
-    ]
-
-
 def test_layers_that_share_values(tmp_path):
     """The numbers are the segments' order; the later layer wins; both are told."""
     path = seg_nrrd(tmp_path, more="Segment2_Color:=1 0.5 0\n")
-    image, said = read(path)
+    image, said = read_warned(path)
     expected = LAYERS[0].copy()
     expected[LAYERS[1] == 1] = 3
     assert_array_equal(image.data, expected)
@@ -71,31 +61,30 @@ def test_layers_that_share_values(tmp_path):
 
 def test_values_of_the_file_are_kept(tmp_path):
     """In one layer, and where each segment has a value of its own."""
-    layer = LAYERS[:1].copy()
-    layer[layer == 2] = 77
+    layer = np.where(LAYERS[:1] == 2, np.uint8(77), LAYERS[:1])
     path = seg_nrrd(tmp_path, layer, [("liver", 1, 0), ("bone", 77, 0)])
-    image, said = read(path)
+    image, said = read_warned(path)
     assert_array_equal(image.data, layer[0])
     assert (said, load_label_table(path).names) == ([], {1: "liver", 77: "bone"})
     layers = LAYERS * np.array([1, 9], np.uint8)[:, None, None, None]
-    image, said = read(
-        seg_nrrd(tmp_path, layers, [("liver", 1, 0), ("bone", 2, 0), ("tumour", 9, 1)])
-    )
-    assert np.unique(image.data, return_counts=True)[1].tolist() == [120 - 24 - 1 - 6, 12, 1, 18]
-    assert [np.unique(image.data).tolist(), len(said)] == [[0, 1, 2, 9], 1]
+    segments = [("liver", 1, 0), ("bone", 2, 0), ("tumour", 9, 1)]
+    image, said = read_warned(seg_nrrd(tmp_path, layers, segments))
+    values, counts = np.unique(image.data, return_counts=True)
+    assert values.tolist() == [0, 1, 2, 9]
+    assert counts.tolist() == [120 - 24 - 1 - 6, 12, 1, 18]
+    assert len(said) == 1
 
 
 def test_files_of_older_programs(tmp_path):
     """Each segment is a layer of ones, in order."""
-    image, said = read(
-        seg_nrrd(tmp_path, LAYERS & 1, [("liver", None, None), ("tumour", None, None)])
-    )
+    segments = [(name, None, None) for name in ("liver", "tumour")]
+    image, said = read_warned(seg_nrrd(tmp_path, LAYERS & 1, segments))
     assert np.unique(image.data, return_counts=True)[1].tolist() == [120 - 30, 12, 18]
     assert "1 liver, 2 tumour" in said[0]
 
 
 def test_what_cannot_be_told_apart(tmp_path):
-    image, said = read(seg_nrrd(tmp_path, LAYERS[:1], [("liver", 1, 0), ("lobe", 1, 0)]))
+    image, said = read_warned(seg_nrrd(tmp_path, LAYERS[:1], [("liver", 1, 0), ("lobe", 1, 0)]))
     assert said == [
         'segments of one layer share a label value and cannot be told apart: "liver / lobe"',
         "1 voxels have values of no segment ([2]) and get label 0",
@@ -113,67 +102,57 @@ def test_what_cannot_be_told_apart(tmp_path):
     ],
 )
 def test_segments_that_are_not_there(tmp_path, segment, match):
-    with pytest.raises(InputError, match=match):
-        load_image(seg_nrrd(tmp_path, segments=[segment]))
+    assert_refused(seg_nrrd(tmp_path, segments=[segment]), match)
 
 
 def test_an_nrrd_without_segments(tmp_path):
     path = seg_nrrd(tmp_path, segments=[])
-    with pytest.raises(InputError, match="expected one number per voxel, got 2"):
-        load_image(path)
-    with pytest.raises(InputError, match="expected names of segments in this file, found none"):
-        load_label_table(path)
+    assert_refused(path, "expected one number per voxel, got 2")
+    assert_refused(path, "expected names of segments in this file, found none", load_label_table)
 
 
-def test_names_come_with_the_labels(tmp_path):
+def test_names_come_with_the_labels(here):
     """Without --label-names, a run takes the names of the segmentation itself; a table replaces
     them.
     """
-    path = seg_nrrd(tmp_path)
-    (tmp_path / "t.csv").write_text("label,name\n1,a\n2,b\n3,c\n")
+    path = seg_nrrd(here)
+    (here / "t.csv").write_text("label,name\n1,a\n2,b\n3,c\n")
+    seg_nrrd(here, segments=[("A", 1, 0), ("B", 2, 0), ("C", 1, 1)], name="b.seg.nrrd")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        job = tetopt.Job(images=path, labels=path, output=tmp_path / "a.vtu")
-        assert tetopt.read(job).source.table.names == {1: "liver", 2: "bone", 3: "tumour"}
-        job = tetopt.Job(
-            images=path, labels=path, output=tmp_path / "a.vtu", label_names=tmp_path / "t.csv"
-        )
-        assert tetopt.read(job).source.table.names == {1: "a", 2: "b", 3: "c"}
-        named = seg_nrrd(
-            tmp_path, segments=[("A", 1, 0), ("B", 2, 0), ("C", 1, 1)], name="b.seg.nrrd"
-        )
-        job = tetopt.Job(images=path, labels=path, output=tmp_path / "a.vtu", label_names=named)
-        assert tetopt.read(job).source.table.names == {1: "A", 2: "B", 3: "C"}
+        for table, names in (
+            (None, ["liver", "bone", "tumour"]),
+            ("t.csv", ["a", "b", "c"]),
+            ("b.seg.nrrd", ["A", "B", "C"]),
+        ):
+            job = tetopt.Job(images=path, labels=path, output="a.vtu", label_names=table)
+            assert tetopt.read(job).source.table.names == dict(enumerate(names, 1))
 
 
-def test_names_come_with_the_labels_of_another_mesh(tmp_path):
+def test_names_come_with_the_labels_of_another_mesh(here):
     """The cells of a mesh's file that take their labels from a segmentation take its names."""
-    path = seg_nrrd(tmp_path, LAYERS[:1], SEGMENTS[:2])
+    path = seg_nrrd(here, LAYERS[:1], SEGMENTS[:2])
     mesh = tetopt.lattice_mesh(load_image(path), nodes=60)
-    tetopt.save_mesh(tmp_path / "a.vtu", mesh)
-    loaded = tetopt.load_mesh(tmp_path / "a.vtu")
-    loaded = voxels_of(loaded, tmp_path / "a.vtu", None, MaskedPart(), path).loaded
+    tetopt.save_mesh("a.vtu", mesh)
+    loaded = tetopt.load_mesh("a.vtu")
+    loaded = voxels_of(loaded, here / "a.vtu", None, MaskedPart(), path).loaded
     assert loaded.label_table.names == {1: "liver", 2: "bone"}
 
 
 @pytest.mark.full
 def test_real_overlapping_segments(data_dir):
-    image, said = read(data_dir / "SegmentationOverlapping.seg.nrrd")
-    raw = sitk.GetArrayFromImage(
-        sitk.ReadImage(str(data_dir / "SegmentationOverlapping.seg.nrrd"))
-    ).T
+    path = data_dir / "SegmentationOverlapping.seg.nrrd"
+    image, said = read_warned(path)
+    raw = sitk.GetArrayFromImage(sitk.ReadImage(str(path))).T
     assert_array_equal(image.data, np.where(raw[1] == 1, 8, raw[0]))
     assert 'segment "overlapping sphere" covers 491 of the 8487 voxels of "ribs", 118' in said[1]
-    assert (
-        load_label_table(data_dir / "SegmentationOverlapping.seg.nrrd").names[8]
-        == "overlapping sphere"
-    )
+    assert load_label_table(path).names[8] == "overlapping sphere"
 
 
 def test_a_comparison_names_labels_as_the_file_does(tmp_path):
     """Its figures and report.json have these names, unless another table is given."""
     path, names = seg_nrrd(tmp_path), tmp_path / "names.csv"
     names.write_text("label,name\n1,hepar\n")
-    image, _ = read(path)
+    image, _ = read_warned(path)
     assert _label_source(path, image, None).names == {1: "liver", 2: "bone", 3: "tumour"}
     assert _label_source(path, image, names).names == {1: "hepar"}

@@ -5,8 +5,8 @@ import PIL.Image
 import pytest
 from commands import assert_refused as assert_command_refused
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import assert_refused
 
-from tetopt.errors import InputError
 from tetopt.io.images import load_image
 
 tifffile = pytest.importorskip("tifffile")
@@ -60,8 +60,7 @@ def test_calibrated_stack(tmp_path, name):
     assert_array_equal(image.data, VOXELS.T)
     assert_allclose(image.affine, np.diag([-steps[0], -steps[1], steps[2], 1.0]))
     assert load_image(path, spacing_mm=steps).shape == (7, 5, 10)
-    with pytest.raises(InputError, match=r"but `spacing_mm` is 0\.1 x 0\.1 x 0\.1"):
-        load_image(path, spacing_mm=0.1)
+    assert_refused(path, r"but `spacing_mm` is 0\.1 x 0\.1 x 0\.1", spacing_mm=0.1)
 
 
 @pytest.mark.parametrize(
@@ -75,10 +74,7 @@ def test_calibrated_stack(tmp_path, name):
 )
 def test_stack_without_voxel_size(tmp_path, options):
     path = stack(tmp_path, **options)
-    with pytest.raises(
-        InputError, match=r"this stack of 10 slices states no voxel size .*unknown mm.*`spacing_mm`"
-    ):
-        load_image(path)
+    assert_refused(path, r"this stack of 10 slices states no voxel size .*unknown mm.*`spacing_mm`")
     if options.get("imagej") is None:
         assert load_image(path, spacing_mm=[0.02, 0.02, 0.05]).spacing.tolist() == [
             0.02,
@@ -101,15 +97,13 @@ def test_stack_without_voxel_size(tmp_path, options):
     ],
 )
 def test_stacks_of_no_volume(tmp_path, voxels, options, match):
-    with pytest.raises(InputError, match=match):
-        load_image(stack(tmp_path, voxels, **options), spacing_mm=1.0)
+    assert_refused(stack(tmp_path, voxels, **options), match, spacing_mm=1.0)
 
 
 def test_truncated_stack(tmp_path):
     path = stack(tmp_path)
     path.write_bytes(path.read_bytes()[:500])
-    with pytest.raises(InputError, match=r"a\.tif: truncated or damaged; copy it again"):
-        load_image(path, spacing_mm=1.0)
+    assert_refused(path, "truncated or damaged; copy it again", spacing_mm=1.0)
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".png", ".bmp"])
@@ -119,14 +113,13 @@ def test_folder_of_slices(tmp_path, suffix):
     image = load_image(path, spacing_mm=0.02)
     assert_array_equal(image.data, (VOXELS[[8, 9, 0, 1]] % 256).T)
     assert_allclose(image.affine, np.diag([-0.02, -0.02, 0.02, 1.0]))
-    with pytest.raises(InputError, match="this folder of 4 slices states no voxel size"):
-        load_image(path)
+    assert_refused(path, "this folder of 4 slices states no voxel size")
     (path / f"scan_v2_10{suffix}").unlink()
-    with pytest.raises(
-        InputError,
-        match=f"got scan_v2_9{suffix} followed by scan_v2_11{suffix}; a slice is missing",
-    ):
-        load_image(path, spacing_mm=0.02)
+    assert_refused(
+        path,
+        f"got scan_v2_9{suffix} followed by scan_v2_11{suffix}; a slice is missing",
+        spacing_mm=0.02,
+    )
 
 
 def sliced(folder, voxels=VOXELS, **options):
@@ -156,7 +149,7 @@ def test_stack_and_folder_of_the_same_slices_agree(tmp_path, kind, options):
     assert_array_equal(*(image.affine for image in images))
 
 
-def test_order_of_ome_and_its_full_level(tmp_path):
+def test_order_of_ome_and_its_full_level(here):
     planes = "".join(f'<TiffData IFD="{k}" FirstZ="{9 - k}" PlaneCount="1"/>' for k in range(10))
     words = (
         '<?xml version="1.0"?><OME '
@@ -165,19 +158,19 @@ def test_order_of_ome_and_its_full_level(tmp_path):
         'SizeZ="10" SizeC="1" SizeT="1" '
         f'PhysicalSizeX="20" PhysicalSizeY="20" PhysicalSizeZ="20">{planes}</Pixels></Image></OME>'
     )
-    with tifffile.TiffWriter(tmp_path / "a.ome.tif") as writer:
+    with tifffile.TiffWriter(here / "a.ome.tif") as writer:
         for k, plane in enumerate(VOXELS):
             writer.write(
                 plane, description=words if k == 0 else None, contiguous=False, metadata=None
             )
-    assert_array_equal(load_image(tmp_path / "a.ome.tif").data, VOXELS[::-1].T)
-    with tifffile.TiffWriter(tmp_path / "b.ome.tif", ome=True) as writer:
+    assert_array_equal(load_image("a.ome.tif").data, VOXELS[::-1].T)
+    with tifffile.TiffWriter(here / "b.ome.tif", ome=True) as writer:
         writer.write(VOXELS, subifds=1, metadata={"axes": "ZYX"})
         writer.write(VOXELS[:, ::2, ::2], subfiletype=1)
-    assert_array_equal(load_image(tmp_path / "b.ome.tif", spacing_mm=1).data, VOXELS.T)
+    assert_array_equal(load_image("b.ome.tif", spacing_mm=1).data, VOXELS.T)
 
 
-def test_calibrated_values_of_imagej(tmp_path):
+def test_calibrated_values_of_imagej(here):
     """As signed numbers of 16 bits, which ImageJ stores without a sign; a page and a folder have
     them, too.
     """
@@ -187,41 +180,37 @@ def test_calibrated_values_of_imagej(tmp_path):
         "resolution": (20, 10),
         "metadata": IMAGEJ | line | {"unit": "mm", "spacing": 0.5},
     }
-    path = stack(tmp_path, **options)
+    path = stack(here, **options)
     assert_array_equal(load_image(path).data, 2.0 * VOXELS.T - 32768)
     page = load_image(path, volume=3)
     assert_array_equal(page.data, 2.0 * VOXELS[3] - 32768)
     assert page.spacing.tolist() == pytest.approx([0.1, 0.05])
-    with pytest.raises(InputError, match=r"voxels of 0\.05 x 0\.1 mm, but `spacing_mm` is 1 x 1"):
-        load_image(path, volume=3, spacing_mm=1)
+    assert_refused(
+        path, r"voxels of 0\.05 x 0\.1 mm, but `spacing_mm` is 1 x 1", volume=3, spacing_mm=1
+    )
     options["metadata"].pop("axes")
-    folder = load_image(sliced(tmp_path / "d", **options))
+    folder = load_image(sliced(here / "d", **options))
     assert_array_equal(folder.data, 2.0 * VOXELS.T - 32768)
     assert folder.spacing.tolist() == pytest.approx([0.05, 0.1, 0.5])
-    with pytest.raises(InputError, match=r"0\.05 x 0\.1 x 0\.5 mm, but `spacing_mm` is 1 x 1 x 1"):
-        load_image(tmp_path / "d", spacing_mm=1)
-    stack(tmp_path / "d", VOXELS[2], "s2.tif", **options | {"resolution": (20, 20)})
-    with pytest.raises(
-        InputError, match=r"s2\.tif: expected the pixel size and calibration of s0\.tif"
-    ):
-        load_image(tmp_path / "d")
+    assert_refused("d", r"0\.05 x 0\.1 x 0\.5 mm, but `spacing_mm` is 1 x 1 x 1", spacing_mm=1)
+    stack(here / "d", VOXELS[2], "s2.tif", **options | {"resolution": (20, 20)})
+    assert_refused("d", r"s2\.tif: expected the pixel size and calibration of s0\.tif")
     options["metadata"] |= IMAGEJ | {"cf": 3}
     with pytest.warns(
         UserWarning, match="calibration of them is no straight line and is not applied"
     ):
-        assert_array_equal(load_image(stack(tmp_path, **options)).data, VOXELS.T)
+        assert_array_equal(load_image(stack(here, **options)).data, VOXELS.T)
 
 
-def test_slices_written_one_by_one(tmp_path):
-    with tifffile.TiffWriter(tmp_path / "a.tif") as writer:
+def test_slices_written_one_by_one(here):
+    with tifffile.TiffWriter(here / "a.tif") as writer:
         for plane in VOXELS:
             writer.write(plane)
-    assert_array_equal(load_image(tmp_path / "a.tif", spacing_mm=1).data, VOXELS.T)
-    with tifffile.TiffWriter(tmp_path / "b.tif") as writer:
+    assert_array_equal(load_image("a.tif", spacing_mm=1).data, VOXELS.T)
+    with tifffile.TiffWriter(here / "b.tif") as writer:
         for plane in VOXELS[0], VOXELS[1, :3]:
             writer.write(plane)
-    with pytest.raises(InputError, match="expected slices of one size and type, got 5 x 7, 3 x 7"):
-        load_image(tmp_path / "b.tif", spacing_mm=1)
+    assert_refused("b.tif", "expected slices of one size and type, got 5 x 7, 3 x 7", spacing_mm=1)
 
 
 def test_slices_that_differ(tmp_path):
@@ -232,13 +221,11 @@ def test_slices_that_differ(tmp_path):
     ):
         load_image(path, spacing_mm=1.0)
     PIL.Image.fromarray(VOXELS[0, :3].astype(np.uint8)).save(path / "scan_v2_2.tif")
-    with pytest.raises(
-        InputError, match=r"scan_v2_2.tif: expected 5 x 7 pixels of uint8, .* got 3 x 7"
-    ):
-        load_image(path, spacing_mm=1.0)
+    assert_refused(
+        path, r"scan_v2_2.tif: expected 5 x 7 pixels of uint8, .* got 3 x 7", spacing_mm=1.0
+    )
     folder_of(path, range(3), ".png")
-    with pytest.raises(InputError, match="expected one series of numbered slices"):
-        load_image(path, spacing_mm=1.0)
+    assert_refused(path, "expected one series of numbered slices", spacing_mm=1.0)
 
 
 def test_a_command_names_its_option(tmp_path, capfd):

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 import zarr
 from numcodecs import AsType, Blosc, Delta, GZip, Shuffle, Zlib
+from numpy.testing import assert_array_equal
+from refusals import assert_refused
 from zarr.codecs import BloscCodec, Crc32cCodec, GzipCodec, ZstdCodec
 
 from tetopt.errors import InputError
@@ -36,16 +38,14 @@ def packer(name):
 def written(path, fmt, **options):
     """An image of 10^3 voxels in chunks of 4^3, and the file of its first chunk."""
     array = zarr.create_array(
-        store=path,
-        shape=VALUES.shape,
+        path,
+        data=VALUES,
         chunks=(4, 4, 4),
-        dtype="i2",
         zarr_format=fmt,
         fill_value=0,
         attributes={"affine": np.eye(4).tolist()},
         **options,
     )
-    array[:] = VALUES
     return path / array.metadata.encode_chunk_key((0, 0, 0))
 
 
@@ -63,21 +63,14 @@ KINDS = {
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_voxels_come_back(tmp_path, kind):
+def test_voxels_come_back(here, kind):
     fmt, options = KINDS[kind]
-    written(tmp_path / "a.zarr", fmt, **options)
-    np.testing.assert_array_equal(load_image(tmp_path / "a.zarr").data, VALUES)
-    np.testing.assert_array_equal(
-        load_image(tmp_path / "a.zarr", crop=[(1, 9), (2, 6), (3, 10)]).data,
+    written(here / "a.zarr", fmt, **options)
+    assert_array_equal(load_image("a.zarr").data, VALUES)
+    assert_array_equal(
+        load_image("a.zarr", crop=[(1, 9), (2, 6), (3, 10)]).data,
         VALUES[1:9, 2:6, 3:],
     )
-
-
-def refused(path, words):
-    with pytest.raises(InputError, match=words) as caught:
-        load_image(path)
-    assert str(caught.value).startswith(f"{path}: ")
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.deep
@@ -99,19 +92,19 @@ def refused(path, words):
         (12, 0),
     ],
 )
-def test_a_blosc_header_that_lies(tmp_path, kind, offset, number):
+def test_a_blosc_header_that_lies(here, kind, offset, number):
     """Blosc may read beyond the chunk's end, which only the child survives: a line, or the right
     voxels.
     """
     fmt, options = KINDS[kind]
-    chunk = written(tmp_path / "a.zarr", fmt, **options)
+    chunk = written(here / "a.zarr", fmt, **options)
     content = bytearray(chunk.read_bytes())
     struct.pack_into("<B" if offset == 3 else "<I", content, offset, number)
     chunk.write_bytes(content)
     try:
-        np.testing.assert_array_equal(load_image(tmp_path / "a.zarr").data, VALUES)
+        assert_array_equal(load_image("a.zarr").data, VALUES)
     except InputError:
-        refused(tmp_path / "a.zarr", LINE)
+        assert_refused("a.zarr", LINE)
 
 
 @pytest.mark.deep
@@ -119,20 +112,20 @@ def test_a_blosc_header_that_lies(tmp_path, kind, offset, number):
     "name",
     [pytest.param(each, marks=() if each in ("blosc", "gzip") else SLOW) for each in PACKERS],
 )
-def test_chunks_that_are_cut(tmp_path, name):
-    chunk = written(tmp_path / "a.zarr", 2, compressors=packer(name))
+def test_chunks_that_are_cut(here, name):
+    chunk = written(here / "a.zarr", 2, compressors=packer(name))
     content = chunk.read_bytes()
     for length in (0, 1, 4, 5, 6, 15, 16, len(content) - 1):
         chunk.write_bytes(content[:length])
-        refused(tmp_path / "a.zarr", LINE)
+        assert_refused("a.zarr", LINE)
 
 
 @pytest.mark.parametrize("fmt", [2, 3])
-def test_a_bomb_is_refused_in_one_line(tmp_path, fmt):
+def test_a_bomb_is_refused_in_one_line(here, fmt):
     """A chunk of 32 MB for 128 bytes."""
-    chunk = written(tmp_path / "a.zarr", fmt, compressors=GZip() if fmt == 2 else GzipCodec())
+    chunk = written(here / "a.zarr", fmt, compressors=GZip() if fmt == 2 else GzipCodec())
     chunk.write_bytes(zlib.compress(bytes(2**25), wbits=31))
-    refused(tmp_path / "a.zarr", LINE)
+    assert_refused("a.zarr", LINE)
 
 
 def changed(path, fmt, **values):
@@ -154,15 +147,14 @@ def changed(path, fmt, **values):
         ({"shape": [10**6] * 3, "chunks": [10**6] * 3}, "one of its chunks .* memory"),
     ],
 )
-def test_metadata_that_promises_too_much(tmp_path, fmt, values, words):
-    written(tmp_path / "a.zarr", fmt)
-    changed(tmp_path / "a.zarr", fmt, **values)
-    with pytest.raises(InputError, match=words):
-        load_image(tmp_path / "a.zarr")
+def test_metadata_that_promises_too_much(here, fmt, values, words):
+    written(here / "a.zarr", fmt)
+    changed(here / "a.zarr", fmt, **values)
+    assert_refused("a.zarr", words)
 
 
-def test_a_chunk_of_any_length(tmp_path):
-    chunk = written(tmp_path / "a.zarr", 2, compressors=None)
+def test_a_chunk_of_any_length(here):
+    chunk = written(here / "a.zarr", 2, compressors=None)
     with chunk.open("r+b") as file:
         file.truncate(2**40)  # a hole, which takes no room
-    refused(tmp_path / "a.zarr", "its chunk 0.0.0 is not a regular file of at most")
+    assert_refused("a.zarr", "its chunk 0.0.0 is not a regular file of at most")
