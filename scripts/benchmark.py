@@ -35,6 +35,14 @@ HEAD_NODES = 130_000
 # by tissue and thickness
 HEAD_SIZES = "1=0.7t[1:4],2=0.9t[1.5:6],3=1t[1.2:6],4=1.3t[1.5:7],*=1t[2:10]"
 
+# pytetwild as `tetopt compare` runs it: on an image's labels, for a number of nodes
+WILD = """
+import sys, tetopt
+from tetopt.study.pipelines import PipelineInput, pytetwild
+image, labels = map(tetopt.load_image, sys.argv[1:3])
+pytetwild(PipelineInput(image, labels, int(sys.argv[3])))
+"""
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the benchmarks, print a table and write a JSON file."""
@@ -177,23 +185,8 @@ def peers(path: Path, nodes: int, cgal: str | None, turns: int) -> dict[str, Any
         if importlib.util.find_spec("pytetwild") is None:
             rows["pytetwild"] = "not installed"
         else:
-            base = [
-                sys.executable,
-                "-m",
-                "tetopt",
-                "baseline",
-                str(path),
-                "-o",
-                str(folder / "wild.vtu"),
-                "--force",
-            ]
-            commands["pytetwild"] = [
-                *base,
-                "--nodes",
-                str(nodes),
-                "--labels",
-                str(folder / "labels.nii.gz"),
-            ]
+            inputs = [str(path), str(folder / "labels.nii.gz"), str(nodes)]
+            commands["pytetwild"] = [sys.executable, "-c", WILD, *inputs]
         if cgal is None:
             rows["cgal"] = "no program given (--cgal)"
         else:

@@ -1113,7 +1113,6 @@ def lines(draw):
         "demo",
         "paper",
         "compare",
-        "baseline",
         "--json",
         "",
         "-",
@@ -1130,9 +1129,7 @@ def lines(draw):
     draw.good("m.vtu")
     words = [one_of(draw.rng, pool) for _ in range(int(draw.rng.integers(0, 6)))]
     words = (
-        [word for word in words if word not in ("demo", "compare", "baseline")]
-        if len(words) != 1
-        else words
+        [word for word in words if word not in ("demo", "compare")] if len(words) != 1 else words
     )
     if words[:1] == ["demo"]:  # which have defaults for all they need
         words.append("--nodes=x")

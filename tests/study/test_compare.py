@@ -1,6 +1,4 @@
-"""`tetopt compare` and `tetopt baseline`: files, numbers recomputed, failures, one line for bad
-input.
-"""
+"""`tetopt compare`: files, numbers recomputed, failures, one line for bad input."""
 
 import pipes
 from types import SimpleNamespace
@@ -16,7 +14,7 @@ from tetopt.fem.reference import average_voxels, nearest, reference, refine_voxe
 from tetopt.fem.reference import compare as reference_errors
 from tetopt.geometry.quadratic import quadratic
 from tetopt.model.averages import element_young, young_image
-from tetopt.study import baseline, compare, compare_files
+from tetopt.study import compare, compare_files
 from tetopt.study.compare_files import COMPARE_PICTURES
 from tetopt.study.compare_report import Settings
 from tetopt.study.endings import AFTER_CRASHES
@@ -200,20 +198,10 @@ def test_pytetwild_in_the_comparison(head, undrawn, tmp_path):
     assert len(theirs["runs"]) == 2
     assert theirs["median"] == min(theirs["runs"], key=lambda run: run["E_D"])  # the lower of two
     assert abs(theirs["median"]["n_nodes"] / 120 - 1) < 0.2
+    assert set(theirs["median"]["seconds"]) == {"surfaces", "tetrahedra", "search"}
+    mesh = tetopt.load_mesh(tmp_path / "pytetwild.vtu").mesh
+    assert tetopt.check_mesh(mesh, head.image) == []
     assert (tmp_path / "report.html").read_text(encoding="utf-8").count("pytetwild") > 3
-
-
-@pytest.mark.full
-def test_baseline(head, tmp_path, capsys):
-    pytest.importorskip("pytetwild", reason="the conventional pipeline needs pytetwild")
-    image = head.image
-    command = f"baseline {head.folder}/image.nii.gz -o {tmp_path}/b.vtu --nodes 150"
-    assert exit_code(f"{command} --classes 3 --json {tmp_path}/b.json") == 0
-    numbers = numbers_in(tmp_path / "b.json")
-    mesh = tetopt.load_mesh(tmp_path / "b.vtu").mesh
-    assert tetopt.check_mesh(mesh, image) == []
-    assert numbers["fit"]["E_D"] == pytest.approx(tetopt.E_D(image, mesh), rel=1e-9)
-    assert set(numbers["seconds"]) == {"surfaces", "tetrahedra", "search"}
 
 
 @pytest.mark.deep
@@ -242,13 +230,12 @@ def test_a_peer_that_crashes(head, undrawn, tmp_path, monkeypatch, capsys):
     assert (twice["failure"], twice["median"]) == (failed, None)
 
 
-@pytest.mark.full
 def test_a_missing_peer_is_no_failure_of_it(head, tmp_path, monkeypatch, capsys):
-    missing = Outcome(None, {}, 0, [], "thing: not installed")
-    monkeypatch.setattr(baseline, "run_in_child", lambda *_, **__: missing)
-    command = f"baseline {head.folder}/image.nii.gz -o {tmp_path}/b.vtu --nodes 150"
-    assert exit_code(command) == 2
-    assert "tetopt: pytetwild: thing: not installed" in capsys.readouterr().err
+    """Its own line names it once."""
+    missing = Outcome(None, {}, 0, [], "pytetwild: not installed")
+    monkeypatch.setattr(compare, "run_in_child", lambda *_, **__: missing)
+    assert exit_code(head.compare, f"-o {tmp_path} --pipelines pytetwild") == 2
+    assert capsys.readouterr().err.rstrip().endswith(": pytetwild: not installed")
 
 
 @pytest.mark.parametrize(

@@ -44,7 +44,6 @@ COMMANDS = {
     "phantom": "phantom",
     "fem": "fem",
     "segment": "segment",
-    "baseline": "compare",
     "compare": "compare",
     "warm-up": "warm_up",
     "demo": "mesh",

@@ -1,4 +1,4 @@
-"""``tetopt baseline`` and ``compare``: comparisons with the conventional pipelines."""
+"""``tetopt compare``: comparison with the conventional pipelines."""
 
 from __future__ import annotations
 
@@ -11,39 +11,17 @@ from rich.markup import escape
 from rich.text import Text
 
 from tetopt.cli.console import print_line, print_table
-from tetopt.cli.options import ForceOption, ImageArgument, NumberOptions
+from tetopt.cli.options import ForceOption, ImageArgument
 from tetopt.job.options import Option
-from tetopt.report.tables import add_quality, new_table
+from tetopt.report.tables import new_table
 from tetopt.study.compare_table import columns_of, rows_of
-from tetopt.study.options import BaselineOptions, CompareOptions
-
-ResultsOption = Annotated[Path, Option("DIR", "Folder for the results.", letter="o")]
-
-
-def baseline_command(
-    image_path: ImageArgument,
-    output: Annotated[Path, Option("MESH.vtu", "The mesh to write.", letter="o")],
-    options: BaselineOptions,
-    numbers: NumberOptions,
-) -> int:
-    """Mesh an image the conventional way, for comparison: segment, extract surfaces,
-    tetrahedralise.
-    """
-    from tetopt.study.baseline import baseline
-
-    made = baseline(image_path, output, options, numbers.json_path, numbers.force)
-    table = new_table("", escape(made.output.name))
-    add_quality(table, made.quality)
-    for step, seconds in made.seconds.items():
-        table.add_row(f"seconds, {step}", f"{seconds:.1f}")
-    print_table(table)
-    return 0
+from tetopt.study.options import CompareOptions
 
 
 def compare_command(
     context: typer.Context,
     image_path: ImageArgument,
-    output: ResultsOption,
+    output: Annotated[Path, Option("DIR", "Folder for the results.", letter="o")],
     options: CompareOptions,
     force: ForceOption = False,
 ) -> int:

@@ -1,10 +1,10 @@
-"""Options of a comparison and of a conventional mesh, and the resulting settings."""
+"""Options of a comparison, and the resulting settings."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar
 
 from tetopt.engine.loop import DEFAULT_NODES
 from tetopt.errors import InputError
@@ -16,7 +16,6 @@ from tetopt.study.program import Program, parse_program
 from tetopt.system.budget import BYTES_PER_GB
 
 DEFAULT_SETTINGS = Settings(nodes=DEFAULT_NODES[3])
-ClassesOption = Annotated[int, Option("K", "Number of segmentation classes (multi-Otsu).", least=2)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +47,9 @@ class ComparedOptions:
     k_D: Annotated[float, Option("K", "Weight of the image on uniform meshes.", "k-d")] = (
         DEFAULT_SETTINGS.k_D
     )
-    classes: ClassesOption = DEFAULT_SETTINGS.classes
+    classes: Annotated[
+        int, Option("K", "Number of segmentation classes (multi-Otsu).", least=2)
+    ] = DEFAULT_SETTINGS.classes
     part: BoxPart = WHOLE_BOX
 
 
@@ -113,21 +114,6 @@ class CompareOptions(LimitOptions, SimulationOptions, ComparedOptions):
             max_seconds=self.max_seconds,
             max_bytes=None if self.max_gb is None else int(self.max_gb * BYTES_PER_GB),
         )
-
-
-@dataclass(frozen=True, kw_only=True)
-class BaselineOptions:
-    """Options of a conventional mesh."""
-
-    pipeline: Annotated[
-        Literal["pytetwild"], Option(None, "The mesher of the conventional pipeline.")
-    ] = "pytetwild"
-    nodes: Annotated[int, Option("N", "Target number of nodes.", least=20)] = DEFAULT_NODES[3]
-    labels: Annotated[
-        Path | None, Option("LABELS", "Label image instead of a segmentation of IMAGE.")
-    ] = None
-    classes: ClassesOption = DEFAULT_SETTINGS.classes
-    part: BoxPart = WHOLE_BOX
 
 
 def _check_limit(name: str, limit: float | None) -> None:
