@@ -192,7 +192,7 @@ def same_dice(path: Path, cgal: str) -> dict[str, Any]:
 def _dice(labels: tetopt.Image, mesh: tetopt.Mesh, of_cell: NDArray[np.int64]) -> dict[str, float]:
     """Return the Dice of each label but 0."""
     rows = tetopt.label_fidelity(labels, mesh, of_cell)
-    return {str(row.label): row.dice for row in rows if row.label != 0}
+    return {str(row.label): row.overlap.dice for row in rows if row.label != 0}
 
 
 if __name__ == "__main__":

@@ -320,7 +320,7 @@ MEASURES = {  # where each is called, and its keys in run.json
     "label_fidelity": (tetopt.measure.measures, {"labels"}),
     "label_interfaces": (tetopt.measure.measures, {"interfaces"}),
     "label_contacts": (tetopt.measure.measures, {"contacts"}),
-    "label_layers": (tetopt.measure.measures, {"thickness"}),
+    "label_thickness": (tetopt.measure.measures, {"thickness"}),
     "by_contrast": (tetopt.job.source.Source, {"contrasts"}),
     "fields": (tetopt.job.source.Source, {"cells_without_voxel"}),
 }
@@ -377,7 +377,7 @@ def test_a_measure_that_fails_is_a_line(measured_run, monkeypatch, capsys, name,
     assert (set(numbers) | more) - {"thickness"} == set(whole)
     assert list(numbers["violated"]) == list(numbers["failed"])
     known = {"failed", "violated", "seconds", "memory", "request", *keys}
-    if name == "label_layers":  # it is in the rows of labels
+    if name == "label_thickness":  # it is in the rows of labels
         assert all(row["thickness_mesh"] is None and row["dice"] > 0.0 for row in numbers["labels"])
         known |= {"labels"}
     assert all(numbers[key] == whole[key] for key in set(numbers) - known)

@@ -5,12 +5,12 @@ tables end in a count.
 import numpy as np
 import pytest
 from commands import exit_code
+from label_rows import label_row, surface_of, with_numbers
 from models import sample_image
 
 import tetopt
 import tetopt.cli.console as console
-from tetopt.measure.fidelity import LabelFidelity, Thickness
-from tetopt.measure.interfaces import LabelInterface
+from tetopt.measure.fidelity import LabelInterface, Thickness
 from tetopt.report.tables import worst_labels
 
 N_LABELS = 300
@@ -24,40 +24,36 @@ def real_width(monkeypatch, wide_lines):
 @pytest.fixture
 def labels():
     thick = Thickness(101.25, 1234.5, 12345.6, 12345.6)
+    number = {
+        name: 1.0 if name.endswith("o") or name == "folded" else 7
+        for name in LabelInterface._fields[1:]
+    }
     rows = [
-        LabelFidelity(
+        label_row(
             100000 + k,
-            12345678,
-            1234567.89,
-            1234567.89,
-            123456,
-            0,
-            1.0 - 0.001 * k,
-            0.9,
-            123.456,
-            123.456,
-            12,
-            11,
-            False,
-            123.4,
-            0.5,
-            0.8,
-            12345678,
-            (),
-            thick,
-            thick,
-            12.34,
-            1.234,
-        )
+            voxels=12345678,
+            covered_voxels=12345678,
+            volume=1234567.89,
+            mesh_volume=1234567.89,
+            n_cells=123456,
+            dice=1.0 - 0.001 * k,
+            volume_dice=0.9,
+            dice_majority=0.8,
+            distance_mean=123.456,
+            distance_p95=123.456,
+            distance_max=123.4,
+            components=12,
+            mesh_components=11,
+            one_layer_fraction=0.5,
+            thickness_voxels=thick,
+            thickness_mesh=thick,
+            edge=12.34,
+            cells_across=1.234,
+        )._replace(surface=surface_of(100000 + k, **number))
         for k in range(N_LABELS)
     ]
     names = {row.label: f"left superior temporal gyrus, part {row.label}" for row in rows}
-    number = {
-        name: 1.0 if name.endswith("o") or name == "folded" else 7
-        for name in LabelInterface._fields
-    }
-    interfaces = [LabelInterface(**{**number, "label": row.label}) for row in rows]
-    return {"labels": rows, "interfaces": interfaces, "label_names": names}
+    return {"labels": rows, "interfaces": [row.surface for row in rows], "label_names": names}
 
 
 @pytest.mark.parametrize("every", [False, True])
@@ -83,7 +79,7 @@ def test_a_label_of_another_volume_is_among_the_worst(labels):
     volume.
     """
     rows = labels["labels"]
-    rows[3] = rows[3]._replace(mesh_volume=0.1 * rows[3].volume)
+    rows[3] = with_numbers(rows[3], mesh_volume=0.1 * rows[3].extent.volume)
     assert 3 in worst_labels(rows)
     assert len(worst_labels(rows)) == 12
 

@@ -41,7 +41,8 @@ def judge(result):
     fluid = tetopt.label_fidelity(labels, result.mesh, result.labels)[1]
     contacts = tetopt.label_contacts(labels, result.mesh, result.labels)
     touching_mm2 = sum(each.mesh_mm2 for each in contacts if each.labels == (1, 3))
-    return fluid.mesh_volume / fluid.volume, fluid.one_layer_fraction, touching_mm2
+    volume_ratio = fluid.extent.mesh_volume / fluid.extent.volume
+    return volume_ratio, fluid.extent.one_layer_fraction, touching_mm2
 
 
 without = tetopt.mesh_image(content, nodes=500)
@@ -57,8 +58,9 @@ for name, result in (("without sizes", without), ("two cells across", sized)):
 # %% Compare the thickness of the fluid between its facets with that between the smooth surfaces of
 # its voxels:
 
-of_voxels, of_cells = tetopt.label_thickness(content, sized.mesh, sized.labels)[2]
-print(f"fluid: {of_voxels.p50:.2f} mm of voxels, {of_cells.p50:.2f} mm of cells")
+fluid = tetopt.label_thickness(content, sized.mesh, sized.labels)[2]
+of_voxels, of_cells = fluid.of_voxels.p50, fluid.of_cells.p50
+print(f"fluid: {of_voxels:.2f} mm of voxels, {of_cells:.2f} mm of cells")
 
 # %%
 # Both meshes, cut in the middle: without sizes, and two cells across.

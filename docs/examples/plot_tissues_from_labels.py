@@ -27,7 +27,8 @@ mask = tetopt.Image(1.0 * (t1 > 0), affine)
 # too, with label 0.
 
 result = tetopt.mesh_image(tetopt.content(image, labels, mask), nodes=2500)
-dices = {row.label: row.dice for row in tetopt.label_fidelity(labels, result.mesh, result.labels)}
+rows = tetopt.label_fidelity(labels, result.mesh, result.labels)
+dices = {row.label: row.overlap.dice for row in rows}
 grey_dice, white_dice = dices[2], dices[3]
 print(f"Dice of grey matter {grey_dice:.4f}, of white matter {white_dice:.4f}")
 

@@ -21,8 +21,7 @@ from tetopt.cohort.numbers import (
     orientation_code,
     save_table,
 )
-from tetopt.measure.fidelity import LabelFidelity, MaskFidelity
-from tetopt.measure.interfaces import LabelInterface
+from tetopt.measure.fidelity import LabelFidelity, LabelInterface, MaskFidelity
 from tetopt.measure.quality import Quality
 from tetopt.system.incoming import toml_of
 
@@ -184,15 +183,15 @@ def test_every_column_is_described():
 
 
 @pytest.mark.parametrize(
-    ("beginning", "record"),
+    ("beginning", "names"),
     [
-        ("labels.N.", LabelFidelity),
-        ("interfaces.N.", LabelInterface),
-        ("mask.", MaskFidelity),
-        ("quality.", Quality),
+        ("labels.N.", LabelFidelity(1).as_json()),
+        ("interfaces.N.", LabelInterface._fields),
+        ("mask.", MaskFidelity._fields),
+        ("quality.", Quality._fields),
     ],
 )
-def test_what_is_measured_is_described(beginning, record):
+def test_what_is_measured_is_described(beginning, names):
     """A new number of a run has a line in the table of descriptions, and one that is gone has
     none.
     """
@@ -202,4 +201,4 @@ def test_what_is_measured_is_described(beginning, record):
         for name in table
         if name.startswith(beginning)
     }
-    assert described == set(record._fields) - {"label"}
+    assert described == set(names) - {"label"}

@@ -89,8 +89,8 @@ def assert_sound(result, image, labels, mask, order=1):
         fields["label"] = result.labels
     measured = fidelity(labels, mask, mesh, result.labels)
     if labels is not None and mask is None:
-        assert sum(row.n_cells for row in measured["labels"]) == n_cells
-        volume = sum(row.mesh_volume for row in measured["labels"])
+        assert sum(row.extent.n_cells for row in measured["labels"]) == n_cells
+        volume = sum(row.extent.mesh_volume for row in measured["labels"])
         assert volume == pytest.approx(image.volume)
     assert {len(values) for values in fields.values()} == {n_cells}
     model = tetopt.build_model(mesh, image, young=3.0, order=order, cell_data=fields)

@@ -253,12 +253,12 @@ def test_labels_that_meet_in_edges_and_points():
     assert_E_D(target, result)
     rows = {row.label: row for row in label_fidelity(labels, result.mesh, result.labels)}
     for label in range(1, 9):
-        assert rows[label].dice > 0.995
-        assert rows[label].components == 1
+        assert rows[label].overlap.dice > 0.995
+        assert rows[label].pieces.components == 1
         # beside the edge where four meet a cell may stand alone
-        assert rows[label].mesh_components <= 3
-    assert sum(row.mesh_volume for row in rows.values()) == pytest.approx(labels.volume)
-    assert rows[20].is_lost or rows[20].mesh_volume < 4.0  # one voxel among 13,824
+        assert rows[label].pieces.mesh_components <= 3
+    assert sum(row.extent.mesh_volume for row in rows.values()) == pytest.approx(labels.volume)
+    assert rows[20].extent.is_lost or rows[20].extent.mesh_volume < 4.0  # one voxel among 13,824
 
 
 def unexplained(image, mesh):
@@ -280,7 +280,9 @@ def test_labels_and_an_image_share_the_cells():
         mesh_image(each, 300).mesh
         for each in (content(image), content(image, labels, label_weight=1.0))
     )
-    least = [min(row.dice for row in label_fidelity(labels, mesh)) for mesh in (alone, both)]
+    least = [
+        min(row.overlap.dice for row in label_fidelity(labels, mesh)) for mesh in (alone, both)
+    ]
     assert least[0] < 0.98
     assert least[1] > 0.99
     assert unexplained(image, both) < 0.02

@@ -5,6 +5,7 @@ meant.
 import numpy as np
 import pytest
 from commands import exit_code, numbers_in
+from label_rows import label_row, surface_of, with_numbers
 
 import tetopt
 from tetopt.contents.labels import LostComponent
@@ -23,8 +24,7 @@ from tetopt.job.advice import (
 )
 from tetopt.job.advice import unmet_requirements as unmet_of
 from tetopt.job.events import listen_with
-from tetopt.measure.fidelity import LabelFidelity, MaskFidelity
-from tetopt.measure.interfaces import LabelInterface
+from tetopt.measure.fidelity import LabelPieces, MaskFidelity
 from tetopt.measure.judge import LABEL_REMEDY, PIECES_REMEDY, judge
 from tetopt.start.label_sizes import sizes_by_label
 from tetopt.start.sizes import EdgeRatios, Sizes
@@ -111,9 +111,9 @@ def test_components_that_were_dropped_are_told(said):
 
 
 def label_of(label, mesh_volume=9.0, is_lost=False, voxels=9):
-    dice = 0.0 if is_lost else 0.9
-    row = LabelFidelity(label, voxels, 9.0, mesh_volume, 3, 0, dice, dice, 0.1, 0.1, 1, 1, is_lost)
-    return row._replace(covered_voxels=voxels)
+    counts = {"voxels": voxels, "covered_voxels": voxels, "components": 1, "mesh_components": 1}
+    numbers = {"volume": 9.0, "mesh_volume": mesh_volume, "is_lost": is_lost}
+    return label_row(label, dice=0.0 if is_lost else 0.9, **counts, **numbers)
 
 
 def test_labels_of_twice_or_half_their_volume_are_named_the_worst_first(said):
@@ -142,12 +142,12 @@ def test_large_labels_of_another_volume_violate_a_requirement_by_name(said):
     assert told(*unmet({"labels": "by numbers"}, names)) == {"labels": f"{words}; {LABEL_REMEDY}"}
     # With a part of the label in the mesh, the volume is that of the part.
     half = [
-        row._replace(covered_voxels=300, voxels=600, mesh_volume=0.5 * row.mesh_volume)
+        with_numbers(row, covered_voxels=300, voxels=600, mesh_volume=0.5 * row.extent.mesh_volume)
         for row in rows
     ]
     assert told(*unmet({}, names | {"labels": half})) == {"labels": f"{words}; {LABEL_REMEDY}"}
     few = [
-        row._replace(covered_voxels=199, voxels=398, mesh_volume=0.5 * row.mesh_volume)
+        with_numbers(row, covered_voxels=199, voxels=398, mesh_volume=0.5 * row.extent.mesh_volume)
         for row in rows
     ]
     assert told(*unmet({}, names | {"labels": few})) == {}
@@ -156,8 +156,8 @@ def test_large_labels_of_another_volume_violate_a_requirement_by_name(said):
 def test_components_without_a_cell_violate_a_requirement_the_largest_first(said):
     lost = tuple(LostComponent(n, (1.0, 2.5, 1234.56)) for n in (99, 60, 50, 50))
     rows = [
-        label_of(3)._replace(lost_components=lost),
-        label_of(4, is_lost=True)._replace(lost_components=lost[:2]),
+        with_numbers(label_of(3), lost_components=lost),
+        with_numbers(label_of(4, is_lost=True), lost_components=lost[:2]),
     ]
     words = told(*unmet({}, {"labels": rows}))["labels"]
     assert words.startswith(
@@ -166,9 +166,10 @@ def test_components_without_a_cell_violate_a_requirement_the_largest_first(said)
     assert words.endswith(f"50 voxels of label 3 at (1, 2.5, 1235) mm and 1 more; {PIECES_REMEDY}")
     assert "label_weight" not in words
     assert "no cell has label" not in said()  # named above
-    small = [label_of(3)._replace(lost_components=tuple(each._replace(voxels=49) for each in lost))]
+    few = tuple(each._replace(voxels=49) for each in lost)
+    small = [with_numbers(label_of(3), lost_components=few)]
     assert told(*unmet({}, {"labels": small})) == {}
-    large = [label_of(4, is_lost=True, voxels=200)._replace(lost_components=lost[:2])]
+    large = [with_numbers(label_of(4, is_lost=True, voxels=200), lost_components=lost[:2])]
     assert "components" not in told(*unmet({}, {"labels": large}))["labels"]
 
 
@@ -180,12 +181,14 @@ def test_what_requirements_allow_is_counted_over_all_labels_the_worst_first():
     ]
     assert beyond_requirements({"labels": [rows[1], rows[3]]}) == {}
     assert beyond_requirements({}) == {}
-    rows[1] = rows[1]._replace(lost_components=lost, components=9, mesh_components=7)
-    rows[3] = rows[3]._replace(lost_components=lost[:1], components=2, mesh_components=2)
-    # its cell is elsewhere
-    rows[5] = rows[5]._replace(lost_components=lost[1:], components=1, mesh_components=1)
-    rows[7] = rows[7]._replace(mesh_components=3)
-    rows[0] = rows[0]._replace(lost_components=lost, mesh_components=5)  # the space between tissues
+    for k, pieces in {
+        1: LabelPieces(9, 7, lost),
+        3: LabelPieces(2, 2, lost[:1]),
+        5: LabelPieces(1, 1, lost[1:]),  # its cell is elsewhere
+        7: LabelPieces(1, 3),
+        0: LabelPieces(1, 5, lost),  # the space between tissues
+    }.items():
+        rows[k] = rows[k]._replace(pieces=pieces)
     assert beyond_requirements({"labels": rows, "label_names": {5: "rib"}}) == {
         "not all labels fit": "labels: of 7 and label 0, 6 with less than 0.85 or more than 1.15 "
         "times the volume of "
@@ -210,19 +213,12 @@ def test_pieces_that_merge_and_cavities_that_open_are_counted():
         5: (9, 0, ()),
         6: (1, 1, ()),
     }
-    names = ("components", "mesh_components", "lost_components")
-    rows = [
-        label_of(k, 9.0)._replace(**dict(zip(names, count, strict=True)))
-        for k, count in counts.items()
-    ]
-    rows[4] = rows[4]._replace(voxels=2 * rows[4].covered_voxels, mesh_volume=4.5)
-    empty = dict.fromkeys(LabelInterface._fields, 0)
+    rows = [label_of(k)._replace(pieces=LabelPieces(*count)) for k, count in counts.items()]
+    rows[4] = with_numbers(rows[4], voxels=18, mesh_volume=4.5)
     cavities = {0: (5, 1), 2: (1, 1), 3: (1, 2), 4: (1, 0), 5: (1, 0), 6: (3, 1)}
-    surfaces = [
-        LabelInterface(**empty | {"label": k, "cavities": n, "mesh_cavities": left})
-        for k, (n, left) in cavities.items()
-    ]
-    (line,) = beyond_requirements({"labels": rows, "interfaces": surfaces}).values()
+    for k, (n, left) in cavities.items():
+        rows[k] = rows[k]._replace(surface=surface_of(k, cavities=n, mesh_cavities=left))
+    (line,) = beyond_requirements({"labels": rows}).values()
     assert line == (
         "labels: of 6 and label 0, 2 with components without a cell: 1 (2 of 3, voxels: 43), 3 "
         "(2 of 9, voxels: 43); "
@@ -260,12 +256,13 @@ def test_what_requirements_allow_of_a_mask(change, words):
 
 def test_more_nodes_do_not_help_voxels_without_a_label_in_a_foreground(said):
     air = label_of(0, 2.0, voxels=300)
+    far = with_numbers(air, mesh_volume=9.0, dice=0.1)
     for word, rows, n_lines, n_remedies in (
         ("foreground", [air], 1, 0),
         ("mask", [air], 1, 1),
         ("foreground", [air, label_of(2, 2.0)], 2, 1),
-        ("foreground", [air._replace(mesh_volume=9.0, dice=0.1)], 1, 0),
-        ("mask", [air._replace(mesh_volume=9.0, dice=0.1)], 1, 1),
+        ("foreground", [far], 1, 0),
+        ("mask", [far], 1, 1),
     ):
         told(*unmet({}, {"labels": rows}, word))
         text = said()
@@ -274,7 +271,7 @@ def test_more_nodes_do_not_help_voxels_without_a_label_in_a_foreground(said):
         assert text.count("0 (voxels without a label, enclosed or bright)") == (
             word == "foreground"
         )
-    told(*unmet({"labels": "..."}, {"labels": [air._replace(dice=0.0)]}, "foreground"))
+    told(*unmet({"labels": "..."}, {"labels": [with_numbers(air, dice=0.0)]}, "foreground"))
     assert said().endswith("of 200 voxels or more, lies in a cell with that label\n")
 
 
@@ -293,7 +290,7 @@ def started_only():
 @pytest.mark.parametrize(
     ("result", "mode", "nodes", "measured", "words"),
     [
-        (ended(), "graded", 100, {}, ""),
+        (ended(), "graded", 101, {}, ""),
         (ended(), "graded", 120, {}, "100 nodes instead of 120; use more iterations\n"),
         (ended()._replace(ended="converged"), "graded", 120, {}, "100 nodes instead of 120\n"),
         (

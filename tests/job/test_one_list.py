@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from commands import exit_code, numbers_in
+from label_rows import label_row
 from scipy.ndimage import gaussian_filter
 
 import tetopt
@@ -20,7 +21,6 @@ from tetopt.job.advice import Problem, of_layers, order_problems, sentences
 from tetopt.job.events import ended_words
 from tetopt.job.options import SourceOptions
 from tetopt.job.source import read_source
-from tetopt.measure.fidelity import LabelFidelity
 
 COARSE = ["--spacing", "12", "--iterations", "0"]
 FINE = ["--spacing", "6", "--iterations", "0"]
@@ -213,15 +213,9 @@ def test_remedies_agree():
 
 
 def test_cells_across_are_those_of_the_mesh():
-    row = LabelFidelity(
-        3, 900, 900.0, 900.0, 90, 0, 0.9, 0.9, 0.1, 0.2, 1, 1, False, edge=3.6, cells_across=1.2
-    )
-    rows = [
-        row,
-        row._replace(label=4, cells_across=1.9),
-        row._replace(label=5, cells_across=0.8, edge=5.0),
-    ]
-    (problem,) = of_layers([*rows, row._replace(label=0)], 2.0, {3: "fluid"})
+    across = {3: (3.6, 1.2), 4: (3.6, 1.9), 5: (5.0, 0.8), 0: (3.6, 1.2)}
+    rows = [label_row(k, edge=edge, cells_across=n) for k, (edge, n) in across.items()]
+    (problem,) = of_layers(rows, 2.0, {3: "fluid"})
     assert (
         problem.text
         == "fewer than 2 cells across: 5 0.8 (edges 5 mm), 3 (fluid) 1.2 (edges 3.6 mm)"

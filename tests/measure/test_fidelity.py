@@ -240,14 +240,18 @@ def test_shifted_plane(n, shift):
     for row in label_fidelity(image, mesh, of_cell):
         layers = 4 + (shift if row.label == 0 else -shift)
         assert row.label in (0, 1)
-        assert row.voxels == 4 * layer
-        assert row.volume == pytest.approx(4 * layer * voxel)
-        assert row.mesh_volume == pytest.approx(layers * layer * voxel)
-        assert row.n_cells == (of_cell == row.label).sum()
-        assert row.dice == pytest.approx(2 * min(layers, 4) / (layers + 4))
-        assert row.distance_mean == pytest.approx(1.5 * abs(shift), abs=1e-9)
-        assert row.distance_p95 == pytest.approx(1.5 * abs(shift), abs=1e-9)
-        assert (row.components, row.mesh_components, row.is_lost) == (1, 1, False)
+        assert row.extent.voxels == 4 * layer
+        assert row.extent.volume == pytest.approx(4 * layer * voxel)
+        assert row.extent.mesh_volume == pytest.approx(layers * layer * voxel)
+        assert row.extent.n_cells == (of_cell == row.label).sum()
+        assert row.overlap.dice == pytest.approx(2 * min(layers, 4) / (layers + 4))
+        assert row.distance.mean == pytest.approx(1.5 * abs(shift), abs=1e-9)
+        assert row.distance.p95 == pytest.approx(1.5 * abs(shift), abs=1e-9)
+        assert (row.pieces.components, row.pieces.mesh_components, row.extent.is_lost) == (
+            1,
+            1,
+            False,
+        )
 
 
 @pytest.mark.parametrize("n", [2, 3])
@@ -259,8 +263,8 @@ def test_distances_are_pooled_by_area(n):
     stripe = np.zeros(image.shape)
     stripe[2:6] = 3
     row = label_fidelity(tetopt.Image(stripe), mesh, np.where(x > 1.5, 3, 0))[1]
-    assert row.distance_mean == pytest.approx(4 / 3, rel=6e-3)
-    assert row.distance_p95 == row.distance_max == 4.0
+    assert row.distance.mean == pytest.approx(4 / 3, rel=6e-3)
+    assert row.distance.p95 == row.distance.max == 4.0
 
 
 def test_lost_label():
@@ -269,19 +273,25 @@ def test_lost_label():
     labels[4, 4, 4] = 1
     image = tetopt.Image(labels)
     background, speck = label_fidelity(image, blocky(image, (1, 1, 1)))
-    assert speck.is_lost
-    assert (speck.n_cells, speck.mesh_volume, speck.dice, speck.voxels, speck.components) == (
+    assert speck.extent.is_lost
+    assert (
+        speck.extent.n_cells,
+        speck.extent.mesh_volume,
+        speck.overlap.dice,
+        speck.extent.voxels,
+        speck.pieces.components,
+    ) == (
         0,
         0.0,
         0.0,
         1,
         1,
     )
-    assert speck.mesh_components == 0
-    assert np.isnan(speck.distance_mean)
-    assert np.isnan(speck.distance_p95)
-    assert not background.is_lost
-    assert background.dice == 2 * 511 / (511 + 512)
+    assert speck.pieces.mesh_components == 0
+    assert np.isnan(speck.distance.mean)
+    assert np.isnan(speck.distance.p95)
+    assert not background.extent.is_lost
+    assert background.overlap.dice == 2 * 511 / (511 + 512)
 
 
 def test_cells_without_a_voxel():
@@ -295,7 +305,7 @@ def test_cells_without_a_voxel():
     rows = label_fidelity(image, mesh)
     is_empty = tetopt.cell_moments(image, mesh).n_voxels == 0
     of_cell = cell_labels(image, mesh)
-    assert [row.n_empty_cells for row in rows] == [
+    assert [row.extent.n_empty_cells for row in rows] == [
         is_empty[of_cell == row.label].sum() for row in rows
     ]
     assert 0 < is_empty.sum() < len(mesh.cells)
@@ -305,8 +315,8 @@ def test_label_that_fills_the_box_has_no_distance():
     (row,) = label_fidelity(
         tetopt.Image(np.ones((4, 4))), tetopt.lattice_mesh(tetopt.Image(np.ones((4, 4))), nodes=20)
     )
-    assert np.isnan(row.distance_mean)
-    assert (row.label, row.dice, row.is_lost) == (1, 1.0, False)
+    assert np.isnan(row.distance.mean)
+    assert (row.label, row.overlap.dice, row.extent.is_lost) == (1, 1.0, False)
 
 
 def test_outside_of_the_mesh_is_background():
@@ -314,12 +324,12 @@ def test_outside_of_the_mesh_is_background():
     image, mesh, x = slabs(3)
     half = tetopt.Mesh(mesh.points, mesh.cells[x > 2.5])
     background, inside = label_fidelity(image, half, np.ones(len(half.cells)))
-    assert background.n_cells == 0
-    assert not background.is_lost
-    assert background.dice == pytest.approx(2 * 3 / (3 + 4))
-    assert inside.dice == pytest.approx(2 * 4 / (4 + 5))
-    assert background.distance_mean == inside.distance_mean == pytest.approx(1.0)
-    assert label_fidelity(image, mesh, np.ones(len(mesh.cells)))[0].is_lost
+    assert background.extent.n_cells == 0
+    assert not background.extent.is_lost
+    assert background.overlap.dice == pytest.approx(2 * 3 / (3 + 4))
+    assert inside.overlap.dice == pytest.approx(2 * 4 / (4 + 5))
+    assert background.distance.mean == inside.distance.mean == pytest.approx(1.0)
+    assert label_fidelity(image, mesh, np.ones(len(mesh.cells)))[0].extent.is_lost
 
 
 @pytest.mark.parametrize("n", [2, 3])
@@ -329,8 +339,8 @@ def test_components(n):
     labels[(0,) * n] = labels[(1,) * n] = labels[(3,) * n] = labels[(4,) + (3,) * (n - 1)] = 1
     image = tetopt.Image(labels)
     background, spots = label_fidelity(image, blocky(image, (6,) * n))
-    assert (spots.components, spots.mesh_components) == (3, 3)
-    assert (background.components, background.mesh_components) == (1, 1)
+    assert (spots.pieces.components, spots.pieces.mesh_components) == (3, 3)
+    assert (background.pieces.components, background.pieces.mesh_components) == (1, 1)
 
 
 @pytest.mark.parametrize(
@@ -452,7 +462,7 @@ def test_volume_dice_does_not_depend_on_the_unit():
         image = tetopt.Image(labels, np.diag([voxel] * 3 + [1.0]))
         dice.append(
             [
-                row.volume_dice
+                row.overlap.volume_dice
                 for row in label_fidelity(image, tetopt.lattice_mesh(image, blocks=(6, 6, 6)))
             ]
         )
@@ -482,4 +492,8 @@ def test_dice_by_majority(n, is_masked):
         painted[owner == cell] = np.argmax(np.bincount(own)) if len(own) else 3
     for row in label_fidelity(image, mesh, np.full(len(mesh.cells), 3), mask):
         one, other = inside & (image.data == row.label), painted == row.label
-        assert row.dice_majority == 2 * (one & other).sum() / (one.sum() + other.sum()) != row.dice
+        assert (
+            row.overlap.dice_majority
+            == 2 * (one & other).sum() / (one.sum() + other.sum())
+            != row.overlap.dice
+        )

@@ -377,16 +377,18 @@ def test_labels_are_judged_as_they_are_measured(n, is_masked):
     fits = measure(mesh, target, of_cell)["labels"]
     rows = tetopt.label_fidelity(labels, mesh, of_cell, mask)
     assert [fit.label for fit in fits] == [row.label for row in rows]
-    assert any(fit.lost_components for fit in fits)
+    assert any(fit.pieces.lost_components for fit in fits)
     for fit, row in zip(fits, rows, strict=True):
-        assert (fit.covered_voxels, fit.is_met) == (row.covered_voxels, row.dice > 0.0)
-        assert fit.volume_ratio == pytest.approx(
-            row.mesh_volume / (row.covered_voxels * labels.voxel_volume)
+        assert fit.extent[:-1] == row.extent[:-1]  # but for the layers
+        assert fit.extent.ratio == pytest.approx(
+            row.extent.mesh_volume / (row.extent.covered_voxels * labels.voxel_volume)
         )
-        assert [each.voxels for each in fit.lost_components] == [
-            each.voxels for each in row.lost_components
+        assert fit.pieces._replace(lost_components=()) == row.pieces._replace(lost_components=())
+        assert fit.overlap.dice == row.overlap.dice
+        assert [each.voxels for each in fit.pieces.lost_components] == [
+            each.voxels for each in row.pieces.lost_components
         ]
-        for one, other in zip(fit.lost_components, row.lost_components, strict=True):
+        for one, other in zip(fit.pieces.lost_components, row.pieces.lost_components, strict=True):
             np.testing.assert_allclose(one.place, other.place)
             assert data[tuple(np.rint(labels.to_index(one.place)).astype(int))] == fit.label
 

@@ -8,6 +8,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 import pyvista
+from label_rows import surface_of
 from meshes import random_affine
 from scipy.sparse.csgraph import connected_components
 from shapes import OBLIQUE, shaped
@@ -16,13 +17,14 @@ import tetopt
 from tetopt.geometry.simplex import centroids, orient_cells
 from tetopt.measure.fidelity import (
     FacetSurface,
+    LabelExtent,
     LabelFidelity,
+    LabelPieces,
     cell_labels,
     label_fidelity,
     surface_areas,
 )
 from tetopt.measure.interfaces import (
-    LabelInterface,
     area_at_volume,
     label_interfaces,
     smooth_surface,
@@ -125,12 +127,14 @@ def test_a_void_that_the_mesh_leaves_out_is_a_cavity():
     assert (one.cavities, one.mesh_cavities, zero.cavities, zero.mesh_cavities) == (2, 2, 0, 0)
     assert (one.euler, one.mesh_euler) == (2 * (2 + 2), 2 * (2 + 2))
     rows = label_fidelity(image, part, of_cell[is_in], mask)
-    assert [(row.label, row.voxels, row.dice, row.is_lost) for row in rows] == [
+    assert [
+        (row.label, row.extent.voxels, row.overlap.dice, row.extent.is_lost) for row in rows
+    ] == [
         (0, 1, 1.0, False),
         (1, inside.sum() - 1, 1.0, False),
     ]
     lost = label_fidelity(image, part, np.ones(is_in.sum()), mask)[0]
-    assert (lost.voxels, lost.is_lost, lost.dice) == (1, True, 0.0)
+    assert (lost.extent.voxels, lost.extent.is_lost, lost.overlap.dice) == (1, True, 0.0)
     for measure in (label_interfaces, label_fidelity):
         with pytest.raises(tetopt.InputError, match="mask: expected the labels' shape"):
             measure(image, part, of_cell[is_in], tetopt.Image(inside[1:]))
@@ -345,13 +349,10 @@ def test_differences_in_words():
     """Only those that there are, of labels that have cells."""
 
     def rows(label, pieces, eulers, cavities, n_cells=9, mesh_volume=10.0):
-        fidelity = dict.fromkeys(LabelFidelity._fields, 0) | {"label": label, "n_cells": n_cells}
-        fidelity |= {"volume": 10.0, "mesh_volume": mesh_volume}
-        surface = dict.fromkeys(LabelInterface._fields, 0) | {"label": label}
-        fidelity["components"], fidelity["mesh_components"] = pieces
-        surface["euler"], surface["mesh_euler"] = eulers
-        surface["cavities"], surface["mesh_cavities"] = cavities
-        return LabelFidelity(**fidelity), LabelInterface(**surface)
+        names = "euler", "mesh_euler", "cavities", "mesh_cavities"
+        surface = surface_of(label, **dict(zip(names, (*eulers, *cavities), strict=True)))
+        extent = LabelExtent(volume=10.0, mesh_volume=mesh_volume, n_cells=n_cells)
+        return LabelFidelity(label, extent, LabelPieces(*pieces), surface=surface)
 
     each = [
         rows(1, (1, 1), (2, 2), (0, 0)),
@@ -362,7 +363,7 @@ def test_differences_in_words():
         rows(9, (1, 1), (2, 2), (0, 0), mesh_volume=3.8),
         rows(10, (1, 1), (2, 2), (0, 0), mesh_volume=8.1),
     ]
-    assert label_differences(*zip(*each, strict=True), {5: "liver [left]"}) == [
+    assert label_differences(each, {5: "liver [left]"}) == [
         "label 5 (liver [left]): 1 component of voxels, 3 of cells; 1 hole more",
         "label 6: 2 components of voxels, 1 of cells; 2 cavities more",
         "label 7: 2 holes fewer",

@@ -9,17 +9,17 @@ import numba
 import numpy as np
 import pytest
 import pyvista
+from label_rows import label_row, with_numbers
 from shapes import OBLIQUE
 
 import tetopt
 from tetopt.contents.thickness import thickness_between
 from tetopt.geometry.simplex import volumes
-from tetopt.measure.fidelity import LabelFidelity, Thickness, label_fidelity
+from tetopt.measure.fidelity import Thickness, label_fidelity
 from tetopt.measure.thin import (
     LabelContact,
     contact_totals,
     label_contacts,
-    label_layers,
     label_thickness,
 )
 from tetopt.report.tables import contact_table, contacts_in_words, thin_table
@@ -102,7 +102,9 @@ def test_only_voxels_in_the_mask_touch():
 def test_layers_are_cells_without_an_inner_node(n):
     image, mesh, of_cell = blocky(slabs(1, n))
     # 2-D: centres
-    assert label_fidelity(image, mesh, of_cell)[1].one_layer_fraction == (1.0 if n == 3 else 0.0)
+    assert label_fidelity(image, mesh, of_cell)[1].extent.one_layer_fraction == (
+        1.0 if n == 3 else 0.0
+    )
     image, mesh, of_cell = blocky(slabs(4, n)[5:15, :5])
     rows = {row.label: row for row in label_fidelity(image, mesh, of_cell)}
     beside = defaultdict(list)
@@ -114,7 +116,7 @@ def test_layers_are_cells_without_an_inner_node(n):
         on = {i for facet, labels in beside.items() if labels.count(label) == 1 for i in facet}
         own = [cell for cell in range(len(mesh.cells)) if of_cell[cell] == label]
         part = sum(size[cell] for cell in own if set(mesh.cells[cell]) <= on)
-        assert rows[label].one_layer_fraction == pytest.approx(
+        assert rows[label].extent.one_layer_fraction == pytest.approx(
             part / sum(size[cell] for cell in own)
         )
         assert (part > 0.0) == (n == 3)
@@ -145,17 +147,17 @@ def test_a_shell_between_facets_is_as_thick_as_it_is(size, spacing, monkeypatch)
 @pytest.mark.parametrize("size", [2, 3, 5])
 def test_voxels_and_cells_of_the_same_surfaces_are_as_thick(n, size):
     image, mesh, of_cell = blocky(slabs(size, n))
-    voxels, cells = label_thickness(tetopt.content(image, image), mesh, of_cell)[2]
+    voxels, cells, *_ = label_thickness(tetopt.content(image, image), mesh, of_cell)[2]
     assert cells == pytest.approx((size, size, size, 10.0), abs=1e-4)
     assert voxels == pytest.approx(cells, rel=0.03)
 
 
 def test_edges_are_those_of_the_labels_own_cells():
     image, mesh, of_cell = blocky(slabs(3, 3))
-    row = label_layers(tetopt.content(image, image), mesh, of_cell)[2]
+    row = label_thickness(tetopt.content(image, image), mesh, of_cell)[2]
     # each voxel's centre is in the middle one of its five cells
     assert row.edge == pytest.approx(np.sqrt(2.0))
-    assert row.across == pytest.approx(row.voxels.p50 / row.edge, rel=1e-6)
+    assert row.cells_across == pytest.approx(row.of_voxels.p50 / row.edge, rel=1e-6)
 
 
 def test_only_voxels_of_the_cells_label_count_as_its_layers():
@@ -164,23 +166,24 @@ def test_only_voxels_of_the_cells_label_count_as_its_layers():
     wide = np.where(
         mesh.points[mesh.cells].mean(axis=1)[:, 0] > 2.5, np.maximum(of_cell, 2), of_cell
     )
-    row = label_layers(tetopt.content(image, image), mesh, wide)[2]
-    assert row.across == pytest.approx(3.0 / np.sqrt(2.0), rel=0.03)
+    row = label_thickness(tetopt.content(image, image), mesh, wide)[2]
+    assert row.cells_across == pytest.approx(3.0 / np.sqrt(2.0), rel=0.03)
 
 
 def test_percentiles_are_over_the_voxels():
     x, y = np.indices((20, 20))
     size = np.choose(np.searchsorted([6, 16], y, side="right"), [2, 4, 6])
     image, mesh, of_cell = blocky(np.where((x >= 6) & (x < 6 + size), 2, 1))
-    for each in label_thickness(tetopt.content(image, image), mesh, of_cell)[2]:
+    row = label_thickness(tetopt.content(image, image), mesh, of_cell)[2]
+    for each in (row.of_voxels, row.of_cells):
         assert each == pytest.approx((2.0, 4.0, 6.0, 10.0), abs=0.5)
 
 
 def test_a_label_that_is_in_one_of_them_alone():
     image, mesh, of_cell = blocky(slabs(1))
     found = label_thickness(tetopt.content(image, image), mesh, np.where(of_cell == 2, 7, of_cell))
-    assert (found[2][1], found[7][0]) == (None, None)
-    assert found[7][1].p50 == pytest.approx(1.0, abs=1e-4)
+    assert (found[2].of_cells, found[7].of_voxels) == (None, None)
+    assert found[7].of_cells.p50 == pytest.approx(1.0, abs=1e-4)
     with pytest.raises(tetopt.InputError, match="expected labels with smooth interfaces, got none"):
         label_thickness(tetopt.content(image), mesh, of_cell)
 
@@ -193,7 +196,7 @@ def test_a_mesh_of_nested_shells_is_as_thick_as_its_voxels():
     result = tetopt.mesh_image(what, 4000, iterations=8)
     found = label_thickness(what, result.mesh, result.labels)
     for label, size in ((1, 3.0), (2, 4.0)):
-        voxels, cells = found[label]
+        voxels, cells, *_ = found[label]
         assert (voxels.p50, cells.p50) == pytest.approx((size,) * 2, rel=0.045)
         assert cells == pytest.approx(voxels, rel=0.06)
     (shell,) = [
@@ -210,41 +213,46 @@ def texts(table):
 
 def test_tables_have_the_worst_five_alone():
     rows = [
-        LabelFidelity(
-            *(9,) * 12, False, 1.0, fraction, 0.9, 9, (), Thickness(1.0, 2.0, 3.0, 3.0), None
-        )._replace(label=label)
+        label_row(
+            label,
+            n_cells=9,
+            one_layer_fraction=fraction,
+            thickness_voxels=Thickness(1.0, 2.0, 3.0, 3.0),
+        )
         for label, fraction in zip(
             range(1, 42), np.random.default_rng(2).permutation(41) / 41.0, strict=True
         )
     ]
     shown = texts(thin_table(rows, {rows[0].label: "bone [l]"}))
-    worst = sorted(rows, key=lambda row: -row.one_layer_fraction)[:5]
+    worst = sorted(rows, key=lambda row: -row.extent.one_layer_fraction)[:5]
     assert [int(row[0].split()[0]) for row in shown] == [row.label for row in worst]
     assert (
         texts(
             thin_table(
-                [rows[0]._replace(label=0, one_layer_fraction=1.0), *rows],
+                [with_numbers(rows[0], one_layer_fraction=1.0)._replace(label=0), *rows],
                 {rows[0].label: "bone [l]"},
             )
         )
         == shown
     )
     assert shown[0][1:] == (
-        f"{100 * worst[0].one_layer_fraction:.1f}",
+        f"{100 * worst[0].extent.one_layer_fraction:.1f}",
         "2.00 (1.00 to >= 3.00)",
         "-",
         "-",
         "-",
     )
     alike = [
-        row._replace(one_layer_fraction=1.0, thickness_voxels=Thickness(0.0, row.label % 7, 9.0))
+        with_numbers(
+            row, one_layer_fraction=1.0, thickness_voxels=Thickness(0.0, row.label % 7, 9.0)
+        )
         for row in rows
     ]
     assert [int(row[0]) for row in texts(thin_table(alike, {}))] == [7, 14, 21, 28, 35]
-    thick = rows[0]._replace(one_layer_fraction=1.0)
+    thick = with_numbers(rows[0], one_layer_fraction=1.0)
     for row in (
-        thick._replace(cells_across=2.0),
-        thick._replace(thickness_voxels=Thickness(1.0, 3.0, 3.0, 3.0)),
+        with_numbers(thick, cells_across=2.0),
+        with_numbers(thick, thickness_voxels=Thickness(1.0, 3.0, 3.0, 3.0)),
     ):
         assert texts(thin_table([row, *rows], {rows[0].label: "bone [l]"})) == shown
         assert thin_table([row], {}) is None

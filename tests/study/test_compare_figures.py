@@ -66,7 +66,7 @@ def test_label_marks_are_those_of_the_report():
     for axes, name, n in ((dice, "dice", 4), (distance, "distance_mean", 3)):
 
         def assert_marks(line, rows, name=name, n=n):
-            values = {row.label: getattr(row, name) for row in rows}
+            values = {row.label: row.as_json()[name] for row in rows}
             assert_array_equal(line.get_ydata()[:n], [values[k] for k in range(n)])
 
         full = [line for line in axes.lines if line.get_markerfacecolor() != "none"]

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from browser import browser, copied, document
+from label_rows import label_row, with_numbers
 from markupsafe import escape
 
 import tetopt
@@ -16,7 +17,6 @@ from tetopt.cli import console
 from tetopt.cli.compare import compare_command
 from tetopt.fem.reference import Errors, OwnError
 from tetopt.io.text import plain
-from tetopt.measure.fidelity import LabelFidelity
 from tetopt.measure.quality import Quality
 from tetopt.report.figures import save_figure
 from tetopt.study import compare_files
@@ -76,11 +76,12 @@ def histogram(random, edges):
 
 def label_of(random, label, voxels, **given):
     sizes = {"voxels": voxels, "volume": 8.0 * voxels, "mesh_volume": 7.5 * voxels}
-    return filled(random, LabelFidelity, label=label, is_lost=False, **sizes | given)
+    numbers = {"dice": random.uniform(), "distance_mean": random.uniform()}
+    return label_row(label, **numbers | sizes | given)
 
 
 def lost(row):
-    return row._replace(is_lost=True, dice=0.0, distance_mean=math.nan, mesh_volume=0.0)
+    return with_numbers(row, is_lost=True, dice=0.0, distance_mean=math.nan, mesh_volume=0.0)
 
 
 def with_runs(pipeline, runs):

@@ -311,17 +311,15 @@ def _print_labels(measured: dict[str, Any], ndim: int, every: bool) -> None:
 
     names = measured.get("label_names", {})
     places = worst_labels(measured["labels"], *([None] if every else []))
-    rows, interfaces = (
-        [measured[name][place] for place in places] for name in ("labels", "interfaces")
-    )
+    rows = [measured["labels"][place] for place in places]
     print_table(label_table(rows, names, ndim))
     if len(places) < len(measured["labels"]):
         n_all = count_of_labels([row.label for row in measured["labels"]], " labels")
         which = f"the {len(places)} of {n_all} that fit worst, by Dice or volume"
         print_line(f"{which}; `tetopt quality --all` prints all")
     if every:
-        print_table(surface_table(rows, interfaces, names))
-    for line in label_differences(rows, interfaces, names):
+        print_table(surface_table(rows, names))
+    for line in label_differences(rows, names):
         print_line(line)
 
 

@@ -5,7 +5,7 @@ nodes.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
@@ -20,6 +20,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.box import facets_on_sides
 from tetopt.image import Image, transform_vectors
 from tetopt.interop import notebook
+from tetopt.measure.fidelity import LabelFidelity
 from tetopt.mesh import Mesh
 from tetopt.system.arrays import Bools, Floats, Ints
 
@@ -128,6 +129,8 @@ class MeshingResult(NamedTuple):
     violated : mapping of str to str
         Requirements that the mesh violates, by name, one sentence each
         (`tetopt.measure.judge`), judged by `mesh_image`; empty if none.
+    extents : sequence of LabelFidelity
+        Volumes, components and Dice of the labels, as they were judged.
     fraction : float, optional
         Unexplained fraction of the content's variance: E_D over variance times volume. Only from
         `mesh_image`.
@@ -162,6 +165,7 @@ class MeshingResult(NamedTuple):
     seconds_run: float = 0.0
     labels: Ints | None = None
     violated: Mapping[str, str] = MappingProxyType({})
+    extents: Sequence[LabelFidelity] = ()
     fraction: float | None = None
     n_dropped: int = 0
     curving: Curving | None = None

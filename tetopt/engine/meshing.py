@@ -373,8 +373,12 @@ def _with_verdict(
         cut_short=result.ended if result.ended in CUT_SHORT else "",
         is_initial=last.iteration == 0,
     )
-    fraction = None if isinstance(rows["error"], Exception) else rows["error"]
-    return result._replace(violated=judge(rows, required), fraction=fraction)
+    measured = {name: row for name, row in rows.items() if not isinstance(row, Exception)}
+    return result._replace(
+        violated=judge(rows, required),
+        extents=measured.get("labels", ()),
+        fraction=measured.get("error"),
+    )
 
 
 def process_bytes(content: Content, nodes: int) -> float:

@@ -63,8 +63,9 @@ def plain(text: str) -> str:
 
 
 def count_text(number: int, noun: str) -> str:
-    """Format a number of things."""
-    return f"{number} {noun}{'s' * (number != 1)}"
+    """Format a number of things; "cavity" has the plural "cavities"."""
+    plural = f"{noun[:-1]}ies" if noun.endswith("y") else f"{noun}s"
+    return f"{number} {noun if number == 1 else plural}"
 
 
 def last_line(text: str) -> str:

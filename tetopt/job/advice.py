@@ -17,8 +17,7 @@ from tetopt.engine.sliding import MOST_MEETING
 from tetopt.io.text import list_names
 from tetopt.job.events import note, report_violation, warning
 from tetopt.job.options import Method
-from tetopt.measure.fidelity import LabelFidelity, MaskFidelity
-from tetopt.measure.interfaces import LabelInterface
+from tetopt.measure.fidelity import LabelFidelity, LabelInterface, LabelPieces, MaskFidelity
 from tetopt.measure.judge import LABEL_VOXELS, Requirements, faulty_labels
 from tetopt.model.label_names import count_of_labels, label_words
 from tetopt.start.label_sizes import SizesByLabel
@@ -283,22 +282,22 @@ def _of_labels(measured: Json, word: str) -> Iterator[Problem]:
     required = required_of(word, measured.get("label_names", {}))
     faulty = set(faulty_labels(labels))
     others = [row for row in labels if row.label not in faulty]
-    there = [row for row in others if row.covered_voxels and row.mesh_volume > 0.0]
-    large = [row for row in others if row.voxels >= LABEL_VOXELS]
+    there = [row for row in others if row.extent.covered_voxels and row.extent.mesh_volume > 0.0]
+    large = [row for row in others if row.extent.voxels >= LABEL_VOXELS]
 
     def words(row: LabelFidelity) -> str:
         return required.label_words(row.label)
 
-    yield from find_odd_labels("lost", others, lambda row: row.is_lost, words)
+    yield from find_odd_labels("lost", others, lambda row: row.extent.is_lost, words)
     yield from find_odd_labels(
         "volume",
         there,
-        lambda row: max(row.volume_ratio, 1.0 / row.volume_ratio),
-        lambda row: f"{words(row)} ({row.volume_ratio:.3g})",
+        lambda row: max(row.extent.ratio, 1.0 / row.extent.ratio),
+        lambda row: f"{words(row)} ({row.extent.ratio:.3g})",
         unhelped=required.unhelped,
     )
     yield from find_odd_labels(
-        "overlap", large, lambda row: 1.0 - row.dice, words, 5, required.unhelped
+        "overlap", large, lambda row: 1.0 - row.overlap.dice, words, 5, required.unhelped
     )
 
 
@@ -331,12 +330,11 @@ def beyond_requirements(measured: Mapping[str, Any], word: str = "mask") -> dict
         ]
         beyond = {f"not all of the {word} fits": f"{word}: {'; '.join(of_mask)}"} if of_mask else {}
     rows, names = measured.get("labels", []), measured.get("label_names", {})
-    surfaces = {each.label: each for each in measured.get("interfaces", [])}
     for row in rows:
-        ratio = row.volume_ratio if row.covered_voxels else 1.0
-        faults = _faults(
-            row, ratio, NEAR_VOLUME, surfaces.get(row.label), row.covered_voxels == row.voxels
-        )
+        extent = row.extent
+        ratio = extent.ratio if extent.covered_voxels else 1.0
+        is_whole = extent.covered_voxels == extent.voxels
+        faults = _faults(row.pieces, ratio, NEAR_VOLUME, row.surface, is_whole)
         for what, rank, words in faults:
             if row.label != BACKGROUND_LABEL or "volume" in what:
                 of_labels.setdefault(what, []).append(
@@ -353,7 +351,7 @@ def beyond_requirements(measured: Mapping[str, Any], word: str = "mask") -> dict
 
 
 def _faults(
-    row: LabelFidelity | MaskFidelity,
+    row: LabelPieces | MaskFidelity,
     ratio: float,
     near: tuple[float, float],
     surface: LabelInterface | None = None,
@@ -527,9 +525,10 @@ def of_layers(
     yield from find_odd_labels(
         "across",
         tissues,
-        lambda row: 1.0 - row.cells_across / cells_across,
+        lambda row: 1.0 - row.thickness.cells_across / cells_across,
         lambda row: (
-            f"{label_words(row.label, names)} {row.cells_across:.2g} (edges {row.edge:.2g} mm)"
+            f"{label_words(row.label, names)} {row.thickness.cells_across:.2g} (edges "
+            f"{row.thickness.edge:.2g} mm)"
         ),
         5,
         requested=cells_across,

@@ -157,6 +157,7 @@ def measures_of(task: Task, result: MeshingResult, model: Model, failed: dict[st
         model.cell_data.get(LABEL_FIELD),
         failed,
         source.content,
+        result.extents,
     )
     if (table := _table_of(source)) is not None and table.names:
         measured["label_names"] = table.names

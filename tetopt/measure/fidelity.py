@@ -12,10 +12,10 @@ percentiles are by area.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from itertools import combinations
 from math import ceil
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -51,6 +51,14 @@ POINTS_PER_FACE = 4.0  # per area of a voxel's face: the half level bends no fas
 # + 1 (Roberts 2018).
 EVEN_STEPS = {2: 0.7548776662466927 ** np.arange(1, 3), 3: 0.8191725133961645 ** np.arange(1, 4)}
 
+ROW_KEYS = {  # of a label's numbers in run.json, if their names there differ from those in groups
+    "mean": "distance_mean",
+    "p95": "distance_p95",
+    "max": "distance_max",
+    "of_voxels": "thickness_voxels",
+    "of_cells": "thickness_mesh",
+}
+
 
 class FacetSurface(NamedTuple):
     """Triangles in space, or segments in the plane; the surface may be open."""
@@ -82,53 +90,128 @@ class Thickness(NamedTuple):
     limit: float = np.inf
 
 
-class LabelFidelity(NamedTuple):
-    """Fidelity of the mesh to one label. Volumes are areas in 2-D.
+class LabelExtent(NamedTuple):
+    """Sizes of a label in voxels and in cells. Volumes are areas in 2-D.
 
     Parameters
     ----------
-    label : int
-        The label's number.
     voxels : int
         Number of its voxels.
+    covered_voxels : int
+        Number of its voxels that cells should represent: those in the mesh or, with a mask, all.
     volume : float
-        Volume of these voxels, mm^n.
+        Volume of its voxels, mm^n.
     mesh_volume : float
         Volume of its cells, mm^n.
     n_cells : int
         Number of its cells.
     n_empty_cells : int
         Number of its cells without voxel centre.
-    dice : float
-        Dice of the voxels in its cells with its voxels, 0 to 1.
-    volume_dice : float
-        Dice of its cells with its voxels as boxes, which cells as small as voxels cannot evade.
-    distance_mean : float
-        Mean distance between its surfaces in the mesh and in the image, both ways, mm; nan if one
-        is missing.
-    distance_p95 : float
-        95th percentile of the same, mm.
-    components : int
-        Connected components of its voxels, linked by faces.
-    mesh_components : int
-        Connected components of its cells, linked by facets.
     is_lost : bool
         True if no part of the mesh has the label.
-    distance_max : float
-        The largest distance, mm: it shows single spikes, unlike a percentile.
     one_layer_fraction : float
         Fraction of its cells' volume in cells whose nodes all lie on its surface, one cell thick;
-        nan without cells.
+        nan without cells, or if not measured.
+
+    Examples
+    --------
+    >>> LabelExtent(voxels=8, covered_voxels=4, volume=16.0, mesh_volume=6.0).ratio
+    0.75
+    """
+
+    voxels: int = 0
+    covered_voxels: int = 0
+    volume: float = 0.0
+    mesh_volume: float = 0.0
+    n_cells: int = 0
+    n_empty_cells: int = 0
+    is_lost: bool = False
+    one_layer_fraction: float = np.nan
+
+    @property
+    def ratio(self) -> float:
+        """Ratio of the volume of its cells to that of its voxels that they should represent."""
+        return self.mesh_volume / self.volume * self.voxels / max(self.covered_voxels, 1)
+
+
+class LabelPieces(NamedTuple):
+    """Connected components of a label.
+
+    Parameters
+    ----------
+    components : int
+        Components of its voxels, linked by faces.
+    mesh_components : int
+        Components of its cells, linked by facets.
+    lost_components : tuple of LostComponent
+        Components of the voxels that cells should represent, none of which lies in a cell with the
+        label, the largest first.
+
+    Examples
+    --------
+    >>> LabelPieces(components=2, mesh_components=1).lost_components
+    ()
+    """
+
+    components: int = 0
+    mesh_components: int = 0
+    lost_components: tuple[LostComponent, ...] = ()
+
+
+class LabelOverlap(NamedTuple):
+    """Overlaps of a label's voxels with its cells, 0 to 1.
+
+    Parameters
+    ----------
+    dice : float
+        Dice of the voxels in its cells with its voxels.
+    volume_dice : float
+        Dice of its cells with its voxels as boxes, which cells as small as voxels cannot evade.
     dice_majority : float
         `dice` if each cell had the label of most of its voxels: what the mesh allows, whatever its
         labels.
-    covered_voxels : int
-        Number of its voxels that cells should represent: those in the mesh or, with a mask, all.
-    lost_components : tuple of LostComponent
-        Components of these voxels, none of which lies in a cell with the label, the largest first.
-    thickness_voxels, thickness_mesh : Thickness, optional
-        Thickness of the smooth surface of its voxels, and of its cells, by
-        `tetopt.label_thickness`; None if not measured.
+
+    Examples
+    --------
+    >>> LabelOverlap(dice=0.9).dice
+    0.9
+    """
+
+    dice: float = np.nan
+    volume_dice: float = np.nan
+    dice_majority: float = np.nan
+
+
+class LabelDistance(NamedTuple):
+    """Distances between a label's surfaces in the mesh and in the image, both ways, mm; nan if one
+    is missing.
+
+    Parameters
+    ----------
+    mean, p95 : float
+        Their mean and 95th percentile.
+    max : float
+        The largest: it shows single spikes, unlike a percentile.
+
+    Examples
+    --------
+    >>> LabelDistance(0.5, 1.0, 2.0).max
+    2.0
+    """
+
+    mean: float = np.nan
+    p95: float = np.nan
+    max: float = np.nan
+
+
+class LabelThickness(NamedTuple):
+    """Thickness of a label, and of its cells.
+
+    Parameters
+    ----------
+    of_voxels, of_cells : Thickness, optional
+        Thickness of the smooth surface of its voxels, and of its cells; None if not measured, or
+        without a voxel centre in them.
     edge : float
         Mean edge of the label's cells, mm: the median over its voxels in them; nan if not measured.
     cells_across : float
@@ -137,45 +220,148 @@ class LabelFidelity(NamedTuple):
 
     Examples
     --------
+    >>> LabelThickness(edge=2.0, cells_across=1.5).of_cells is None
+    True
+    """
+
+    of_voxels: Thickness | None = None
+    of_cells: Thickness | None = None
+    edge: float = np.nan
+    cells_across: float = np.nan
+
+
+class LabelInterface(NamedTuple):
+    """Properties of a label's surface. In 2-D areas are lengths, and edges are nodes.
+
+    Parameters
+    ----------
+    label : int
+        The label's number.
+    area : float
+        Area of its closed surface in the mesh, with its faces on the image's box or a mask's
+        surface, mm^(n-1).
+    smooth_area : float
+        Area of the closed smooth surface of its voxels, mm^(n-1).
+    area_ratio : float
+        Ratio of the two; nan without cells, or with fewer voxels than
+        `tetopt.measure.interfaces.NET_VOXELS`.
+    folded : float
+        Fraction of the surface's edges at which it turns by more than 60 degrees; nan without
+        cells.
+    n_facets : int
+        Number of facets of its surface.
+    nonmanifold_edges : int
+        Number of edges in more than two of its facets.
+    nonmanifold_edges_two_labels : int
+        Number of these edges around which it meets only one other label, or only the outside.
+    nonmanifold_nodes : int
+        Number of nodes around which its facets form more than one fan, over edges; 0 in 2-D.
+    nonmanifold_nodes_two_labels : int
+        Number of these nodes around which it meets only one other label, or only the outside.
+    euler : int
+        Euler number of its voxels' closed surface: 2 (components - holes + cavities); the same
+        formula in 2-D.
+    mesh_euler : int
+        Euler number of its cells' closed surface.
+    cavities : int
+        Number of cavities in its voxels; 0 in 2-D, where they are holes.
+    mesh_cavities : int
+        Number of cavities in its cells; 0 in 2-D.
+
+    Examples
+    --------
+    >>> phantom = tetopt.load_phantom("sphere")
+    >>> labels = phantom.label_image(voxel_mm=4)
+    >>> mesh = tetopt.lattice_mesh(labels, nodes=300)
+    >>> background, ball = tetopt.label_interfaces(labels, mesh, tetopt.cell_labels(labels, mesh))
+    >>> background.cavities, background.mesh_cavities, ball.euler
+    (1, 1, 2)
+    """
+
+    label: int
+    area: float
+    smooth_area: float
+    area_ratio: float
+    folded: float
+    n_facets: int
+    nonmanifold_edges: int
+    nonmanifold_edges_two_labels: int
+    nonmanifold_nodes: int
+    nonmanifold_nodes_two_labels: int
+    euler: int
+    mesh_euler: int
+    cavities: int
+    mesh_cavities: int
+
+
+class LabelFidelity(NamedTuple):
+    """Fidelity of the mesh to one label.
+
+    Parameters
+    ----------
+    label : int
+        The label's number.
+    extent : LabelExtent
+        Voxels, cells and volumes.
+    pieces : LabelPieces
+        Connected components.
+    overlap : LabelOverlap
+        Dice of voxels and cells.
+    distance : LabelDistance
+        Distances between the surfaces in mesh and image.
+    thickness : LabelThickness
+        Thickness, and cells across, by `tetopt.label_thickness`, if measured.
+    surface : LabelInterface, optional
+        Smoothness and topology of its surface, by `tetopt.label_interfaces`, if measured.
+
+    Examples
+    --------
     >>> phantom = tetopt.load_phantom("sphere")
     >>> labels = phantom.label_image(voxel_mm=4)
     >>> ball = tetopt.label_fidelity(labels, tetopt.lattice_mesh(labels, nodes=300))[1]
-    >>> ball.label, ball.voxels, ball.components, ball.is_lost
+    >>> ball.label, ball.extent.voxels, ball.pieces.components, ball.extent.is_lost
     (1, 552, 1, False)
     """
 
     label: int
-    voxels: int
-    volume: float
-    mesh_volume: float
-    n_cells: int
-    n_empty_cells: int
-    dice: float
-    volume_dice: float
-    distance_mean: float
-    distance_p95: float
-    components: int
-    mesh_components: int
-    is_lost: bool
-    distance_max: float = np.nan
-    one_layer_fraction: float = np.nan
-    dice_majority: float = np.nan
-    covered_voxels: int = 0
-    lost_components: tuple[LostComponent, ...] = ()
-    thickness_voxels: Thickness | None = None
-    thickness_mesh: Thickness | None = None
-    edge: float = np.nan
-    cells_across: float = np.nan
+    extent: LabelExtent = LabelExtent()
+    pieces: LabelPieces = LabelPieces()
+    overlap: LabelOverlap = LabelOverlap()
+    distance: LabelDistance = LabelDistance()
+    thickness: LabelThickness = LabelThickness()
+    surface: LabelInterface | None = None
 
-    @property
-    def volume_ratio(self) -> float:
-        """Ratio of the volume of its cells to that of its voxels that they should represent."""
-        return self.mesh_volume / self.volume * self.voxels / max(self.covered_voxels, 1)
+    def as_json(self) -> dict[str, Any]:
+        """Return the numbers of all groups but the surface's, as one row of run.json.
 
-    @property
-    def is_met(self) -> bool:
-        """True if one of its voxels, or more, lies in one of its cells."""
-        return self.dice > 0.0
+        Returns
+        -------
+        dict
+            By name, such as "dice" and "mesh_volume".
+
+        Examples
+        --------
+        >>> LabelFidelity(3, overlap=LabelOverlap(dice=0.9)).as_json()["dice"]
+        0.9
+        """
+        groups = self.extent, self.pieces, self.overlap, self.distance, self.thickness
+        numbers = {
+            ROW_KEYS.get(name, name): value
+            for each in groups
+            for name, value in each._asdict().items()
+        }
+        return {"label": self.label, **numbers}
+
+
+class OwnedVoxels(NamedTuple):
+    """Voxels with labels, and the cells that own them."""
+
+    labels: Ints  # (K,) ascending
+    rows: NDArray[np.integer]  # row of `labels` of each voxel; `OUTSIDE_LABEL` of those left out
+    owner: NDArray[np.integer]  # cell of each voxel, -1 outside the mesh
+    is_covered: Bools  # True for voxels that cells should represent
+    outside: int  # row of the space outside the mesh
+    affine: Floats
 
 
 class MaskFidelity(NamedTuple):
@@ -287,6 +473,7 @@ def label_fidelity(
     of_cell: ArrayLike | None = None,
     mask: Image | None = None,
     owner: NDArray[np.integer] | None = None,
+    extents: Sequence[LabelFidelity] = (),
 ) -> list[LabelFidelity]:
     """Measure how well cells represent each label of an image.
 
@@ -307,6 +494,8 @@ def label_fidelity(
         Mask on the same voxels; only voxels of 1/2 or more count.
     owner : (s_0, ..., s_{n-1}) array of int, optional
         Cell of each voxel, -1 outside the mesh, if known.
+    extents : sequence of LabelFidelity, optional
+        Rows with volumes and components, if known, as those of `MeshingResult.extents`.
 
     Returns
     -------
@@ -326,99 +515,111 @@ def label_fidelity(
     >>> image = phantom.image(voxel_mm=4)
     >>> result = tetopt.mesh_image(tetopt.content(image, labels), 300)
     >>> for each in tetopt.label_fidelity(labels, result.mesh, result.labels):
-    ...     print(f"label {each.label}: Dice {each.dice:.2f}, off by {each.distance_mean:.1f} mm")
+    ...     dice, off = each.overlap.dice, each.distance.mean
+    ...     print(f"label {each.label}: Dice {dice:.2f}, off by {off:.1f} mm")
     label 0: Dice 1.00, off by 0.5 mm
     label 1: Dice 1.00, off by 0.5 mm
     """
     labels = check_labels("labels", labels)
     owner = voxel_cells(labels, mesh) if owner is None else owner
-    label_of_cell = (
-        cell_labels(labels, mesh) if of_cell is None else check_cell_labels(of_cell, mesh)
-    )
-    values, true, label_of_cell = by_row(labels_in_mask(labels, mask), label_of_cell)
+    of_cell = cell_labels(labels, mesh) if of_cell is None else check_cell_labels(of_cell, mesh)
+    values, true, of_cell = by_row(labels_in_mask(labels, mask), of_cell)
     outside = BACKGROUND_LABEL if mask is None else OUTSIDE_LABEL
-    painted, is_covered = painted_voxels(owner, label_of_cell, outside), owner >= 0
-    is_covered |= mask is not None
-    columns = _label_columns(labels, mesh, true, painted, owner, label_of_cell, outside)
-    distances = _label_distances(labels, mesh, true, label_of_cell, outside)
-    rows = []
-    for row, box, n_covered, _, n_components, lost in label_pieces(
-        true, painted, is_covered, labels.affine
-    ):
-        far = distances(row, box)
-        mean, p95 = _mean_and_p95(far)
+    is_covered = (owner >= 0) | (mask is not None)
+    voxels = OwnedVoxels(values, true, owner, is_covered, outside, labels.affine)
+    overlaps = _label_overlaps(labels, mesh, voxels, of_cell)
+    distances = _label_distances(labels, mesh, true, of_cell, outside)
+    one_layer = one_layer_fractions(mesh, of_cell, facets(mesh.cells))
+    n_empty = _count_empty_cells(voxels, of_cell, len(values))
+    boxes, rows = scipy.ndimage.find_objects(true + 1), []
+    for known in extents or label_extents(voxels, mesh, of_cell):
+        row = int(np.searchsorted(values, known.label))
+        far = distances(row, boxes[row])
         rows.append(
-            LabelFidelity(
-                label=int(values[row]),
-                **{name: column[row].item() for name, column in columns.items()},
-                distance_mean=mean,
-                distance_p95=p95,
-                distance_max=float(far.max()) if len(far) else np.nan,
-                components=n_components,
-                mesh_components=_n_components(mesh.cells[label_of_cell == row]),
-                covered_voxels=n_covered,
-                lost_components=lost,
+            known._replace(
+                extent=known.extent._replace(
+                    n_empty_cells=int(n_empty[row]), one_layer_fraction=one_layer.get(row, np.nan)
+                ),
+                overlap=LabelOverlap(
+                    **{name: column[row].item() for name, column in overlaps.items()}
+                ),
+                distance=LabelDistance(
+                    *_mean_and_p95(far), float(far.max()) if len(far) else np.nan
+                ),
             )
         )
     return rows
 
 
-def label_pieces(
-    rows: NDArray[np.integer],
-    painted: NDArray[np.integer],
-    is_covered: Bools,
-    affine: Floats,
-) -> Iterator[tuple[int, tuple[slice, ...], int, bool, int, tuple[LostComponent, ...]]]:
-    """Yield each label's row and box in the voxels, the number of its voxels that cells should
-    represent, True if one lies in its cells, and its number of components and the lost ones.
-
-    `rows` are those of the voxels, `painted` those of their cells; `is_covered` where cells should
-    be.
+def label_extents(voxels: OwnedVoxels, mesh: Mesh, row_of_cell: Ints) -> list[LabelFidelity]:
+    """Measure the volumes and components of each label with a voxel, and its Dice: all that a
+    verdict needs (`tetopt.measure.judge`).
     """
-    for row, box in enumerate(scipy.ndimage.find_objects(rows + 1)):
-        if box is not None:
-            own, is_seen = rows[box] == row, is_covered[box]
-            is_met = own & (painted[box] == row)
-            n_components, lost = voxel_components(own, is_met | ~is_seen, affine, box)
-            n_seen = int(np.count_nonzero(own & is_seen))
-            yield row, box, n_seen, bool(is_met.any()), n_components, lost
-
-
-def _label_columns(
-    labels: Image,
-    mesh: Mesh,
-    true: NDArray[np.integer],
-    painted: NDArray[np.integer],
-    owner: NDArray[np.integer],
-    label_of_cell: Ints,
-    outside: int,
-) -> dict[str, NDArray]:
-    """Volumes and overlaps of all labels, by the names of `LabelFidelity`."""
-    n_labels = int(max(true.max(), label_of_cell.max())) + 1
-    n_true, number = _voxel_counts(true, n_labels), np.arange(n_labels)
-    n_cells = np.bincount(label_of_cell, minlength=n_labels)
-    n_owned = np.bincount(owner[owner >= 0], minlength=len(mesh.cells))
-    pieces, n_pieces = mesh.straight_pieces()
-    of_piece = np.repeat(label_of_cell, n_pieces)
-    overlap, size, (overlap_beyond, size_beyond) = _overlaps(
-        labels, true, pieces, of_piece, n_labels
+    true, painted = voxels.rows, painted_voxels(voxels.owner, row_of_cell, voxels.outside)
+    n_labels = int(max(true.max(), row_of_cell.max())) + 1
+    n_true, n_painted = (_voxel_counts(rows, n_labels) for rows in (true, painted))
+    n_cells = np.bincount(row_of_cell, minlength=n_labels)
+    mesh_volume = np.bincount(row_of_cell, mesh.cell_volumes, n_labels)
+    volume = n_true * abs(np.linalg.det(voxels.affine[:-1, :-1]))
+    n_empty, dice = (
+        _count_empty_cells(voxels, row_of_cell, n_labels),
+        _voxel_dice(true, painted, n_true),
     )
-    volume, is_outside = n_true * labels.voxel_volume, number == outside
+    measured = []
+    for row, box in enumerate(scipy.ndimage.find_objects(true + 1)):
+        if box is None:
+            continue
+        own, is_covered = true[box] == row, voxels.is_covered[box]
+        is_met = own & (painted[box] == row)
+        n_components, lost = voxel_components(own, is_met | ~is_covered, voxels.affine, box)
+        measured.append(
+            LabelFidelity(
+                int(voxels.labels[row]),
+                extent=LabelExtent(
+                    voxels=int(n_true[row]),
+                    covered_voxels=int(np.count_nonzero(own & is_covered)),
+                    volume=float(volume[row]),
+                    mesh_volume=float(mesh_volume[row]),
+                    n_cells=int(n_cells[row]),
+                    n_empty_cells=int(n_empty[row]),
+                    is_lost=bool(n_cells[row] == 0 and n_painted[row] == 0),
+                ),
+                pieces=LabelPieces(
+                    components=n_components,
+                    mesh_components=_n_components(mesh.cells[row_of_cell == row]),
+                    lost_components=lost,
+                ),
+                overlap=LabelOverlap(dice=float(dice[row])),
+            )
+        )
+    return measured
+
+
+def _count_empty_cells(voxels: OwnedVoxels, row_of_cell: Ints, n_labels: int) -> Ints:
+    """Numbers of cells without a voxel, by label."""
+    n_owned = np.bincount(voxels.owner[voxels.owner >= 0], minlength=len(row_of_cell))
+    return np.bincount(row_of_cell[n_owned == 0], minlength=n_labels)
+
+
+def _label_overlaps(
+    labels: Image, mesh: Mesh, voxels: OwnedVoxels, of_cell: Ints
+) -> dict[str, NDArray]:
+    """Overlaps of all labels, by the names of `LabelOverlap`."""
+    true, owner, outside = voxels.rows, voxels.owner, voxels.outside
+    n_labels = int(max(true.max(), of_cell.max())) + 1
+    n_true = _voxel_counts(true, n_labels)
+    pieces, n_pieces = mesh.straight_pieces()
+    overlap, size, (overlap_beyond, size_beyond) = _overlaps(
+        labels, true, pieces, np.repeat(of_cell, n_pieces), n_labels
+    )
+    is_outside = np.arange(n_labels) == outside
     both = overlap + is_outside * overlap_beyond
-    total = volume + (size + is_outside * size_beyond)
-    of_most = painted_voxels(owner, _most_frequent(true, owner, label_of_cell), outside)
-    one_layer = one_layer_fractions(mesh, label_of_cell, facets(mesh.cells))
+    total = n_true * labels.voxel_volume + (size + is_outside * size_beyond)
+    of_most = _most_frequent(true, owner, of_cell)
     return {
-        "voxels": n_true,
-        "volume": volume,
-        "mesh_volume": np.bincount(label_of_cell, mesh.cell_volumes, n_labels),
-        "n_cells": n_cells,
-        "n_empty_cells": np.bincount(label_of_cell[n_owned == 0], minlength=n_labels),
-        "dice": _voxel_dice(true, painted, n_true),
+        "dice": _voxel_dice(true, painted_voxels(owner, of_cell, outside), n_true),
         "volume_dice": 2.0 * both / np.where(total > 0.0, total, 1.0),
-        "dice_majority": _voxel_dice(true, of_most, n_true),
-        "is_lost": (n_cells == 0) & (~is_outside | (owner.min() >= 0)),
-        "one_layer_fraction": np.array([one_layer.get(row, np.nan) for row in range(n_labels)]),
+        "dice_majority": _voxel_dice(true, painted_voxels(owner, of_most, outside), n_true),
     }
 
 

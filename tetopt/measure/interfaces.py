@@ -15,7 +15,6 @@ closes only in an edge or a node has no hole.
 from __future__ import annotations
 
 from itertools import product
-from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -34,6 +33,7 @@ from tetopt.geometry.topology import Facets, connected_sets, facets
 from tetopt.image import Image, transform_vectors
 from tetopt.measure.fidelity import (
     FacetSurface,
+    LabelInterface,
     by_row,
     check_cell_labels,
     facet_vectors,
@@ -55,69 +55,6 @@ VOLUME_NEAR = 0.01
 # times the volume in a net: a ball of radius 3 voxels takes 2.5, nets of specks have collapsed
 MOST_GROWN = 3.0
 NET_RELAXATION = 0.5  # fraction of the way to the neighbours' mean that a point moves in each
-
-
-class LabelInterface(NamedTuple):
-    """Properties of a label's surface. In 2-D areas are lengths, and edges are nodes.
-
-    Parameters
-    ----------
-    label : int
-        The label's number.
-    area : float
-        Area of its closed surface in the mesh, with its faces on the image's box or a mask's
-        surface, mm^(n-1).
-    smooth_area : float
-        Area of the closed smooth surface of its voxels, mm^(n-1).
-    area_ratio : float
-        Ratio of the two; nan without cells, or with fewer voxels than `NET_VOXELS`.
-    folded : float
-        Fraction of the surface's edges at which it turns by more than 60 degrees; nan without
-        cells.
-    n_facets : int
-        Number of facets of its surface.
-    nonmanifold_edges : int
-        Number of edges in more than two of its facets.
-    nonmanifold_edges_two_labels : int
-        Number of these edges around which it meets only one other label, or only the outside.
-    nonmanifold_nodes : int
-        Number of nodes around which its facets form more than one fan, over edges; 0 in 2-D.
-    nonmanifold_nodes_two_labels : int
-        Number of these nodes around which it meets only one other label, or only the outside.
-    euler : int
-        Euler number of its voxels' closed surface: 2 (components - holes + cavities); the same
-        formula in 2-D.
-    mesh_euler : int
-        Euler number of its cells' closed surface.
-    cavities : int
-        Number of cavities in its voxels; 0 in 2-D, where they are holes.
-    mesh_cavities : int
-        Number of cavities in its cells; 0 in 2-D.
-
-    Examples
-    --------
-    >>> phantom = tetopt.load_phantom("sphere")
-    >>> labels = phantom.label_image(voxel_mm=4)
-    >>> mesh = tetopt.lattice_mesh(labels, nodes=300)
-    >>> background, ball = tetopt.label_interfaces(labels, mesh, tetopt.cell_labels(labels, mesh))
-    >>> background.cavities, background.mesh_cavities, ball.euler
-    (1, 1, 2)
-    """
-
-    label: int
-    area: float
-    smooth_area: float
-    area_ratio: float
-    folded: float
-    n_facets: int
-    nonmanifold_edges: int
-    nonmanifold_edges_two_labels: int
-    nonmanifold_nodes: int
-    nonmanifold_nodes_two_labels: int
-    euler: int
-    mesh_euler: int
-    cavities: int
-    mesh_cavities: int
 
 
 def label_interfaces(

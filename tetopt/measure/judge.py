@@ -8,7 +8,7 @@ program, asks here.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from math import prod
 from types import MappingProxyType
@@ -36,7 +36,7 @@ from tetopt.geometry.manifold import OUTSIDE_LABEL
 from tetopt.geometry.simplex import dihedral_angles, edge_pairs, squared_edges
 from tetopt.geometry.topology import components
 from tetopt.image import Image, transform_vectors
-from tetopt.measure.fidelity import label_pieces, painted_voxels
+from tetopt.measure.fidelity import LabelFidelity, OwnedVoxels, label_extents
 from tetopt.mesh import Mesh
 from tetopt.system.arrays import Bools, Floats, Ints
 
@@ -96,16 +96,6 @@ class MaskComponents(NamedTuple):
     n_cells: tuple[int, ...]  # of each component of the mesh, the largest first
     lost: tuple[LostComponent, ...]  # of the mask, without a cell
     bare: tuple[LostComponent, ...]  # of voxels far from any cell
-
-
-class LabelFit(NamedTuple):
-    """How a label's cells represent it, as far as a requirement."""
-
-    label: int
-    covered_voxels: int  # of it that cells should represent
-    volume_ratio: float  # of its cells to these voxels
-    is_met: bool  # one of its voxels, or more, lies in a cell with the label
-    lost_components: tuple[LostComponent, ...]  # of its voxels, in which none does
 
 
 def measure(
@@ -182,7 +172,7 @@ def measure(
         region is None,
     )
     if labels is not None and members is not None:
-        measures["labels"] = lambda: _label_fits(content, mesh, labels, owner())
+        measures["labels"] = lambda: _label_extents(content, mesh, labels, owner())
     measures["error"] = lambda: unexplained_by(content, mesh, E_D, n_voxels)
     taken = {name: _take_measure(each) for name, each in measures.items() if name not in known}
     return {**taken, **known}
@@ -295,46 +285,46 @@ def _say_manifold(problems: tuple[list[str], list[str], bool], _: Requirements) 
     return "; ".join([*texts, remedy]) if texts else ""
 
 
-def faulty_labels(rows: Iterable[Any]) -> Iterator[int]:
-    """Yield the labels that violate the requirement, by rows like `LabelFit`."""
+def faulty_labels(rows: Iterable[LabelFidelity]) -> Iterator[int]:
+    """Yield the labels that violate the requirement."""
     for row in rows:
         if _is_absent(row) or _is_off(row) or _pieces(row):
             yield row.label
 
 
-def _is_absent(row: Any) -> bool:
+def _is_absent(row: LabelFidelity) -> bool:
     """Return whether a large label has no cell, or cells elsewhere."""
-    return bool(row.covered_voxels >= LABEL_VOXELS and not row.is_met)
+    return row.extent.covered_voxels >= LABEL_VOXELS and row.overlap.dice == 0.0
 
 
-def _is_off(row: Any) -> bool:
+def _is_off(row: LabelFidelity) -> bool:
     """Return whether a large label has cells of too much or too little volume."""
-    is_right = LEAST_VOLUME <= row.volume_ratio <= MOST_VOLUME
-    return bool(row.covered_voxels >= LABEL_VOXELS and row.is_met and not is_right)
+    is_right = LEAST_VOLUME <= row.extent.ratio <= MOST_VOLUME
+    return row.extent.covered_voxels >= LABEL_VOXELS and not (is_right or _is_absent(row))
 
 
-def _pieces(row: Any) -> list[LostComponent]:
+def _pieces(row: LabelFidelity) -> list[LostComponent]:
     """Return the large lost components of a tissue that has cells elsewhere; those of the space
     between tissues do not count.
     """
     is_exempt = _is_absent(row) or row.label == BACKGROUND_LABEL
-    return [] if is_exempt else [each for each in row.lost_components if _is_large(each)]
+    return [] if is_exempt else [each for each in row.pieces.lost_components if _is_large(each)]
 
 
 def _is_large(component: LostComponent) -> bool:
     return component.voxels >= COMPONENT_VOXELS
 
 
-def _say_labels(rows: Iterable[Any], required: Requirements) -> str:
-    rows, words, texts = list(rows), required.label_words, []
+def _say_labels(rows: Sequence[LabelFidelity], required: Requirements) -> str:
+    words, texts = required.label_words, list[str]()
     if lost := [words(row.label) for row in rows if _is_absent(row)]:
         texts.append(
             f"no voxel of label {', '.join(lost)}, of {LABEL_VOXELS} voxels or more, lies in a "
             "cell with that label"
         )
-    off = sorted(filter(_is_off, rows), key=lambda row: -abs(np.log(row.volume_ratio)))
+    off = sorted(filter(_is_off, rows), key=lambda row: -abs(np.log(row.extent.ratio)))
     if off:
-        ratios = ", ".join(f"{row.volume_ratio:.3g} for label {words(row.label)}" for row in off)
+        ratios = ", ".join(f"{row.extent.ratio:.3g} for label {words(row.label)}" for row in off)
         texts.append(
             f"the volume of cells is not {LEAST_VOLUME:g} to {MOST_VOLUME:g} times that of "
             f"voxels: {ratios}"
@@ -447,29 +437,22 @@ def _list_components(pieces: list[tuple[LostComponent, str]]) -> str:
     )
 
 
-def _label_fits(
+def _label_extents(
     content: Content, mesh: Mesh, of_cell: Ints, owner: NDArray[np.integer]
-) -> list[LabelFit]:
-    """Compare each label with its cells, as `tetopt.measure.fidelity.label_fidelity` does."""
+) -> list[LabelFidelity]:
+    """Measure each label on its own voxels, as `tetopt.measure.fidelity.label_fidelity` does."""
     planes, affine = _own_voxels(content)
     members = content.memberships
     assert members is not None
-    owner, rows = owner[planes], members.partition[planes]
-    row_of = {label: row for row, label in enumerate(members.labels.tolist())}
-    is_covered, outside = owner >= 0, row_of.get(BACKGROUND_LABEL, OUTSIDE_LABEL)
+    labels, rows, owner = members.labels, members.partition[planes], owner[planes]
+    is_covered, outside = owner >= 0, 0 if labels[0] == BACKGROUND_LABEL else OUTSIDE_LABEL
     if content.region is not None:
         is_covered, outside = content.region.inside[planes], OUTSIDE_LABEL
         rows = np.where(is_covered, rows, OUTSIDE_LABEL)
-    numbers, place = np.unique(of_cell, return_inverse=True)
-    sizes = np.bincount(place, mesh.cell_volumes) / (content.image.voxel_volume * members.parts)
-    n_in_cells, fits = dict(zip(numbers.tolist(), sizes.tolist(), strict=True)), []
-    row_of_cell = np.array([row_of.get(each, OUTSIDE_LABEL) for each in numbers.tolist()])[place]
-    painted = painted_voxels(owner, row_of_cell, outside)
-    for row, _, n_covered, is_met, _, lost in label_pieces(rows, painted, is_covered, affine):
-        label = int(members.labels[row])
-        ratio = n_in_cells.get(label, 0.0) / max(n_covered, 1)
-        fits.append(LabelFit(label, n_covered, ratio, is_met, lost))
-    return fits
+    at = np.searchsorted(labels, of_cell)
+    is_known = labels[np.minimum(at, len(labels) - 1)] == of_cell
+    voxels = OwnedVoxels(labels, rows, owner, is_covered, outside, affine)
+    return label_extents(voxels, mesh, np.where(is_known, at, len(labels)))
 
 
 def _own_voxels(content: Content) -> tuple[tuple[slice, ...], Floats]:
@@ -481,7 +464,7 @@ def _own_voxels(content: Content) -> tuple[tuple[slice, ...], Floats]:
         factors = supersampling(content.given.spacing)
     affine = image.affine.copy()
     affine[:-1, -1] = image.to_world([factor // 2 for factor in factors])
-    affine[:-1, :-1] *= factors
+    affine[:-1, :-1] = content.given.affine[:-1, :-1]
     return tuple(slice(factor // 2, None, factor) for factor in factors), affine
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
 from functools import cache, partial
@@ -17,9 +17,15 @@ from tetopt.contents.content import Content, content, continue_image
 from tetopt.contents.domain import INSIDE_FRACTION
 from tetopt.errors import InputError
 from tetopt.image import Image
-from tetopt.measure.fidelity import cell_labels, label_fidelity, mask_fidelity, voxel_cells
+from tetopt.measure.fidelity import (
+    LabelFidelity,
+    cell_labels,
+    label_fidelity,
+    mask_fidelity,
+    voxel_cells,
+)
 from tetopt.measure.interfaces import label_interfaces
-from tetopt.measure.thin import contact_totals, label_contacts, label_layers
+from tetopt.measure.thin import contact_totals, label_contacts, label_thickness
 from tetopt.mesh import Mesh
 
 # around mask and mesh: their surfaces end at no side of this box but the image's own
@@ -33,15 +39,16 @@ def fidelity(
     of_cell: NDArray | None,
     failed: dict[str, str] | None = None,
     what: Content | None = None,
+    extents: Sequence[LabelFidelity] = (),
 ) -> dict[str, Any]:
     """Measure how well a mesh represents a mask and labels.
 
-    Returns a `MaskFidelity` as `mask`; for each label a `LabelFidelity` in `labels` and a
-    `LabelInterface` in `interfaces`; for each pair of labels a `LabelContact` in `contacts`, and
-    their sums in `contact_totals`. Entries of missing images are omitted. With a mask, labels count
-    only inside it. `of_cell` (M,) is the label of each cell, by default that of most of its voxels;
-    for `failed` see `measure_each`; `what` is the content with the levels of these labels, if
-    known.
+    Returns a `MaskFidelity` as `mask`; for each label a whole `LabelFidelity` in `labels`, and its
+    surface in `interfaces`, too; for each pair of labels a `LabelContact` in `contacts`, and their
+    sums in `contact_totals`. Entries of missing images are omitted. With a mask, labels count only
+    inside it. `of_cell` (M,) is the label of each cell, by default that of most of its voxels; for
+    `failed` see `measure_each`; `what` is the content with the levels of these labels, and
+    `extents` are their volumes and components, if known.
     """
     measures: dict[str, Callable[[], Any]] = {}
     whole = partial(_with_levels, what, labels, mask)
@@ -56,9 +63,9 @@ def fidelity(
             if of_cell is None
             else lambda: of_cell
         )
-        measures["labels"] = lambda: label_fidelity(labels, mesh, own(), mask, owner())
+        measures["labels"] = lambda: label_fidelity(labels, mesh, own(), mask, owner(), extents)
         if len(np.unique(labels.data if mask is None else labels.data[mask.data >= 0.5])) > 1:
-            measures["thickness"] = lambda: label_layers(whole(), mesh, own())
+            measures["thickness"] = lambda: label_thickness(whole(), mesh, own())
         measures["interfaces"] = lambda: label_interfaces(labels, mesh, own(), mask)
         measures["contacts"] = lambda: label_contacts(labels, mesh, own(), mask)
     # First and alone: it takes all threads, and the most memory.
@@ -66,9 +73,12 @@ def fidelity(
     thickness = measure_each(alone, failed).get("thickness", {})
     measured = measure_each(measures, failed)
     if "labels" in measured:
-        columns = ("thickness_voxels", "thickness_mesh", "edge", "cells_across")
+        surfaces = {each.label: each for each in measured.get("interfaces", [])}
         measured["labels"] = [
-            row._replace(**dict(zip(columns, thickness.get(row.label, row[-4:]), strict=True)))
+            row._replace(
+                thickness=thickness.get(row.label, row.thickness),
+                surface=surfaces.get(row.label),
+            )
             for row in measured["labels"]
         ]
     if "contacts" in measured:

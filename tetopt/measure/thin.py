@@ -29,6 +29,7 @@ from tetopt.geometry.topology import facets
 from tetopt.image import Image
 from tetopt.measure.fidelity import (
     FacetSurface,
+    LabelThickness,
     Thickness,
     check_cell_labels,
     labels_in_mask,
@@ -176,10 +177,9 @@ def _by_pair(one: NDArray, other: NDArray, weights: Floats | None = None) -> dic
     )
 
 
-def label_thickness(
-    what: Content, mesh: Mesh, of_cell: ArrayLike
-) -> dict[int, tuple[Thickness | None, Thickness | None]]:
-    """Measure the local thickness of each label, of its voxels' smooth surfaces and of its cells.
+def label_thickness(what: Content, mesh: Mesh, of_cell: ArrayLike) -> dict[int, LabelThickness]:
+    """Measure the local thickness of each label, of its voxels' smooth surfaces and of its cells,
+    and the edges of the cells there.
 
     Parameters
     ----------
@@ -194,9 +194,9 @@ def label_thickness(
     Returns
     -------
     dict
-        For each label, the thickness of its voxels and of its cells, each None if they contain no
-        voxel centre. Values are clipped at ten times a voxel's shortest edge. At a mask both end
-        half a voxel beyond the last centre inside.
+        The thickness of each label with a voxel or a voxel centre in its cells. Values are clipped
+        at ten times a voxel's shortest edge. At a mask both end half a voxel beyond the last centre
+        inside.
 
     Raises
     ------
@@ -208,27 +208,9 @@ def label_thickness(
     >>> phantom = tetopt.load_phantom("sphere")
     >>> what = tetopt.content(phantom.image(voxel_mm=4), phantom.label_image(voxel_mm=4))
     >>> result = tetopt.mesh_image(what, 300, iterations=4)
-    >>> voxels, cells = tetopt.label_thickness(what, result.mesh, result.labels)[1]
-    >>> f"{voxels.p50:.0f} mm of voxels, {cells.p50:.0f} mm of cells"
+    >>> ball = tetopt.label_thickness(what, result.mesh, result.labels)[1]
+    >>> f"{ball.of_voxels.p50:.0f} mm of voxels, {ball.of_cells.p50:.0f} mm of cells"
     '37 mm of voxels, 38 mm of cells'
-    """
-    return {
-        label: (row.voxels, row.cells) for label, row in label_layers(what, mesh, of_cell).items()
-    }
-
-
-class Layers(NamedTuple):
-    """The thickness of a label, and of its cells at the voxels in them."""
-
-    voxels: Thickness | None  # of the smooth surface of its voxels
-    cells: Thickness | None  # of its cells
-    edge: float  # median of the mean edge of the cell, mm; nan without a voxel in its cells
-    across: float  # median of the voxels' thickness over that edge
-
-
-def label_layers(what: Content, mesh: Mesh, of_cell: ArrayLike) -> dict[int, Layers]:
-    """Measure the local thickness of each label as `label_thickness` does, in mm and in edges of
-    the cells there.
     """
     of_cell = check_cell_labels(of_cell, mesh)
     members, grid = what.memberships, what.image
@@ -249,14 +231,18 @@ def label_layers(what: Content, mesh: Mesh, of_cell: ArrayLike) -> dict[int, Lay
     painted = painted_voxels(owner, row, BEYOND_REGION)
     number = np.searchsorted(members.labels, values)  # of each label of cells among those of voxels
     is_known = members.labels[np.minimum(number, len(members.labels) - 1)] == values
-    edge, medians = np.sqrt(squared_edges(mesh.points, mesh.cells)).mean(axis=1), {}
+    edge = np.sqrt(squared_edges(mesh.points, mesh.cells)).mean(axis=1)
+    medians: dict[int, dict[str, float]] = {}
     for label, box in enumerate(scipy.ndimage.find_objects(painted + 1)):
         if box is not None and is_known[label]:
             is_right = (painted[box] == label) & (rows[box] == number[label])
             edges = edge[owner[box][is_right]]
             if len(edges):
                 across = float(np.median(thick[box][is_right] / edges))
-                medians[int(values[label])] = float(np.median(edges)), across
+                medians[int(values[label])] = {
+                    "edge": float(np.median(edges)),
+                    "cells_across": across,
+                }
     del owner, thick, rows
     shared = facets(pieces.cells)
     is_between = (shared.n_cells == 2) & np.diff(np.repeat(of_cell, n_pieces)[shared.cells])[
@@ -267,8 +253,10 @@ def label_layers(what: Content, mesh: Mesh, of_cell: ArrayLike) -> dict[int, Lay
         thickness_between(corners, painted, spacing, most), painted, values, most
     )
     return {
-        label: Layers(
-            of_voxels.get(label), of_cells.get(label), *medians.get(label, (np.nan, np.nan))
+        label: LabelThickness(
+            of_voxels=of_voxels.get(label),
+            of_cells=of_cells.get(label),
+            **medians.get(label, {}),
         )
         for label in sorted(of_voxels | of_cells)
     }

@@ -12,8 +12,8 @@ from rich.text import Text
 from tetopt.contents.labels import BACKGROUND_LABEL
 from tetopt.engine.curving import Curving
 from tetopt.geometry.quadratic import node_count
+from tetopt.io.text import count_text
 from tetopt.measure.fidelity import LabelFidelity, MaskFidelity, Thickness
-from tetopt.measure.interfaces import LabelInterface
 from tetopt.measure.quality import Quality
 from tetopt.measure.thin import TOLERATED_CONTACT, LabelContact
 from tetopt.mesh import Mesh
@@ -197,8 +197,8 @@ def worst_labels(rows: Sequence[LabelFidelity], most: int | None = WORST_LABELS)
         return places
 
     def fit(place: int) -> float:
-        volume, voxels = rows[place].mesh_volume, rows[place].volume
-        return min(rows[place].dice, min(volume, voxels) / max(volume, voxels))
+        volume, voxels = rows[place].extent.mesh_volume, rows[place].extent.volume
+        return min(rows[place].overlap.dice, min(volume, voxels) / max(volume, voxels))
 
     return sorted(sorted(places, key=fit)[:most])
 
@@ -220,25 +220,24 @@ def label_table(rows: Sequence[LabelFidelity], names: Mapping[int, str], ndim: i
         "of\ncells",
     )
     for row in rows:
-        change = 100.0 * (row.mesh_volume / row.volume - 1.0)
-        size = size_text(row.volume, 1 if row.volume < LARGE_SIZE else 0)
+        extent = row.extent
+        change = 100.0 * (extent.mesh_volume / extent.volume - 1.0)
+        size = size_text(extent.volume, 1 if extent.volume < LARGE_SIZE else 0)
         table.add_row(
             _label_words(row.label, names),
-            str(row.voxels),
+            str(extent.voxels),
             size,
-            str(row.n_cells),
+            str(extent.n_cells),
             f"{change:+.1f}",
-            f"{row.dice:.4f}",
-            size_text(row.distance_p95, 3),
-            str(row.components),
-            str(row.mesh_components),
+            f"{row.overlap.dice:.4f}",
+            size_text(row.distance.p95, 3),
+            str(row.pieces.components),
+            str(row.pieces.mesh_components),
         )
     return table
 
 
-def surface_table(
-    rows: Sequence[LabelFidelity], interfaces: Sequence[LabelInterface], names: Mapping[int, str]
-) -> Table:
+def surface_table(rows: Sequence[LabelFidelity], names: Mapping[int, str]) -> Table:
     """Return a table of further measures of labels: Dice by volume and majority, distances,
     smoothness, topology.
     """
@@ -251,17 +250,18 @@ def surface_table(
         "folded,\n%",
         "edges in\n> 2 facets",
     )
-    for row, surface in zip(rows, interfaces, strict=True):
-        table.add_row(
-            _label_words(row.label, names),
-            f"{row.volume_dice:.4f}",
-            f"{row.dice_majority:.4f}",
-            size_text(row.distance_mean, 3),
-            size_text(row.distance_max, 3),
-            _decimals(surface.area_ratio, 3),
-            _decimals(100.0 * surface.folded, 1),
-            str(surface.nonmanifold_edges),
-        )
+    for row in rows:
+        if row.surface is not None:
+            table.add_row(
+                _label_words(row.label, names),
+                f"{row.overlap.volume_dice:.4f}",
+                f"{row.overlap.dice_majority:.4f}",
+                size_text(row.distance.mean, 3),
+                size_text(row.distance.max, 3),
+                _decimals(row.surface.area_ratio, 3),
+                _decimals(100.0 * row.surface.folded, 1),
+                str(row.surface.nonmanifold_edges),
+            )
     return table
 
 
@@ -294,11 +294,11 @@ def thin_table(rows: Sequence[LabelFidelity], names: Mapping[int, str]) -> Table
     there = [
         row
         for row in rows
-        if row.n_cells
+        if row.extent.n_cells
         and row.label != BACKGROUND_LABEL
-        and not row.cells_across >= THIN_ACROSS
-        and row.thickness_voxels is not None
-        and row.thickness_voxels.p50 < row.thickness_voxels.limit
+        and not row.thickness.cells_across >= THIN_ACROSS
+        and (voxels := row.thickness.of_voxels) is not None
+        and voxels.p50 < voxels.limit
     ]
     if not there:
         return None
@@ -312,17 +312,21 @@ def thin_table(rows: Sequence[LabelFidelity], names: Mapping[int, str]) -> Table
     table.columns[0].header = "thin labels"
 
     def goodness(row: LabelFidelity) -> tuple[float, float, int]:
+        voxels = row.thickness.of_voxels
         return (
-            -row.one_layer_fraction,
-            np.inf if row.thickness_voxels is None else row.thickness_voxels.p50,
+            -row.extent.one_layer_fraction,
+            np.inf if voxels is None else voxels.p50,
             row.label,
         )
 
     for row in sorted(there, key=goodness)[:WORST_ROWS]:
-        thick = [_percentiles_text(each) for each in (row.thickness_voxels, row.thickness_mesh)]
-        layer, edges = _decimals(100.0 * row.one_layer_fraction, 1), size_text(row.edge, 2)
+        *thick, edge, across = row.thickness
         table.add_row(
-            _label_words(row.label, names), layer, *thick, edges, _decimals(row.cells_across, 1)
+            _label_words(row.label, names),
+            _decimals(100.0 * row.extent.one_layer_fraction, 1),
+            *map(_percentiles_text, thick),
+            size_text(edge, 2),
+            _decimals(across, 1),
         )
     return table
 
@@ -377,27 +381,26 @@ def _label_words(label: int, names: Mapping[int, str]) -> str:
     return escape(f"{label} {names.get(label, '')}".strip())
 
 
-def label_differences(
-    rows: Sequence[LabelFidelity], interfaces: Sequence[LabelInterface], names: Mapping[int, str]
-) -> list[str]:
+def label_differences(rows: Sequence[LabelFidelity], names: Mapping[int, str]) -> list[str]:
     """Describe labels whose cells differ from their voxels in topology, or strongly in size: one
     line per label.
     """
     lines: list[str] = []
-    for row, surface in zip(rows, interfaces, strict=True):
+    for row in rows:
+        if (surface := row.surface) is None:
+            continue
+        n_voxels, n_cells, _ = row.pieces
         cavities, of_cells = surface.cavities, surface.mesh_cavities
-        holes = row.components + cavities - surface.euler // 2
-        parts, more = [], row.mesh_volume - row.volume
-        if abs(more) > CHANGED_FRACTION * row.volume:
-            parts.append(f"{abs(more) / row.volume:.0%} {'smaller' if more < 0.0 else 'larger'}")
-        if row.components != row.mesh_components:
-            parts.append(
-                f"{_number_of(row.components, 'component')} of voxels, {row.mesh_components} of "
-                "cells"
-            )
-        parts += _surplus(row.mesh_components + of_cells - surface.mesh_euler // 2 - holes, "hole")
+        holes = n_voxels + cavities - surface.euler // 2
+        volume, more = row.extent.volume, row.extent.mesh_volume - row.extent.volume
+        parts = []
+        if abs(more) > CHANGED_FRACTION * volume:
+            parts.append(f"{abs(more) / volume:.0%} {'smaller' if more < 0.0 else 'larger'}")
+        if n_voxels != n_cells:
+            parts.append(f"{count_text(n_voxels, 'component')} of voxels, {n_cells} of cells")
+        parts += _surplus(n_cells + of_cells - surface.mesh_euler // 2 - holes, "hole")
         parts += _surplus(of_cells - cavities, "cavity")
-        if parts and row.n_cells:
+        if parts and row.extent.n_cells:
             name = f" ({names[row.label]})" if row.label in names else ""
             lines.append(f"label {row.label}{name}: {'; '.join(parts)}")
     return lines
@@ -405,9 +408,4 @@ def label_differences(
 
 def _surplus(count: int, noun: str) -> list[str]:
     """Describe a surplus of cells over voxels; empty if there is none."""
-    return [f"{_number_of(abs(count), noun)} {'more' if count > 0 else 'fewer'}"] if count else []
-
-
-def _number_of(count: int, noun: str) -> str:
-    plural = f"{noun[:-1]}ies" if noun.endswith("y") else f"{noun}s"
-    return f"{count} {noun if count == 1 else plural}"
+    return [f"{count_text(abs(count), noun)} {'more' if count > 0 else 'fewer'}"] if count else []

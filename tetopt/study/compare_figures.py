@@ -152,7 +152,9 @@ def labels_figure(report: Report) -> Figure:
     and no distance. Grey bars separate labels.
     """
     finished = _pipelines_with_mesh(report)
-    voxels = {row.label: row.voxels for _, _, run in finished for row in run.measurement.labels}
+    voxels = {
+        row.label: row.extent.voxels for _, _, run in finished for row in run.measurement.labels
+    }
     order = sorted(voxels, key=lambda label: -voxels[label])
     figure = Figure(figsize=(max(8.0, 2.0 + 0.32 * len(order)), 7.2), layout="constrained")
     panels = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
@@ -167,7 +169,7 @@ def labels_figure(report: Report) -> Figure:
                 (run.measurement.own_labels, "none"),
                 (run.measurement.labels, colour),
             ):
-                values = {row.label: getattr(row, name) for row in rows}
+                values = {row.label: row.as_json()[name] for row in rows}
                 points = [
                     (k + aside, values[label]) for k, label in enumerate(order) if label in values
                 ]

@@ -179,6 +179,8 @@ class Report(NamedTuple):
 
 def as_json(value: Any) -> Any:
     """Convert a record to objects and lists, for `tetopt.system.files.save_json`."""
+    if hasattr(value, "as_json"):
+        value = value.as_json()
     if isinstance(value, dict):
         return {key: as_json(item) for key, item in value.items()}
     if hasattr(value, "_asdict"):

@@ -133,16 +133,18 @@ def _label_columns(
         return sum(values) / len(values)
 
     def n_lost(mesh: Measurement) -> int | None:
-        return sum(row.is_lost for row in rows_of(mesh)) if rows_of(mesh) else None
+        return sum(row.extent.is_lost for row in rows_of(mesh)) if rows_of(mesh) else None
 
     return [
-        _measure(group, "mean Dice", over(mean, lambda row: row.dice), 1, is_short=is_short),
-        _measure(group, "smallest Dice", over(min, lambda row: row.dice), 1),
-        _measure(group, "surface distance, mm", over(mean, lambda row: row.distance_mean), -1),
+        _measure(
+            group, "mean Dice", over(mean, lambda row: row.overlap.dice), 1, is_short=is_short
+        ),
+        _measure(group, "smallest Dice", over(min, lambda row: row.overlap.dice), 1),
+        _measure(group, "surface distance, mm", over(mean, lambda row: row.distance.mean), -1),
         _measure(
             group,
             "largest volume error, %",
-            over(max, lambda row: 100.0 * abs(row.mesh_volume / row.volume - 1.0)),
+            over(max, lambda row: 100.0 * abs(row.extent.mesh_volume / row.extent.volume - 1.0)),
             -1,
         ),
         _measure(group, "labels lost", n_lost, -1),
@@ -156,7 +158,7 @@ def labels_of_table(report: Report) -> set[int]:
     rows = [
         row for each in report.pipelines for run in each.runs[:1] for row in run.measurement.labels
     ]
-    voxels = {row.label: row.voxels for row in rows}
+    voxels = {row.label: row.extent.voxels for row in rows}
     if report.labels is not None and len(voxels) > 1:
         voxels.pop(0, None)
     return {label for label, n in voxels.items() if n > JUDGED_VOXELS} or set(voxels)

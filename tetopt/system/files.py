@@ -448,6 +448,8 @@ def _plain(value: Any) -> Any:
     """Convert `value` to JSON's own types; numbers that are not finite become null, as JSON
     cannot express them.
     """
+    if hasattr(value, "as_json"):
+        value = value.as_json()
     if hasattr(value, "_asdict"):
         return {key: _plain(item) for key, item in value._asdict().items()}
     if isinstance(value, dict):
