@@ -1080,8 +1080,7 @@ def test_sizes_make_the_number_of_nodes():
 
 def test_only_the_users_longest_edge_is_told_as_missed(monkeypatch, capsys):
     """Not that of cells of order 2, which a run chooses itself."""
-    rows = tetopt.job.advice.ODDITIES  # any edge is too long
-    monkeypatch.setitem(rows, "longest_edge", rows["longest_edge"]._replace(threshold=-0.9))
+    monkeypatch.setattr(tetopt.job.advice, "EDGE_MISS", -0.9)  # any edge is too long
     for words, is_told in (("", False), ("--edge-max 60", True)):
         assert_done(f"{MESH} --nodes 300 --iterations 1 --order 2 {words} --force")
         err = capsys.readouterr().err

@@ -21,6 +21,7 @@ from tetopt.cohort.flags import (
 )
 from tetopt.cohort.layout import PAGE_NAME, TABLE_NAME
 from tetopt.cohort.numbers import Row, Value, description, present, save_table
+from tetopt.io.text import count_text
 from tetopt.report.page import data_html, package_text, render_page, script_html, write_page
 
 PAGE_PICTURES = 600  # thumbnails of about 8 kB, 6 MB in base64
@@ -112,7 +113,7 @@ def _summary(rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -> list[str]:
     words = [
         f"{counts[status]} {words}" for status, words in STATUS_WORDS.items() if counts[status]
     ]
-    text = f"{len(rows)} subject{'s' if len(rows) != 1 else ''}: {', '.join(words) or 'none'}."
+    text = f"{count_text(len(rows), 'subject')}: {', '.join(words) or 'none'}."
     if n_odd := sum(bool(each) for each in flags):
         text += f" {n_odd} {'is' if n_odd == 1 else 'are'} flagged, see below."
     if seconds := present(row.numbers.get("seconds.all") for row in rows):

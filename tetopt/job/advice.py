@@ -8,17 +8,15 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, Literal, NamedTuple
 
-import numpy as np
-
 from tetopt.contents.labels import BACKGROUND_LABEL
 from tetopt.engine.aim import Mode
 from tetopt.engine.loop import MeshingResult
 from tetopt.engine.sliding import MOST_MEETING
-from tetopt.io.text import list_names
+from tetopt.io.text import count_text, list_names
 from tetopt.job.events import note, report_violation, warning
 from tetopt.job.options import Method
 from tetopt.measure.fidelity import LabelFidelity, LabelInterface, LabelPieces, MaskFidelity
-from tetopt.measure.judge import LABEL_VOXELS, Requirements, faulty_labels
+from tetopt.measure.judge import LABEL_VOXELS, MORE_NODES, Requirements, faulty_labels
 from tetopt.model.label_names import count_of_labels, label_words
 from tetopt.start.label_sizes import SizesByLabel
 from tetopt.start.octree import is_for_walls
@@ -36,120 +34,16 @@ SMALLER_CELLS: Mapping[str, Wanted] = dict.fromkeys(
 THICK_SLICES = 2.0  # times a voxel's shortest edge: so far apart, cells lie between slices
 
 
-class Oddity(NamedTuple):
-    """Words on a valid mesh that is probably not intended."""
-
-    threshold: float  # of the measure: only a larger value is reported
-    sentence: str  # with the value as `{0}`
-    remedy: str = ""
-    wants: Wanted | None = None  # cells, if the remedy is followed
-
-
-ANY_COUNT = 0.0  # of what should not be: one is reported
-NODES = "{n_nodes} nodes instead of {nodes}{walls}"
-# By measure. The thresholds are chosen, but for distances: beyond 1.5 voxels, details are lost.
-ODDITIES = {
-    # small labels without a cell
-    "lost": Oddity(
-        ANY_COUNT, f"no cell has label {{labels}}, of fewer than {LABEL_VOXELS} voxels in the mesh"
-    ),
-    # volume of a label's cells over its voxels', or the other way round, the larger
-    "volume": Oddity(
-        2.0,
-        "{count} with more than {limit:g} times the volume of the voxels, or less than half "
-        "(ratio in brackets): {labels}",
-        "allow more nodes",
-        "smaller",
-    ),
-    # voxels of a label and its cells that are not of both: 1 - Dice
-    "overlap": Oddity(
-        0.5,
-        "Dice below {limit:g} for label {labels}",
-        "allow more nodes, or check that these are labels, not intensities",
-        "smaller",
-    ),
-    # fraction of the requested cells across that a label lacks
-    "across": Oddity(
-        0.1, "fewer than {requested:g} cells across: {labels}", "allow more nodes", "smaller"
-    ),
-    # components of the mask that the mesh lacks
-    "merged": Oddity(
-        ANY_COUNT,
-        "the {word} has {mask.components} connected components, the mesh {mask.mesh_components}: "
-        "elements are too large for the {word}'s detail",
-        "allow more nodes",
-        "smaller",
-    ),
-    # voxels between the surfaces of mesh and mask, 95th percentile
-    "distance": Oddity(
-        1.5,
-        "the mesh's boundary and the {word}'s surface are {0:.1f} voxels apart at the 95th "
-        "percentile, {mean:.1f} on average: elements are too large for the details",
-        "allow more nodes",
-        "smaller",
-    ),
-    "dropped": Oddity(
-        ANY_COUNT,
-        "dropped {0} small connected components of the mesh that are not separate in the {word}"
-        "{volumes}",
-        "`keep_components` keeps them",
-    ),
-    # fraction of the requested number of nodes by which a mesh misses it, by the reason
-    "nodes_of_sizes": Oddity(
-        0.01,
-        f"{NODES}: the target sizes need about {{needed}}",
-        "set `nodes` to that, or use larger sizes",
-        "smaller",
-    ),
-    "nodes_beyond_voxels": Oddity(
-        0.01, f"{NODES}: most cells contain no voxel centre", wants="larger"
-    ),
-    "nodes_at_the_start": Oddity(
-        0.01, f"{NODES}, as no iteration was made", "allow some `iterations`"
-    ),
-    "nodes": Oddity(0.01, NODES),
-    # relative rise of E above its least value, and of E_D above its first
-    "E": Oddity(
-        1e-3,
-        "E ended at {last:.4f}, above its minimum {least:.4f}: a tessellation in the first n_t "
-        "iterations raised it",
-        "`retessellate` accept keeps only those that lower it",
-    ),
-    "E_D": Oddity(
-        1e-3, "{what} rose {to}, as shapes were improved at its expense", "increase `k_D`"
-    ),
-    "crowded": Oddity(
-        ANY_COUNT,
-        f"more than {MOST_MEETING} labels meet at {{0}} nodes; only the first {MOST_MEETING} "
-        "determine where these nodes lie",
-    ),
-    # fraction of the cells without a voxel centre
-    "empty": Oddity(
-        0.02,
-        "{n_empty} of {n_cells} cells contain no voxel centre: these contribute nothing to E_D and "
-        "take the nearest voxel's value{more}",
-    ),
-    # relative, by which edges miss their limits
-    "longest_edge": Oddity(
-        1e-3,
-        "the longest edge is {edge:.4g} mm, {0:.0%} over `edge_max` {limit:g}: splits and "
-        "collapses respect it, but nodes move apart",
-        "lower it",
-    ),
-    "shortest_edge": Oddity(
-        1e-3,
-        "the shortest edge is {edge:.4g} mm, {0:.0%} under `size_min` {limit:g}: splits respect "
-        "it, but nodes move together",
-        "raise it",
-    ),
-    # fraction of the edges that are far over their targets
-    "targets": Oddity(
-        0.1,
-        f"{{0:.0%}} of the edges are longer than {LONG_EDGE:.2f} times their target size",
-        "allow more nodes, or use larger sizes",
-        "smaller",
-    ),
-}
+# Thresholds of oddities, chosen; beyond 1.5 voxels, details of a mask are lost.
+TIMES_VOLUME = 2.0  # of a label's cells over its voxels', or the other way round, the larger
+LEAST_DICE = 0.5  # of a large label
+LACKING_ACROSS = 0.1  # fraction of the requested cells across a label
+FAR_VOXELS = 1.5  # between the surfaces of mesh and mask, 95th percentile
+MISSED_NODES = 0.01  # fraction of the requested number of nodes
+ENERGY_RISE = 1e-3  # of E above its least value, of E_D above its first, relative
+EMPTY_FRACTION = 0.02  # of the cells
+EDGE_MISS = 1e-3  # of the longest or shortest edge beyond its limit, relative
+LONG_FRACTION = 0.1  # of the edges, far over their targets
 
 
 class Problem(NamedTuple):
@@ -169,36 +63,28 @@ class Problem(NamedTuple):
         return f"{self.text}; {self.remedy}" if self.remedy else self.text
 
 
-def find_oddity(name: str, value: float, **facts: Any) -> Iterator[Problem]:
-    """Yield a problem if a measure is odd; `facts` are what its sentence states."""
-    odd = ODDITIES[name]
-    if value > odd.threshold:
-        yield Problem(odd.sentence.format(value, **facts), odd.remedy, wants=odd.wants)
-
-
 def find_odd_labels(
-    name: str,
     rows: Iterable[LabelFidelity],
     value: Callable[[LabelFidelity], float],
+    limit: float,
     words: Callable[[LabelFidelity], str],
+    text: str,
+    remedy: str = "",
     most: int = sys.maxsize,
     unhelped: frozenset[int] = frozenset(),
-    **facts: Any,
 ) -> Iterator[Problem]:
-    """Yield a problem if a measure of labels is odd, which names `most` of them, the worst first.
+    """Yield a problem if a value of labels is above its limit: `text` with their number as `{0}`
+    and `most` of them as `{1}`, the worst first.
 
-    It has no remedy if all of them are `unhelped`.
+    It has no remedy if all of them are `unhelped`; any remedy takes smaller cells.
     """
-    limit = ODDITIES[name].threshold
     odd = sorted((row for row in rows if value(row) > limit), key=value, reverse=True)
-    count = "1 label" if len(odd) == 1 else f"{len(odd)} labels"
-    labels = list_names([words(row) for row in odd], most)
-    problems = find_oddity(
-        name, value(odd[0]) if odd else limit, count=count, labels=labels, limit=limit, **facts
-    )
-    for each in problems:
-        is_helped = any(row.label not in unhelped for row in odd)
-        yield each if is_helped else each._replace(remedy="", wants=None)
+    if odd:
+        named = text.format(
+            count_text(len(odd), "label"), list_names([words(row) for row in odd], most)
+        )
+        is_helped = bool(remedy) and any(row.label not in unhelped for row in odd)
+        yield Problem(named, remedy, wants="smaller") if is_helped else Problem(named)
 
 
 def order_problems(problems: Iterable[Problem]) -> list[Problem]:
@@ -258,8 +144,12 @@ def unmet_requirements(
         yield Problem(words, name=name, wants=SMALLER_CELLS.get(name))
     yield from _of_labels(measured, word)
     yield from _of_mask(measured.get("mask"), word)
-    n_dropped = measured.get("dropped_components") or 0
-    yield from find_oddity("dropped", n_dropped, word=word, volumes=_dropped_words(measured))
+    if n_dropped := measured.get("dropped_components"):
+        yield Problem(
+            f"dropped {n_dropped} small connected components of the mesh that are not separate in "
+            f"the {word}{_dropped_words(measured)}",
+            "`keep_components` keeps them",
+        )
 
 
 def _dropped_words(measured: Json) -> str:
@@ -288,16 +178,32 @@ def _of_labels(measured: Json, word: str) -> Iterator[Problem]:
     def words(row: LabelFidelity) -> str:
         return required.label_words(row.label)
 
-    yield from find_odd_labels("lost", others, lambda row: row.extent.is_lost, words)
     yield from find_odd_labels(
-        "volume",
+        others,
+        lambda row: row.extent.is_lost,
+        0,
+        words,
+        f"no cell has label {{1}}, of fewer than {LABEL_VOXELS} voxels in the mesh",
+    )
+    yield from find_odd_labels(
         there,
         lambda row: max(row.extent.ratio, 1.0 / row.extent.ratio),
+        TIMES_VOLUME,
         lambda row: f"{words(row)} ({row.extent.ratio:.3g})",
+        f"{{}} with more than {TIMES_VOLUME:g} times the volume of the voxels, or less than half "
+        "(ratio in brackets): {}",
+        MORE_NODES,
         unhelped=required.unhelped,
     )
     yield from find_odd_labels(
-        "overlap", large, lambda row: 1.0 - row.overlap.dice, words, 5, required.unhelped
+        large,
+        lambda row: 1.0 - row.overlap.dice,
+        1.0 - LEAST_DICE,
+        words,
+        f"Dice below {LEAST_DICE:g} for label {{1}}",
+        f"{MORE_NODES}, or check that these are labels, not intensities",
+        5,
+        required.unhelped,
     )
 
 
@@ -390,12 +296,24 @@ def _faults(
 def _of_mask(mask: MaskFidelity | None, word: str) -> Iterator[Problem]:
     if mask is None:
         return
-    # more components of the mesh than of the mask violate a requirement
-    yield from find_oddity("merged", mask.components - mask.mesh_components, word=word, mask=mask)
-    mean = max(mask.distance_mean, mask.reverse_mean)
-    yield from find_oddity(
-        "distance", max(mask.distance_p95, mask.reverse_p95), word=word, mean=mean
+    if mask.components > mask.mesh_components:  # fewer violate a requirement
+        yield Problem(
+            f"the {word} has {mask.components} connected components, the mesh "
+            f"{mask.mesh_components}: elements are too large for the {word}'s detail",
+            MORE_NODES,
+            wants="smaller",
+        )
+    p95, mean = (
+        max(mask.distance_p95, mask.reverse_p95),
+        max(mask.distance_mean, mask.reverse_mean),
     )
+    if p95 > FAR_VOXELS:
+        yield Problem(
+            f"the mesh's boundary and the {word}'s surface are {p95:.1f} voxels apart at the 95th "
+            f"percentile, {mean:.1f} on average: elements are too large for the details",
+            MORE_NODES,
+            wants="smaller",
+        )
 
 
 def of_result(
@@ -416,21 +334,23 @@ def of_result(
         yield from _of_nodes(result, mode, n_nodes, nodes, measured, k_D, has_sizes)
     least = min(row.E for row in result.history)
     first, last = result.history[0], result.history[-1]
-    if method == "paper":
-        yield from find_oddity("E", _rise(least, last.E), last=last.E, least=least)
-    if mode == "start":
-        rise = _rise(first.E_D, last.E_D)
-        to = f"to {1.0 + rise:.3f} times its initial value" if first.E_D > 0.0 else "from 0"
+    if method == "paper" and last.E > (1.0 + ENERGY_RISE) * least:
+        yield Problem(
+            f"E ended at {last.E:.4f}, above its minimum {least:.4f}: a tessellation in the first "
+            "n_t iterations raised it",
+            "`retessellate` accept keeps only those that lower it",
+        )
+    if mode == "start" and last.E_D > (1.0 + ENERGY_RISE) * first.E_D:
+        times = f"to {last.E_D / first.E_D:.3f} times its initial value" if first.E_D else "from 0"
         what = "E_D, with voxels on the wrong side of the mask," if "mask" in measured else "E_D"
-        yield from find_oddity("E_D", rise, what=what, to=to)
-    yield from find_oddity("crowded", measured.get("nodes_of_many_labels") or 0)
-
-
-def _rise(before: float, after: float) -> float:
-    """Return the relative rise of a value of 0 or more."""
-    if before > 0.0:
-        return after / before - 1.0
-    return np.inf if after > 0.0 else 0.0
+        yield Problem(
+            f"{what} rose {times}, as shapes were improved at its expense", "increase `k_D`"
+        )
+    if n_crowded := measured.get("nodes_of_many_labels"):
+        yield Problem(
+            f"more than {MOST_MEETING} labels meet at {n_crowded} nodes; only the first "
+            f"{MOST_MEETING} determine where these nodes lie"
+        )
 
 
 def _of_nodes(
@@ -443,27 +363,33 @@ def _of_nodes(
     has_sizes: bool,
 ) -> Iterator[Problem]:
     """Yield the miss of a requested number of nodes, with its reason."""
+    if abs(n_nodes - nodes) <= MISSED_NODES * nodes:
+        return
     n_initial, needed = len(result.initial.points), measured.get("nodes_of_sizes") or 0
-    is_of_walls = mode == "graded" and "mask" in measured and n_nodes > nodes
-    wants: Wanted = "smaller" if n_nodes < nodes else "larger"
-    name, remedies = "nodes", list[str]()
+    text, remedy = f"{n_nodes} nodes instead of {nodes}", ""
+    if (
+        mode == "graded"
+        and "mask" in measured
+        and n_nodes > nodes
+        and is_for_walls(n_initial, nodes)
+    ):
+        text += f" (the initial mesh has {n_initial}, to keep thin walls of the mask)"
+    wants: Wanted | None = None
     if needed > nodes:
-        name = "nodes_of_sizes"
+        text += f": the target sizes need about {needed}"
+        remedy, wants = "set `nodes` to that, or use larger sizes", "smaller"
     elif n_nodes < nodes and has_most_empty(result, measured.get("cells_without_voxel", 0)):
-        name = "nodes_beyond_voxels"
+        text, wants = f"{text}: most cells contain no voxel centre", "larger"
     elif result.history[-1].iteration == 0:
-        name = "nodes_at_the_start"
+        text += ", as no iteration was made"
+        remedy = "allow some `iterations`"
     else:
-        remedies += ["more iterations"] * (result.ended == "iterations")
-        remedies += ["a `k_D` above 0"] * (k_D == 0.0) + [f"{wants} sizes"] * has_sizes
-    walls = f" (the initial mesh has {n_initial}, to keep thin walls of the mask)"
-    walls = walls if is_of_walls and is_for_walls(n_initial, nodes) else ""
-    miss = abs(n_nodes - nodes) / nodes
-    for each in find_oddity(name, miss, n_nodes=n_nodes, nodes=nodes, needed=needed, walls=walls):
-        remedy = f"use {' or '.join(remedies)}" if remedies else each.remedy
-        yield each._replace(
-            remedy=remedy, wants=wants if name == "nodes" and has_sizes else each.wants
-        )
+        size: Wanted = "smaller" if n_nodes < nodes else "larger"
+        remedies = ["more iterations"] * (result.ended == "iterations")
+        remedies += ["a `k_D` above 0"] * (k_D == 0.0) + [f"{size} sizes"] * has_sizes
+        remedy = f"use {' or '.join(remedies)}" if remedies else ""
+        wants = size if has_sizes else None
+    yield Problem(text, remedy, wants=wants)
 
 
 def has_most_empty(result: MeshingResult, n_empty: int) -> bool:
@@ -485,15 +411,18 @@ def of_empty(
     domain, so that the image may be of no importance, and fewer nodes are no remedy.
     """
     n_cells = len(result.mesh.cells)
+    if n_empty <= EMPTY_FRACTION * n_cells:
+        return
     more = ", which is harmless unless moduli come from the image" if is_masked else ""
     is_thick = spacing.max() >= THICK_SLICES * spacing.min()
     if is_thick:
         more += f"; slices are {spacing.max():.3g} mm apart, so some cells lie between them"
-    for each in find_oddity(
-        "empty", n_empty / n_cells, n_empty=n_empty, n_cells=n_cells, more=more
-    ):
-        is_helped = is_free and not is_masked and not is_thick
-        yield each._replace(remedy="reduce `nodes`", wants="larger") if is_helped else each
+    words = (
+        f"{n_empty} of {n_cells} cells contain no voxel centre: these contribute nothing to E_D "
+        f"and take the nearest voxel's value{more}"
+    )
+    is_helped = is_free and not is_masked and not is_thick
+    yield Problem(words, "reduce `nodes`", wants="larger") if is_helped else Problem(words)
 
 
 def tell_label_sizes(sizes: SizesByLabel) -> None:
@@ -523,15 +452,16 @@ def of_layers(
     """
     tissues = [row for row in labels if row.label != BACKGROUND_LABEL]
     yield from find_odd_labels(
-        "across",
         tissues,
         lambda row: 1.0 - row.thickness.cells_across / cells_across,
+        LACKING_ACROSS,
         lambda row: (
             f"{label_words(row.label, names)} {row.thickness.cells_across:.2g} (edges "
             f"{row.thickness.edge:.2g} mm)"
         ),
+        f"fewer than {cells_across:g} cells across: {{1}}",
+        MORE_NODES,
         5,
-        requested=cells_across,
     )
 
 
@@ -539,9 +469,22 @@ def of_sizes(
     sizes: Sizes, shortest: float, longest: float, edges: EdgeRatios | None
 ) -> Iterator[Problem]:
     """Yield size limits and targets that the edges, from shortest to longest, mm, do not meet."""
-    if (most := sizes.longest) is not None:
-        yield from find_oddity("longest_edge", longest / most - 1.0, edge=longest, limit=most)
-    if least := sizes.smallest:
-        yield from find_oddity("shortest_edge", 1.0 - shortest / least, edge=shortest, limit=least)
-    if edges is not None:
-        yield from find_oddity("targets", edges.above)
+    if (most := sizes.longest) is not None and longest > (1.0 + EDGE_MISS) * most:
+        yield Problem(
+            f"the longest edge is {longest:.4g} mm, {longest / most - 1.0:.0%} over `edge_max` "
+            f"{most:g}: splits and collapses respect it, but nodes move apart",
+            "lower it",
+        )
+    if (least := sizes.smallest) and shortest < (1.0 - EDGE_MISS) * least:
+        yield Problem(
+            f"the shortest edge is {shortest:.4g} mm, {1.0 - shortest / least:.0%} under "
+            f"`size_min` {least:g}: splits respect it, but nodes move together",
+            "raise it",
+        )
+    if edges is not None and edges.above > LONG_FRACTION:
+        yield Problem(
+            f"{edges.above:.0%} of the edges are longer than {LONG_EDGE:.2f} times their target "
+            "size",
+            f"{MORE_NODES}, or use larger sizes",
+            wants="smaller",
+        )
