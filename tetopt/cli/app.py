@@ -82,10 +82,6 @@ LAYER_POOLS = {"omp": "omppool", "tbb": "tbbpool", "workqueue": "workqueue"}
 LAYER_KINDS = ("default", "safe", "threadsafe", "forksafe")
 MOST_DIGITS = 4  # of a number of threads: no machine has more
 
-# Options by the names that messages of the library begin with, where these differ by more than a
-# hyphen.
-ARGUMENT_OPTIONS = {"octree": "nodes", "modulus": "young"}
-
 
 class _Plain:
     """A part of the command line whose help shows no metavar for switches, which take no value."""
@@ -160,7 +156,7 @@ def _run(arguments: list[str], outputs: Outputs) -> int:
         code = _app(arguments)(args=arguments, obj=arguments, standalone_mode=False) or 0
         return tell_end() if code in (INTERRUPTED_CODE, signal_code()) else code
     except (InputError, OSError, MemoryError) as error:
-        show_error(_with_option(error_words(error), arguments))
+        show_error(error_words(error), arguments)
         _say_written(outputs)
         return 2
     except typer.Exit as ended:
@@ -177,18 +173,6 @@ def _run(arguments: list[str], outputs: Outputs) -> int:
         if error.format_message():  # empty after the help that a bare `tetopt` prints
             show_error(f"{error.format_message()} (see --help)")
         return 2
-
-
-def _with_option(message: str, arguments: list[str]) -> str:
-    """Replace the argument's name that begins a message of the library, perhaps after a file's,
-    by the option that the user gave for it.
-    """
-    parts = message.split(": ")
-    for place, name in enumerate(parts[:2]):
-        option = f"--{ARGUMENT_OPTIONS.get(name, name).replace('_', '-')}"
-        if any(word == option or word.startswith(f"{option}=") for word in arguments):
-            return ": ".join([*parts[:place], option, *parts[place + 1 :]])
-    return message
 
 
 def _say_written(outputs: Outputs) -> None:

@@ -9,7 +9,7 @@ import os
 import re
 import sys
 import textwrap
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from typing import IO, TYPE_CHECKING, Any
 
@@ -26,31 +26,14 @@ if TYPE_CHECKING:
 LINE_WIDTH = 100  # characters in a line, but for words that are longer
 # characters: the remedy stands at the end, the value found may be a line of a million
 LONGEST_ERROR = 480
-PARAMETER_OPTIONS = {  # by parameters of the library's functions, the command line's names
-    **{
-        name: f"--{name.replace('_', '-').lower()}"
-        for name in (
-            "k_D",
-            "min_dihedral",
-            "shape_power",
-            "target_error",
-            "label_weight",
-            "n_t",
-            "retessellate",
-            "gradation",
-            "boundary",
-            "iterations",
-            "nodes",
-            "nodes_max",
-            "weights",
-        )
-    },
-    "smallest": "--size-min",
-    "edge_size": "--edge-size",
-    "longest": "--edge-max",
-    "field": "--sizing",
+# Options whose arguments have other names in the heads of the library's messages.
+HEADS = {
+    "smallest": "size_min",
+    "longest": "edge_max",
+    "field": "sizing",
+    "octree": "nodes",
+    "modulus": "young",
 }
-PARAMETER_PATTERN = re.compile(rf"^(?:{'|'.join(PARAMETER_OPTIONS)})(?=:)")
 OPTION_NAMES: dict[str, str] = {}  # of the command that runs, by the arguments that messages name
 
 
@@ -179,11 +162,11 @@ def print_line(text: str) -> None:
         out.print(escape(line))
 
 
-def show_error(message: object) -> None:
+def show_error(message: object, arguments: Sequence[str] = ()) -> None:
     """Print an error with the command's names for options: on one line of limited length, which
     a terminal wraps.
     """
-    line = plain(in_options(str(message)))
+    line = plain(in_options(str(message), arguments))
     if len(line) > LONGEST_ERROR:  # it quotes a file
         line = f"{line[: LONGEST_ERROR // 2]} ... {line[-LONGEST_ERROR // 3 :]}"
     _say(f"tetopt: {line}", "tetopt:", "bold red", is_wrapped=log.is_terminal)
@@ -200,28 +183,29 @@ def _say(line: str, head: str = "", style: str = "", is_wrapped: bool = True) ->
         log.print(escape(each))
 
 
-def in_options(message: str) -> str:
-    """Replace a message's names of arguments, at its head and between backticks, by the
-    command's options.
+def in_options(message: str, arguments: Sequence[str] = ()) -> str:
+    """Replace a message's names of arguments by the command's options: those between backticks,
+    and that at its head, perhaps after a file's, if it is an option among the `arguments`.
     """
-    return PARAMETER_PATTERN.sub(lambda name: PARAMETER_OPTIONS[name[0]], with_hyphens(message))
+    if "`" in message:
+        from tetopt.job.options import JobOptions, kinds_of, option_name
 
-
-def with_hyphens(message: str) -> str:
-    """Replace a message's arguments between backticks by the command's options."""
-    if "`" not in message:
-        return message
-    from tetopt.job.options import JobOptions, kinds_of, option_name
-
-    names = {
-        name: f"--{option_name(name, kind)}" for name, kind in kinds_of(JobOptions).items()
-    } | OPTION_NAMES
-    return re.sub(r"`(\w+)`", lambda match: names.get(match[1], match[0]), message)
+        names = {
+            name: f"--{option_name(name, kind)}" for name, kind in kinds_of(JobOptions).items()
+        }
+        names |= OPTION_NAMES
+        message = re.sub(r"`(\w+)`", lambda match: names.get(match[1], match[0]), message)
+    parts = message.split(": ")
+    for place, name in enumerate(parts[:2]):
+        option = f"--{HEADS.get(name, name).replace('_', '-').lower()}"
+        if any(word.partition("=")[0] == option for word in arguments):
+            return ": ".join([*parts[:place], option, *parts[place + 1 :]])
+    return message
 
 
 def say(text: str) -> None:
     """Print a line of the library."""
-    _say(plain(with_hyphens(text)))
+    _say(plain(in_options(text)))
 
 
 def show_event(event: Event) -> None:
@@ -236,7 +220,7 @@ def show_event(event: Event) -> None:
 
 def show_warning(message: str) -> None:
     """Print a warning."""
-    _say(f"tetopt: warning: {plain(with_hyphens(message))}", "tetopt: warning:", "yellow")
+    _say(f"tetopt: warning: {plain(in_options(message))}", "tetopt: warning:", "yellow")
 
 
 def warnings_once() -> Callable[..., None]:

@@ -15,7 +15,7 @@ from typing import Annotated, Any, cast, get_args, get_type_hints
 
 import typer
 
-from tetopt.cli.console import OPTION_NAMES, with_hyphens
+from tetopt.cli.console import OPTION_NAMES, in_options
 from tetopt.errors import InputError
 from tetopt.io.meshes import MESH_SUFFIXES
 from tetopt.job.job import of_option
@@ -178,7 +178,7 @@ def _annotation_of(name: str, kind: Any, default: Any, panel: str | None) -> Any
     if not has_option(kind):
         return kind
     own = option_of(kind)
-    about: Json = {"metavar": own.metavar, "help": with_hyphens(own.text)}
+    about: Json = {"metavar": own.metavar, "help": in_options(own.text)}
     if own.is_argument:
         return Annotated[get_args(kind)[0], typer.Argument(**about)]
     long = option_name(name, kind)
