@@ -13,8 +13,7 @@ from tetopt import Content, InputError, Mesh, save_image
 from tetopt.cli.console import print_line, print_table, show_warning
 from tetopt.cli.options import FilesArgument, NumberOptions, mesh_and_image
 from tetopt.commands.beside import image_voxels, read_labels
-from tetopt.energy.sampling import overlap_of
-from tetopt.job.mesh_file import read_mesh
+from tetopt.job.mesh_file import check_overlap, read_mesh
 from tetopt.job.options import MaskedPart, Option
 from tetopt.report.tables import new_table
 from tetopt.system.arrays import Bools, Json
@@ -113,10 +112,7 @@ def _voxels_in(mesh: Mesh, what: Content, path: Path, image_path: Path) -> Bools
     Raises InputError if one lies in several cells, or all outside.
     """
     image = what.given
-    if (overlap := overlap_of(image, mesh)) is not None:
-        raise InputError(
-            f"{path}: {overlap}; remove one cell of each pair, or mesh the image again"
-        )
+    check_overlap(path, mesh, image)
     inside = tetopt.cell_of_voxel(image, mesh) >= 0
     outside = int((~inside).sum())
     if outside == image.data.size:

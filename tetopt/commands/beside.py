@@ -27,7 +27,7 @@ from tetopt.job.aligned import (
     warn_of_other_world,
 )
 from tetopt.job.mesh_file import table_of_segmentation, warn_of_other_image
-from tetopt.job.options import BoxPart, MaskedPart, stated_part
+from tetopt.job.options import BoxPart, LabelledPart, MaskedPart, stated_part
 from tetopt.measure.fidelity import cell_labels
 from tetopt.measure.judge import warn_of_other_mask
 from tetopt.model.file import (
@@ -77,6 +77,12 @@ def check_part(image: Path | None, part: MaskedPart, labels: Path | None = None)
         lost := [name for name, value in needs_image.items() if value is not None]
     ):
         raise InputError(f"`{lost[0]}`: needs `image`")
+
+
+def stated_files(part: LabelledPart) -> Json:
+    """Return the names of the files of labels and mask, if there are any, as numbers state them."""
+    files = {"labels": part.labels, "mask": part.mask}
+    return {name: path.name for name, path in files.items() if path is not None}
 
 
 class MeshVoxels(NamedTuple):

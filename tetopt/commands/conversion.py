@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tetopt.commands.beside import check_part, voxels_of
+from tetopt.commands.beside import check_part, stated_files, voxels_of
 from tetopt.contents.align import SMALL_COMPONENT_FRACTION
 from tetopt.errors import InputError
 from tetopt.geometry.check import check_unfolded
@@ -136,9 +136,7 @@ def convert_file(
     save_for_solver(output, model, solver)
     files = {"mesh": mesh.name, "output": output.name, "units": solver.units, "space": solver.space}
     files |= {} if results is None else {"results": results.name}
-    files |= {
-        name: path.name for name in ("labels", "mask") if (path := getattr(part, name)) is not None
-    }
+    files |= stated_files(part)
     return Converted(model, solver, files | {"versions": versions()} | model_summary(model))
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from tetopt.commands.beside import check_part, voxels_of
+from tetopt.commands.beside import check_part, stated_files, voxels_of
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io.formats import save_model
@@ -95,10 +95,7 @@ def solve_file(
     _advise(task, solutions)
     options = {**asdict(model), "compress_percent": compress, **stated_part(part)}
     options["label_names"] = None if model.label_names is None else model.label_names.name
-    files = {"mesh": mesh.name}
-    files |= {
-        name: path.name for name in ("labels", "mask") if (path := getattr(part, name)) is not None
-    }
+    files = {"mesh": mesh.name} | stated_files(part)
     if image is not None:
         files |= {"image": image.name, "image_sha256": sha256(image)}
     about = {**files, "versions": versions(), "options": options}

@@ -9,13 +9,12 @@ from numpy.typing import NDArray
 
 from tetopt.commands.conversion import with_results
 from tetopt.contents.labels import is_label_map
-from tetopt.energy.sampling import overlap_of
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io.images import OUTPUT_SUFFIXES, save_image, save_voxels
 from tetopt.job.aligned import read_companion
 from tetopt.job.events import note, progress, warning
-from tetopt.job.mesh_file import read_mesh
+from tetopt.job.mesh_file import check_overlap, read_mesh
 from tetopt.job.options import VoxelOptions
 from tetopt.model.fields import half_turned_fields
 from tetopt.model.file import MeshFile, words_of_other_box
@@ -74,10 +73,7 @@ def write_on_image(
     loaded = read_mesh(mesh) if results is None else with_results(read_mesh(mesh), results)
     name, values, at = _field_of(loaded, mesh, options, space)
     image = _read(loaded, mesh, path, is_registered)
-    if (overlap := overlap_of(image, loaded.mesh)) is not None:
-        raise InputError(
-            f"{mesh}: {overlap}; remove one cell of each pair, or mesh the image again"
-        )
+    check_overlap(mesh, loaded.mesh, image)
     numbers: Json = {"mesh": mesh.name, "output": output.name, "field": name, "at": at}
     if options.warp is None:
         turned = half_turned_fields({name: values})[name]

@@ -387,6 +387,6 @@ def _fields(model: Model) -> dict[str, Floats]:
     """Return cell data and moduli, (M,), (M, 3) or (M, 9) float64, by name."""
     fields = dict(model.cell_data)
     if model.materials is not None:
-        of_cell = model.materials.of_cell
-        fields |= {"young": model.materials.young[of_cell], "nu": model.materials.nu[of_cell]}
+        own = model.materials.fields()
+        fields |= {"young": own["young"], "nu": own["nu"]}
     return _view_columns(fields)

@@ -109,7 +109,7 @@ from tetopt.model.fields import NODE_MODULI, node_field
 from tetopt.model.loads import load_words
 from tetopt.model.model import Model, element_facets, elements, header_lines
 from tetopt.model.sets import Sets
-from tetopt.system.arrays import Floats, Ints
+from tetopt.system.arrays import Ints
 
 # By dimension and order, with VTK's order of nodes; lines must state their number of nodes.
 TOPOLOGY_TYPES = {
@@ -160,14 +160,11 @@ def _mesh_grid(model: Model, others: str) -> str:
         ("load", load_words(load)) for load in model.loads
     ]
     if model.materials is not None:
-        young = model.materials.young
-        nu = model.materials.nu
-        of_cell = model.materials.of_cell
-        own = {"material": of_cell + 1, "young": young[of_cell], "nu": nu[of_cell]}
-        if model.materials.density is not None:
-            own["density"] = model.materials.density[of_cell]
+        own = model.materials.fields()
+        own = {"material": own["material"]} | own
         fields = own | {name: values for name, values in fields.items() if name not in own}
-        named += [("young", _values_text(young)), ("nu", _values_text(nu))]
+        moduli = (("young", model.materials.young), ("nu", model.materials.nu))
+        named += [(name, " ".join(map(repr, values.tolist()))) for name, values in moduli]
     points, cells = elements(model)
     at_nodes = dict(model.point_data)
     if model.node_young is not None:
@@ -273,7 +270,3 @@ def _information(name: str, value: str) -> str:
         f'<Information Name="{xml_attribute(name)}" '
         f'Value="{xml_attribute(value)}">{INFORMATION_TEXT}</Information>\n'
     )
-
-
-def _values_text(values: Floats) -> str:
-    return " ".join(map(repr, values.tolist()))

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from tetopt.contents.align import SAME_BOX_VOXELS, SAME_GRID_VOXELS
+from tetopt.energy.sampling import overlap_of
 from tetopt.errors import InputError
 from tetopt.geometry.check import beyond_box
 from tetopt.image import Image
@@ -36,6 +37,14 @@ def read_mesh(path: Path) -> MeshFile:
             f"{list_names(list(violated))}"
         )
     return loaded
+
+
+def check_overlap(path: Path, mesh: Mesh, image: Image) -> None:
+    """Raise InputError for a mesh whose cells share voxels."""
+    if (overlap := overlap_of(image, mesh)) is not None:
+        raise InputError(
+            f"{path}: {overlap}; remove one cell of each pair, or mesh the image again"
+        )
 
 
 def check_place(what: str, mesh: Mesh, image: Image) -> None:

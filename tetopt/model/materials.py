@@ -16,7 +16,7 @@ from tetopt.errors import InputError, Remark, warn
 from tetopt.model.label_names import label_words, labels_named
 from tetopt.model.mappings import ByLabel, check_cells, check_nu, check_young
 from tetopt.model.sets import Names
-from tetopt.system.arrays import Floats, Ints
+from tetopt.system.arrays import Arrays, Floats, Ints
 
 # Poisson's ratio of soft tissue that linear cells still represent: they lock closer to 0.5
 DEFAULT_NU = 0.45
@@ -78,6 +78,14 @@ class Materials(NamedTuple):
     of_cell: Ints
     binning: BinningError | None = None
     density: Floats | None = None
+
+    def fields(self) -> Arrays:
+        """Return the moduli, ratios, materials from 1 and densities of cells, by fields' names."""
+        fields = {"young": self.young[self.of_cell], "nu": self.nu[self.of_cell]}
+        fields["material"] = self.of_cell + 1
+        if self.density is not None:
+            fields["density"] = self.density[self.of_cell]
+        return fields
 
 
 def materials(

@@ -431,14 +431,8 @@ def grid_fields(model: Model) -> tuple[Arrays, Arrays]:
         is_on = np.zeros(len(points), dtype=np.uint8)
         is_on[element_facets(cells, rows)] = 1
         on_nodes[f"{ON_PREFIX}{name}"] = is_on
-    if (table := model.materials) is not None:
-        on_cells |= {
-            "young": table.young[table.of_cell],
-            "nu": table.nu[table.of_cell],
-            "material": table.of_cell + 1,
-        }
-        if table.density is not None:
-            on_cells["density"] = table.density[table.of_cell]
+    if model.materials is not None:
+        on_cells |= model.materials.fields()
     if model.gauss_young is not None:
         on_cells[GAUSS_MODULI] = model.gauss_young
     if model.node_young is not None:
