@@ -5,6 +5,7 @@ Files are made by pydicom, segmentations by highdicom, which is also the oracle 
 """
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,6 +21,8 @@ from tetopt.io.read_dicom import _unevenness
 
 pydicom = pytest.importorskip("pydicom")
 from pydicom.dataset import Dataset, FileDataset, FileMetaDataset  # noqa: E402
+
+pytestmark = pytest.mark.usefixtures("here")
 
 CT, ENHANCED_CT, MR = (
     "1.2.840.10008.5.1.4.1.1.2",
@@ -70,13 +73,13 @@ def file_of(kind, pixels, **tags):
     return data
 
 
-def saved(path, data, syntax=EXPLICIT):
+def saved(data, path="a.dcm", syntax=EXPLICIT):
     data.file_meta = FileMetaDataset()
     data.file_meta.MediaStorageSOPClassUID = data.SOPClassUID
     data.file_meta.MediaStorageSOPInstanceUID = data.get("SOPInstanceUID") or "1.2.9"
     data.file_meta.TransferSyntaxUID = syntax
     pydicom.dcmwrite(path, data, enforce_file_format=True)
-    return path
+    return Path(path).absolute()
 
 
 def places(n=6, step=STEP * NORMAL):
@@ -116,7 +119,7 @@ def slices_of(folder, pixels=RAMP, where=None, **tags):
     """A series of single slices, named in another order than they lie."""
     folder.mkdir(exist_ok=True)
     for k, place in enumerate(places(len(pixels)) if where is None else where):
-        saved(folder / f"s{(k * 7) % 11}.dcm", one_slice(pixels[k], place, **tags))
+        saved(one_slice(pixels[k], place, **tags), folder / f"s{(k * 7) % 11}.dcm")
     return folder
 
 
@@ -138,11 +141,11 @@ ORDER = np.array([3, 0, 5, 1, 4, 2])
 
 
 @pytest.mark.apart
-def test_frames_in_any_order(tmp_path):
+def test_frames_in_any_order():
     """The reader sorts them; rows and columns have spacings of their own, and the world is
     oblique.
     """
-    assert_placed(saved(tmp_path / "a.dcm", enhanced(RAMP[ORDER], places()[ORDER])))
+    assert_placed(saved(enhanced(RAMP[ORDER], places()[ORDER])))
 
 
 @pytest.mark.parametrize("is_series", [False, True])
@@ -153,16 +156,16 @@ def test_slices_of_a_tilted_gantry_keep_their_shear(tmp_path, is_series):
         slices_of(path, where=where)
         assert_refused(path, "expected a volume from 0 to 0", volume=1)
     else:
-        saved(path, enhanced(RAMP[ORDER], where[ORDER]))
+        saved(enhanced(RAMP[ORDER], where[ORDER]), path)
     assert_placed(path, affine=affine_of(where[1] - where[0]), volume=0)
 
 
 def test_several_files_of_one_series_are_one_volume(tmp_path):
     """Files of many frames and of one, whose frames interleave (a concatenation)."""
     for name, frames in (("b", [4, 0, 2]), ("a", [1, 5]), ("c", [3])):
-        saved(tmp_path / f"{name}.dcm", enhanced(RAMP[frames], places()[frames]))
+        saved(enhanced(RAMP[frames], places()[frames]), f"{name}.dcm")
     assert_placed(tmp_path)
-    saved(tmp_path / "again.dcm", enhanced(RAMP[3:4], places()[3:4]))
+    saved(enhanced(RAMP[3:4], places()[3:4]), "again.dcm")
     assert_refused(
         tmp_path,
         "7 slices of this DICOM series have 6 positions: .* several volumes .* separate folder",
@@ -171,7 +174,7 @@ def test_several_files_of_one_series_are_one_volume(tmp_path):
 
 def test_several_volumes_in_files_of_their_own(tmp_path):
     for name in "ab":
-        saved(tmp_path / f"{name}.dcm", enhanced(RAMP, places()))
+        saved(enhanced(RAMP, places()), f"{name}.dcm")
     assert_refused(
         tmp_path, "12 slices of this DICOM series have 6 positions: .* give one of its files"
     )
@@ -196,7 +199,7 @@ def test_places_that_are_no_volume(tmp_path, where, match, is_series):
     if is_series:
         assert_refused(slices_of(tmp_path, where=where), match)
     else:
-        assert_refused(saved(tmp_path / "a.dcm", enhanced(RAMP, where)), f"{match}.*; |{match}")
+        assert_refused(saved(enhanced(RAMP, where)), f"{match}.*; |{match}")
 
 
 def test_uneven_slices_in_words():
@@ -233,19 +236,19 @@ def of_times(*times):
         (6, {"own": of_times(1, 2, 1, 2, 1, 2)}, "2 volumes"),
     ],
 )
-def test_frames_that_are_no_volume(tmp_path, frames, options, match):
+def test_frames_that_are_no_volume(frames, options, match):
     data = enhanced(RAMP, places(frames), **options)
-    assert_refused(saved(tmp_path / "a.dcm", data), match)
+    assert_refused(saved(data), match)
 
 
 def with_axial(folder):
-    saved(folder / "a.dcm", one_slice(RAMP[0], places(7)[6], ImageOrientationPatient=AXIAL))
+    saved(one_slice(RAMP[0], places(7)[6], ImageOrientationPatient=AXIAL), folder / "a.dcm")
 
 
 def with_two_series(folder):
     data = one_slice(RAMP[0], ORIGIN)
     data.SeriesInstanceUID = "1.2.5"
-    saved(folder / "a.dcm", data)
+    saved(data, folder / "a.dcm")
 
 
 def cut(folder):
@@ -255,7 +258,7 @@ def cut(folder):
 def of_two_frames_of_reference(folder):
     for name, number in (("s", 5), ("t", 7)):
         data = one_slice(RAMP[0], places(8)[number], FrameOfReferenceUID=f"1.2.{number}")
-        saved(folder / f"{name}.dcm", data)
+        saved(data, folder / f"{name}.dcm")
 
 
 @pytest.mark.parametrize(
@@ -286,13 +289,13 @@ def test_a_folder_above_series_lists_them(tmp_path, capfd):
     assert capfd.readouterr().err == ""  # no library's own warning
 
 
-def test_a_volume_of_several_is_chosen(tmp_path):
+def test_a_volume_of_several_is_chosen():
     """By stack and time; or by another dimension, such as the echo, where frames have one
     position.
     """
     both = np.concatenate([RAMP, RAMP[::-1] + 500])
     where = np.concatenate([places(), places()[::-1]])
-    path = saved(tmp_path / "t.dcm", enhanced(both, where, own=of_times(*[2] * 6, *[1] * 6)))
+    path = saved(enhanced(both, where, own=of_times(*[2] * 6, *[1] * 6)), "t.dcm")
     assert_placed(path, volume=1)
     assert_placed(path, RAMP + 500, volume=0)
     own = [group("FrameContent", DimensionIndexValues=[k % 6 + 1, 1 + k // 6]) for k in range(12)]
@@ -300,16 +303,16 @@ def test_a_volume_of_several_is_chosen(tmp_path):
     data.DimensionIndexSequence = [
         tagged(DimensionIndexPointer=tag) for tag in (0x00200032, 0x00189082)
     ]
-    assert_placed(saved(tmp_path / "e.dcm", data), RAMP + 500, volume=1)
+    assert_placed(saved(data, "e.dcm"), RAMP + 500, volume=1)
 
 
-def test_each_frame_has_its_own_scale(tmp_path):
+def test_each_frame_has_its_own_scale():
     scales = [(1, 0), (0.5, 3), (2, -1024), (1, 0), (1.25, 0), (3, 7)]
     own = [
         group("PixelValueTransformation", RescaleSlope=scales[k][0], RescaleIntercept=scales[k][1])
         for k in ORDER
     ]
-    path = saved(tmp_path / "a.dcm", enhanced(RAMP[ORDER], places()[ORDER], own=own))
+    path = saved(enhanced(RAMP[ORDER], places()[ORDER], own=own))
     assert_placed(
         path, np.array([a * plane + b for (a, b), plane in zip(scales, RAMP, strict=True)])
     )
@@ -319,13 +322,13 @@ def test_slices_have_their_own_scales(tmp_path):
     """As PET has; SimpleITK converts all to the first one's type, which may have no fractions."""
     for k, place in enumerate(places()):
         data = one_slice(RAMP[k], place, RescaleSlope=1 + k / 4, RescaleIntercept=-k)
-        saved(tmp_path / f"{k * 7 % 11}.dcm", data)
+        saved(data, f"{k * 7 % 11}.dcm")
     k = np.arange(6)[:, None, None]
     assert_placed(tmp_path, RAMP * (1 + k / 4) - k)
 
 
-def test_contradicting_distance_is_told(tmp_path):
-    path = saved(tmp_path / "a.dcm", enhanced(RAMP, places(), SpacingBetweenSlices=1))
+def test_contradicting_distance_is_told():
+    path = saved(enhanced(RAMP, places(), SpacingBetweenSlices=1))
     assert_placed(path, said="3 mm apart by their .*, which are used; SpacingBetweenSlices is 1 mm")
 
 
@@ -337,22 +340,22 @@ def stack(kind, **tags):
     return one_slice(RAMP, ORIGIN, kind, **tags)
 
 
-def test_dose_is_placed_by_its_offsets(tmp_path):
-    dose, path = "1.2.840.10008.5.1.4.1.1.481.2", tmp_path / "a.dcm"
+def test_dose_is_placed_by_its_offsets():
+    dose = "1.2.840.10008.5.1.4.1.1.481.2"
     offsets = STEP * np.arange(6)
     down = (-offsets).tolist()
     affine = affine_of()
     affine[:3, 3] -= 5 * affine[:3, 2]
     data = stack(dose, GridFrameOffsetVector=down, DoseGridScaling="0.25")
-    assert_placed(saved(path, data), 0.25 * RAMP[::-1], affine)
+    assert_placed(saved(data), 0.25 * RAMP[::-1], affine)
     data = stack(dose, ImageOrientationPatient=AXIAL)
     data.GridFrameOffsetVector = (30.0 + offsets).tolist()
-    assert load_image(saved(path, data)).to_world([0, 0, 5]) == pytest.approx([-10, 20, 45])
+    assert load_image(saved(data)).to_world([0, 0, 5]) == pytest.approx([-10, 20, 45])
     data.GridFrameOffsetVector = (5.0 + offsets).tolist()
-    assert_refused(saved(path, data), "GridFrameOffsetVector that is not of its position")
+    assert_refused(saved(data), "GridFrameOffsetVector that is not of its position")
 
 
-def test_distance_that_a_file_states_is_used(tmp_path):
+def test_distance_that_a_file_states_is_used():
     """With its sign, as nuclear medicine has it; and told."""
     nm = stack(
         "1.2.840.10008.5.1.4.1.1.20", SpacingBetweenSlices=-STEP, FrameIncrementPointer=0x00540080
@@ -364,7 +367,7 @@ def test_distance_that_a_file_states_is_used(tmp_path):
     affine = affine_of()
     affine[:3, 3] -= 5 * affine[:3, 2]
     said = "-3 mm apart along the slices' normal, as SpacingBetweenSlices states"
-    assert_placed(saved(tmp_path / "a.dcm", nm), RAMP[::-1], affine, said)
+    assert_placed(saved(nm), RAMP[::-1], affine, said)
 
 
 @pytest.mark.parametrize(
@@ -376,9 +379,9 @@ def test_distance_that_a_file_states_is_used(tmp_path):
         {"SpacingBetweenSlices": STEP, "ImagePositionPatient": None},
     ],
 )
-def test_frames_that_lie_nowhere(tmp_path, tags):
+def test_frames_that_lie_nowhere(tags):
     data = stack("1.2.840.10008.5.1.4.1.1.7.3", **tags)
-    assert_refused(saved(tmp_path / "a.dcm", data), "does not state where its 6")
+    assert_refused(saved(data), "does not state where its 6")
 
 
 # --------------------------------------------------------------------------------------------------
@@ -399,16 +402,16 @@ def test_one_slice_has_the_thickness_that_it_states(tmp_path, tags, mm, said):
 
 
 def test_a_picture_without_place(tmp_path):
-    path = saved(tmp_path / "a.dcm", file_of("1.2.840.10008.5.1.4.1.1.7", RAMP[0]))
+    path = saved(file_of("1.2.840.10008.5.1.4.1.1.7", RAMP[0]))
     affine = np.diag([-1.0, -1.0, 1.0, 1.0])
     for said in ("no size of pixels: 1 mm", "no position"):
         assert_placed(path, RAMP[:1], affine, said)
-    saved(tmp_path / "b.dcm", file_of("1.2.840.10008.5.1.4.1.1.7", RAMP[1]))
+    saved(file_of("1.2.840.10008.5.1.4.1.1.7", RAMP[1]), "b.dcm")
     assert_refused(tmp_path, r"DICOM file a\.dcm does not state where it lies")
 
 
 def test_a_localizer_of_another_size_is_named(tmp_path):
-    saved(slices_of(tmp_path) / "loc.dcm", one_slice(np.zeros((9, 8)), ORIGIN))
+    saved(one_slice(np.zeros((9, 8)), ORIGIN), slices_of(tmp_path) / "loc.dcm")
     words = r"the DICOM file loc\.dcm has 8 x 9 pixels, and 6 others of its series have 5 x 4"
     assert "damaged" not in assert_refused(tmp_path, words)
 
@@ -450,13 +453,13 @@ INDEX = without_voxels("1.2.840.10008.1.3.10", DirectoryRecordSequence=[])
     ],
     ids=lambda value: value[:12] if isinstance(value, str) else "",
 )
-def test_true_reasons(tmp_path, data, match):
-    said = assert_refused(saved(tmp_path / "a.dcm", data), match)
+def test_true_reasons(data, match):
+    said = assert_refused(saved(data), match)
     assert ("damaged" in said) == ("declares" in said)
 
 
-def test_numbers_that_are_none(tmp_path):
-    path = saved(tmp_path / "a.dcm", changed(ImagePositionPatient=["1.25", "2", "3"]))
+def test_numbers_that_are_none():
+    path = saved(changed(ImagePositionPatient=["1.25", "2", "3"]))
     whole = path.read_bytes()
     assert whole.count(b"1.25\\2\\3") == 1
     path.write_bytes(whole.replace(b"1.25\\2\\3", b"x.25\\2\\3"))
@@ -464,7 +467,7 @@ def test_numbers_that_are_none(tmp_path):
 
 
 def test_objects_beside_a_series_are_skipped(tmp_path):
-    saved(slices_of(tmp_path) / "rs.dcm", without_voxels(ROIContourSequence=[]))
+    saved(without_voxels(ROIContourSequence=[]), slices_of(tmp_path) / "rs.dcm")
     for name in ("DICOMDIR", "notes.txt"):
         (tmp_path / name).write_bytes(b"anything")
     assert_placed(tmp_path, said=r"skipped rs\.dcm, which is of the kind RT Structure Set Storage")
@@ -480,9 +483,9 @@ def test_a_file_without_first_part(tmp_path):
     assert_placed(tmp_path)
 
 
-def test_a_file_without_suffix(tmp_path):
-    assert_placed(saved(tmp_path / "IM000001", enhanced(RAMP, places())))
-    assert_refused(saved(tmp_path / "DICOMDIR", INDEX), "give the folder with one series")
+def test_a_file_without_suffix():
+    assert_placed(saved(enhanced(RAMP, places()), "IM000001"))
+    assert_refused(saved(INDEX, "DICOMDIR"), "give the folder with one series")
 
 
 @pytest.mark.parametrize(
@@ -498,33 +501,33 @@ def test_a_file_without_suffix(tmp_path):
         ),
     ],
 )
-def test_bits_beyond_those_stored_are_ignored(tmp_path, values, high, said):
-    data, path = one_slice(values[0], ORIGIN, SliceThickness=STEP), tmp_path / "a.dcm"
+def test_bits_beyond_those_stored_are_ignored(values, high, said):
+    data = one_slice(values[0], ORIGIN, SliceThickness=STEP)
     data.BitsStored, data.HighBit = 12, high
-    assert_placed(saved(path, data), np.array([[[-5, 7, -2048]]]), said=said)
+    assert_placed(saved(data), np.array([[[-5, 7, -2048]]]), said=said)
     data.HighBit = 9
-    assert_refused(saved(path, data), "BitsStored 12 and HighBit 9, which contradict each other")
+    assert_refused(saved(data), "BitsStored 12 and HighBit 9, which contradict each other")
 
 
-def test_compressed_voxels(tmp_path):
+def test_compressed_voxels():
     data = enhanced(RAMP[ORDER], places()[ORDER])
     data.file_meta = FileMetaDataset()
     data.file_meta.TransferSyntaxUID = EXPLICIT
     data.compress("1.2.840.10008.1.2.5", encoding_plugin="pydicom")  # RLE
-    path = saved(tmp_path / "a.dcm", data, "1.2.840.10008.1.2.5")
+    path = saved(data, syntax="1.2.840.10008.1.2.5")
     assert_placed(path)
     whole = path.read_bytes()
-    saved(path, data, "1.2.840.10008.1.2.4.100")
+    saved(data, syntax="1.2.840.10008.1.2.4.100")
     said = assert_refused(path, "compressed as MPEG2 .*cannot be decoded here; .*gdcmconv")
     assert "damaged" not in said
     path.write_bytes(whole[:-40])
     assert_refused(path, "truncated or damaged")
 
 
-def test_more_voxels_than_the_header_declares(tmp_path):
+def test_more_voxels_than_the_header_declares():
     data = one_slice(RAMP[0], ORIGIN, SliceThickness=STEP)
     data.PixelData = RAMP.tobytes()
-    path = saved(tmp_path / "a.dcm", data)
+    path = saved(data)
     assert_placed(path, RAMP[:1], said="more bytes of voxels than its header declares")
 
 
@@ -568,7 +571,7 @@ ABOUT = {
 )
 
 
-def segmentation(hd, path, voxels, kind="BINARY"):
+def segmentation(hd, voxels, kind="BINARY", path="a.dcm"):
     """A segmentation of an oblique CT of single slices, 3 mm apart, without its empty frames."""
     source = []
     for k, place in enumerate(places(len(voxels))):
@@ -588,7 +591,7 @@ def segmentation(hd, path, voxels, kind="BINARY"):
     hd.seg.Segmentation(
         source, voxels, kind, segments, "1.2.6", 1, "1.2.8", 1, "m", "m", "1", "1"
     ).save_as(path)
-    return path
+    return Path(path).absolute()
 
 
 def assert_segments(path, labels, said=None):
@@ -605,45 +608,45 @@ LABELS = (blobs() * NUMBERS).max(axis=-1)
 
 
 @pytest.mark.apart
-def test_segments_by_number(tmp_path, hd):
+def test_segments_by_number(hd):
     """Empty slices between frames stay empty; of overlapping segments, the larger number is
     kept, and told.
     """
-    path = segmentation(hd, tmp_path / "a.dcm", blobs())
+    path = segmentation(hd, blobs())
     assert len(pydicom.dcmread(path).PerFrameFunctionalGroupsSequence) == 5
     said = r"larger number is kept: 1 \(liver\) and 2 \(tumour\) in 10 voxels$"
     assert_segments(path, LABELS, said)
 
 
 @pytest.mark.parametrize("shape", [(5, 7), (3, 9), (6, 6), (181, 217)])
-def test_bits_of_frames_follow_each_other(tmp_path, hd, shape):
+def test_bits_of_frames_follow_each_other(hd, shape):
     """Frames that begin and end within a byte, in another order than they lie."""
     voxels = np.random.default_rng(0).integers(0, 2, (6, *shape, 3))
-    path = segmentation(hd, tmp_path / "a.dcm", voxels.astype(bool))
+    path = segmentation(hd, voxels.astype(bool))
     assert_placed(path, (voxels * NUMBERS).max(axis=-1), said="segments overlap")
     data = pydicom.dcmread(path)
     data.PixelData = data.PixelData[: -(-18 * shape[0] * shape[1] // 8) - 2]
-    assert_refused(saved(path, data), "truncated or damaged")
+    assert_refused(saved(data), "truncated or damaged")
 
 
-def test_label_map_of_segments(tmp_path, hd):
+def test_label_map_of_segments(hd):
     """Padding is background; values without a segment are told."""
-    path = segmentation(hd, tmp_path / "a.dcm", LABELS.astype(np.uint8), "LABELMAP")
+    path = segmentation(hd, LABELS.astype(np.uint8), "LABELMAP")
     assert_segments(path, LABELS)
     data = pydicom.dcmread(path)
     data.PixelData = data.PixelData.replace(b"\0", b"\xff")
     data.PixelPaddingValue = 255
-    assert_segments(saved(path, data), LABELS)
+    assert_segments(saved(data), LABELS)
     del data.PixelPaddingValue
     said = r"voxels have values of no segment \(\[255\]\) and get label 0"
-    assert_segments(saved(path, data), LABELS, said)
+    assert_segments(saved(data), LABELS, said)
 
 
-def test_fractions_of_segments(tmp_path, hd):
+def test_fractions_of_segments(hd):
     """A voxel belongs to the largest fraction of a half or more."""
     voxels = blobs()
     fractions = voxels * [0.8, 0.6, 0.49] + voxels[..., ::-1] * 0.01
-    path = segmentation(hd, tmp_path / "a.dcm", fractions, "FRACTIONAL")
+    path = segmentation(hd, fractions, "FRACTIONAL")
     said = r"larger fraction, or number is kept: 1 \(liver\) and 2 .* in 10 voxels"
     assert_segments(path, np.where(voxels[..., 0], 1, 2 * voxels[..., 1]), said)
 
@@ -666,14 +669,14 @@ def test_public_segmentations(data_dir, hd, name, counts, slices):
     assert_allclose(found, world, rtol=0, atol=1e-4)
 
 
-def edited(hd, path, edit):
-    data = pydicom.dcmread(segmentation(hd, path, blobs()))
+def edited(hd, edit):
+    data = pydicom.dcmread(segmentation(hd, blobs()))
     edit(
         data,
         [group.PlanePositionSequence[0] for group in data.PerFrameFunctionalGroupsSequence],
         data.SharedFunctionalGroupsSequence[0].PixelMeasuresSequence[0],
     )
-    return saved(path, data)
+    return saved(data)
 
 
 def uneven(data, where, measures):
@@ -701,8 +704,8 @@ def doubled(data, where, measures):
         (doubled, 'two segments 1, "liver" and "tumour"'),
     ],
 )
-def test_segments_that_are_no_volume(tmp_path, hd, edit, match):
-    path = edited(hd, tmp_path / "a.dcm", edit)
+def test_segments_that_are_no_volume(hd, edit, match):
+    path = edited(hd, edit)
     assert_refused(path, match)
     if edit is doubled:
         assert_refused(path, "two segments 1", load_label_table)
@@ -730,8 +733,8 @@ def far(data, where, measures):
         (far, 47, "frames lie in 4 slices, far apart: 43 slices between them are empty"),
     ],
 )
-def test_distances_of_segments_that_are_told(tmp_path, hd, edit, slices, said):
-    image, heard = read_warned(edited(hd, tmp_path / "a.dcm", edit))
+def test_distances_of_segments_that_are_told(hd, edit, slices, said):
+    image, heard = read_warned(edited(hd, edit))
     assert image.shape == (7, 8, slices)
     assert said in "\n".join(heard)
 
@@ -740,12 +743,12 @@ def test_names_and_colours_of_segments(tmp_path, hd):
     """As `--label-names` reads them; from the folder, too. Names that two segments share get
     numbers.
     """
-    path = segmentation(hd, tmp_path / "a.dcm", blobs())
+    path = segmentation(hd, blobs())
     for source in (path, tmp_path):
         table = load_label_table(source)
         assert table.names == {1: "liver", 2: "tumour 2", 3: "tumour 3"}
         assert_allclose(list(table.colours.values()), np.array(COLOURS) / 255, rtol=0, atol=0.004)
-    path = saved(tmp_path / "b.dcm", enhanced(RAMP, places()))
+    path = saved(enhanced(RAMP, places()), "b.dcm")
     assert_refused(path, "expected names of segments in this file, found none", load_label_table)
 
 
@@ -763,8 +766,8 @@ def test_mesh_of_a_scan_and_its_segmentation(here, hd, capsys):
     order = np.random.default_rng(0).permutation(16)
     data = enhanced(1000 * (far < 6)[order], places(16)[order])
     data.FrameOfReferenceUID = "1.2.5"
-    scan = saved(here / "ct.dcm", data)
-    labels = segmentation(hd, here / "seg.dcm", voxels)
+    scan = saved(data, "ct.dcm")
+    labels = segmentation(hd, voxels, path="seg.dcm")
     words = ["--labels", labels, "-o", here / "a.vtu", "--nodes"]
     assert_done("mesh", scan, *words, 900)
     loaded = tetopt.load_mesh("a.vtu")
@@ -778,7 +781,7 @@ def test_mesh_of_a_scan_and_its_segmentation(here, hd, capsys):
     at = np.average(points[is_in].mean(axis=1), axis=0, weights=volume[is_in])
     assert_allclose(at, centre * [-1, -1, 1], rtol=0, atol=0.2)
     data.FrameOfReferenceUID = "1.2.99"
-    other = saved(here / "other.dcm", data)
+    other = saved(data, "other.dcm")
     assert exit_code("mesh", other, *words, 50, "--iterations 0 --force") in (0, 1)
     said = capsys.readouterr().err.replace("\n  ", " ")
     assert "seg.dcm: its positions are in another frame of reference" in said

@@ -9,7 +9,7 @@ from pathlib import Path
 import nibabel
 import numpy as np
 import pytest
-from commands import exit_code
+from commands import assert_done, exit_code
 from numpy.testing import assert_allclose
 from results import CASES, FOLDER, input_file, solved_model
 
@@ -46,40 +46,13 @@ def test_from_image_to_solver_and_back(here, units):
     """
     image = tetopt.load_phantom("two_spheres").image(voxel_mm=4.0)
     tetopt.save_image("a.nii.gz", image)
-    mapping = ["--young", "0.5+h/7", "--nu", "0.3"]
-    mesh = [
-        "mesh",
-        here / "a.nii.gz",
-        "-o",
-        here / "a.vtu",
-        "--spacing",
-        "12",
-        "--iterations",
-        "0",
-    ]
-    assert exit_code(*mesh) == 0
-    inp = [
-        "convert",
-        here / "a.vtu",
-        here / "a.inp",
-        "--image",
-        here / "a.nii.gz",
-        *mapping,
-    ]
-    assert exit_code(*inp, "--load", "compress:3%", "--units", units, "--space", "lps") == 0
+    mapping = "--young 0.5+h/7 --nu 0.3"
+    loads = "--load compress:3% --space lps --units"
+    assert_done("mesh a.nii.gz -o a.vtu --spacing 12 --iterations 0")
+    assert_done("convert a.vtu a.inp --image a.nii.gz", mapping, loads, units)
     run(here, "a")
-    assert exit_code("convert", "a.vtu", "b.vtu", "--results", "a.frd") == 0
-    fem = [
-        "fem",
-        here / "a.nii.gz",
-        here / "a.vtu",
-        *mapping,
-        "--compress",
-        "3",
-        "-o",
-        here / "c.vtu",
-    ]
-    assert exit_code(*fem) == 0
+    assert_done("convert a.vtu b.vtu --results a.frd")
+    assert_done("fem a.nii.gz a.vtu", mapping, "--compress 3 -o c.vtu")
     theirs, ours = (
         tetopt.load_mesh(name).point_data["displacement"] for name in ("b.vtu", "c.vtu")
     )
