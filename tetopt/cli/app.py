@@ -157,7 +157,8 @@ def _run(arguments: list[str], outputs: Outputs) -> int:
         return tell_end() if code in (INTERRUPTED_CODE, signal_code()) else code
     except (InputError, OSError, MemoryError) as error:
         show_error(error_words(error), arguments)
-        _say_written(outputs)
+        if outputs.written:
+            say(f"written before the error: {', '.join(map(str, outputs.written))}")
         return 2
     except typer.Exit as ended:
         return ended.exit_code
@@ -173,12 +174,6 @@ def _run(arguments: list[str], outputs: Outputs) -> int:
         if error.format_message():  # empty after the help that a bare `tetopt` prints
             show_error(f"{error.format_message()} (see --help)")
         return 2
-
-
-def _say_written(outputs: Outputs) -> None:
-    """Print the outputs that exist although the command ended early."""
-    if outputs.written:
-        say(f"written before the error: {', '.join(map(str, outputs.written))}")
 
 
 def _app(arguments: Sequence[str]) -> typer.Typer:

@@ -187,13 +187,11 @@ def _annotation_of(name: str, kind: Any, default: Any, panel: str | None) -> Any
     # `of_option` has plainer words than typer for what is none
     value = get_args(kind)[0]
     if value in (int, float, int | None, float | None):
-        about |= {"parser": str, "callback": _converter(name, kind)}
+        about |= {
+            "parser": str,
+            "callback": lambda text: of_option(name, kind, value_of_text(value, text)),
+        }
     return Annotated[value, typer.Option(*names, **about, min=own.least, rich_help_panel=panel)]
-
-
-def _converter(name: str, kind: Any) -> Callable[[Any], Any]:
-    """Return a function that converts a number's string, or raises InputError for what is none."""
-    return lambda text: of_option(name, kind, value_of_text(get_args(kind)[0], text))
 
 
 def _of_values(kind: Any, name: str, values: Json) -> Any:

@@ -4,7 +4,7 @@ of its run.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple, cast
@@ -32,7 +32,7 @@ from tetopt.job.mesh_file import label_table, read_mesh, warn_of_other_image
 from tetopt.job.options import WHOLE_IMAGE, ImagePart, MaskedPart, SourceOptions
 from tetopt.job.request import checksum
 from tetopt.job.source import Source, read_source
-from tetopt.measure.fidelity import ImageFit, LabelFidelity, image_fit
+from tetopt.measure.fidelity import ImageFit, image_fit
 from tetopt.measure.judge import Requirements, measure
 from tetopt.measure.judge import judge as judge_rows
 from tetopt.measure.measures import fidelity
@@ -254,23 +254,15 @@ def _source(
             }
         )
     names = None if part.mask_label is None else names
+    kept = inputs.get("kept_labels")
+    kept = [each for each in kept if isinstance(each, int)] if isinstance(kept, list) else []
     numbers = None if labels is None else _merged_numbers(inputs, labels, part)
     return read_source(
         options,
         names,
         numbers=numbers,
         loaded=loaded,
-        kept=None if labels is None else _kept_labels(inputs),
-    )
-
-
-def _kept_labels(inputs: Mapping[str, Any]) -> list[int] | None:
-    """Return the labels that the mesh's run kept, if it left out others."""
-    kept = inputs.get("kept_labels")
-    return (
-        [each for each in kept if isinstance(each, int)]
-        if isinstance(kept, list) and kept
-        else None
+        kept=None if labels is None else kept or None,
     )
 
 
@@ -302,7 +294,9 @@ def _measure_fit(judgement: Judgement, names: Names) -> Judgement:
     of_cell = loaded.cell_data.get(LABEL_FIELD)
     fit = image_fit(source.contrasts[0], mesh)
     measured = fidelity(source.labels, source.mask, mesh, of_cell, what=source.content)
-    measured |= _names(measured.get("labels", []), names)
+    labels = [row.label for row in measured.get("labels", [])]
+    if own_names := {label: names[label] for label in labels if label in names}:
+        measured["label_names"] = own_names
     counted = content_E_D(source.content, mesh)
     if counted[1] == 0:
         raise InputError(
@@ -349,9 +343,3 @@ def _mesh_problems(judgement: Judgement) -> tuple[list[str], list[str]]:
         touching = manifold_problems(mesh, labels)
     is_smooth = judgement.loaded.table("inputs").get("smooth_interfaces")
     return (touching, []) if is_smooth else ([], touching)
-
-
-def _names(rows: Sequence[LabelFidelity], names: Names) -> dict[str, dict[int, str]]:
-    """Return the names of the labels that have one, as "label_names"; empty if none has."""
-    of_rows = {row.label: names[row.label] for row in rows if row.label in names}
-    return {"label_names": of_rows} if of_rows else {}

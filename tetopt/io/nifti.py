@@ -149,10 +149,6 @@ def _files_of(path: Path) -> tuple[Path, Path]:
     return files[0], files[-1]
 
 
-def _open_nifti(path: Path) -> Any:
-    return gzip.open(path) if path.name.lower().endswith(PACKED_SUFFIXES) else path.open("rb")
-
-
 @contextlib.contextmanager
 def _note_nibabel() -> Iterator[None]:
     """Note nibabel's log messages of this thread, which are then not printed."""
@@ -177,7 +173,8 @@ def _note_nibabel() -> Iterator[None]:
 def _header_of(path: Path) -> tuple[Any, bytes]:
     """Return nibabel's header, checked and repaired, and the first bytes of the file."""
     try:
-        with _open_nifti(path) as stream:
+        is_packed = path.name.lower().endswith(PACKED_SUFFIXES)
+        with gzip.open(path) if is_packed else path.open("rb") as stream:
             head = stream.read(NIFTI_HEAD_BYTES)
     except FILE_ERRORS as error:
         raise _of_gzip(error) from error

@@ -50,7 +50,8 @@ def read_itk(path: Path, request: Request) -> Voxels:
     if header.ratio == 1 and header.skip.isdecimal():  # neither packed nor text
         rest = size - header.n_bytes - int(header.skip) - header.value_bytes
         note_rest(rest, header.sizes, header.value_bytes // max(math.prod(header.sizes), 1))
-    lengths = (_nrrd_units if is_nrrd else _metaimage_units)(header.fields)
+    units = [header.fields.get("DistanceUnits", "").strip("?")] * 3
+    lengths = _nrrd_units(header.fields) if is_nrrd else mm_of_axes(units, "DistanceUnits")
     segments = segments_of(header.texts)
     data, affine = read_apart(
         _volume_of,
@@ -95,10 +96,6 @@ def _nrrd_units(fields: dict[str, str]) -> Floats | None:
             f"{name}: expected a unit in quotation marks per axis, got {fields[key][:80]}"
         )
     return mm_of_axes(words[:3], name)
-
-
-def _metaimage_units(fields: dict[str, str]) -> Floats | None:
-    return mm_of_axes([fields.get("DistanceUnits", "").strip("?")] * 3, "DistanceUnits")
 
 
 # In the child

@@ -250,7 +250,10 @@ def _of_kind(name: str, kind: Any, value: Any) -> Any:
     if own is str and (
         isinstance(value, str) or (is_number and name in (*MAPPED_OPTIONS, "background", "bins"))
     ):
-        return value if isinstance(value, str) else _number_text(value)
+        if isinstance(value, str):
+            return value
+        # so that it is read back to its last bit
+        return str(int(value)) if isinstance(value, Integral) else repr(float(value))
     if own is Path and name == "tissues" and isinstance(value, list | tuple) and value:
         return Path(",".join(str(_of_kind(name, own, each)) for each in value))
     if own is str and name == "weights" and isinstance(value, list | tuple):
@@ -263,11 +266,6 @@ def _of_kind(name: str, kind: Any, value: Any) -> Any:
         return value
     expected = " or ".join(map(str, choices)) if choices else KIND_WORDS[own]
     raise InputError(f"`{name}`: expected {expected}, got {_value_text(value)}")
-
-
-def _number_text(value: Any) -> str:
-    """Format a number so that it is read back to its last bit."""
-    return str(int(value)) if isinstance(value, Integral) else repr(float(value))
 
 
 def _value_text(value: Any) -> str:
