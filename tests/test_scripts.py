@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import platform
 from pathlib import Path
 
 import nibabel
@@ -12,6 +13,7 @@ import trimesh
 
 import tetopt
 from tetopt.geometry.topology import components
+from tetopt.report.summary import versions
 
 pytestmark = pytest.mark.deep
 
@@ -111,6 +113,20 @@ def test_fingerprints(tmp_path, monkeypatch, capsys):
     assert "differs: small: mesh\n" in capsys.readouterr().out
     assert main(["-o", str(second), "--only", "small"]) == 2
     assert "exists" in capsys.readouterr().err
+
+
+def test_a_plain_mesh_is_still_the_same(tmp_path):
+    """To the last bit that of the version that wrote the file, where processor and libraries are
+    those of the file.
+    """
+    stated = ROOT / "tests" / "fingerprints.json"
+    earlier = json.loads(stated.read_text())
+    kind = platform.platform().partition(platform.machine())[1:]
+    now = versions() | {"tetopt": earlier["versions"]["tetopt"]}
+    if not earlier["machine"].endswith("".join(kind)) or now != earlier["versions"]:
+        pytest.skip("fingerprints of another machine, or of other libraries")
+    words = ["-o", str(tmp_path / "now.json"), "--against", str(stated), "--only", "oblique"]
+    assert script("fingerprints").main(words) == 0
 
 
 def test_choose_sizes(tmp_path, monkeypatch, capsys):

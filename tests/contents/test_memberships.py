@@ -1,13 +1,16 @@
 import naive
-import numba
 import numpy as np
 import pytest
+from meshes import box_corners
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
 from scipy.ndimage import label as components
 from shapes import OBLIQUE, distance, grid
+from threads import assert_same_bits
 
 import tetopt
+from tetopt import Image
+from tetopt.contents.align import divide_voxels
 from tetopt.contents.memberships import (
     finer,
     finer_affine,
@@ -25,18 +28,14 @@ def between(members, first, second):
     return members.levels[members.channel[rows[0]]] - members.levels[members.channel[rows[1]]]
 
 
-def crossings(level, start, way, steps):
+def steps_to(level, start, way):
     """On each line start + step * way the step at which the level turns positive."""
-    at = (start[:, None] + steps[:, None] * way[:, None]).reshape(-1, start.shape[1]).T
+    steps = np.linspace(-0.95, 0.95, 191)
+    at = (start[:, None] + steps[:, None] * way[:, None]).reshape(-1, 3).T
     values = map_coordinates(level, at, order=1).reshape(len(start), -1)
     assert (values[:, 0] < 0.0).all()
     assert (values[:, -1] > 0.0).all()
     return steps[np.argmax(values > 0.0, axis=1)]
-
-
-def directions(n=3000):
-    way = np.random.default_rng(0).normal(size=(n, 3))
-    return way / np.linalg.norm(way, axis=1)[:, None]
 
 
 def bumpy(points):
@@ -54,7 +53,7 @@ def voxelised(spacing, shape):
     """The labels of `bumpy` on voxels of these edges, mm."""
     affine = np.diag([*spacing, 1.0])
     affine[:3, 3] = 0.37 - 0.5 * (np.array(shape) - 1.0) * spacing
-    return tetopt.Image(bumpy(grid(shape) * spacing + affine[:3, 3])[0], affine)
+    return Image(bumpy(grid(shape) * spacing + affine[:3, 3])[0], affine)
 
 
 def dice(first, second):
@@ -65,7 +64,7 @@ def test_every_voxel_keeps_its_label():
     rng = np.random.default_rng(0)
     for shape in [(9, 10, 11), (17, 16)]:
         labels = rng.choice([0, 3, 4, 90], size=shape)
-        members = memberships(tetopt.Image(labels))
+        members = memberships(Image(labels))
         assert_array_equal(members.labels, [0, 3, 4, 90])
         assert_array_equal(members.labels[members.partition], labels)
         assert_array_equal(members.levels.argmin(axis=0), members.channel[members.partition])
@@ -74,10 +73,10 @@ def test_every_voxel_keeps_its_label():
 @pytest.mark.parametrize("n_labels", [180, 181])
 def test_numbers_of_labels_leave_room_for_those_of_pairs(n_labels):
     labels = np.arange(200).reshape(10, 20) % n_labels * 3
-    values, rows = number_labels(tetopt.Image(labels))
+    values, rows = number_labels(Image(labels))
     assert_array_equal(values[rows], labels)
-    pairs = (n_labels + 1) * rows + n_labels
-    assert_array_equal(pairs, (n_labels + 1) * rows.astype(np.int64) + n_labels)
+    of_pairs = [(n_labels + 1) * each + n_labels for each in (rows, rows.astype(np.int64))]
+    assert_array_equal(*of_pairs)
 
 
 @pytest.mark.parametrize("shape", [(19, 5, 4), (22, 9)])
@@ -85,7 +84,7 @@ def test_a_level_as_by_its_plain_twin(shape):
     at = grid(shape)
     inside = at[..., 0] < 9.3 + 0.2 * at[..., 1]
     inside[14, 2], inside[3, 1] = True, False
-    members = memberships(tetopt.Image(1.0 * inside))
+    members = memberships(Image(1.0 * inside))
     assert_allclose(members.levels[members.channel[1]], naive.smooth_level(inside), atol=2e-5)
 
 
@@ -110,44 +109,39 @@ def test_an_interface_of_two_labels_is_that_of_each():
     centre, normal = np.array([19.6, 20.2, 19.8]), np.array([0.31, 0.42, 0.85])
     normal /= np.linalg.norm(normal)
     at = grid((40, 40, 40)) - centre
-    labels = np.where(
-        np.linalg.norm(at, axis=-1) < 15.0, np.where(at @ normal < 0.0, 1.0, 2.0), 0.0
-    )
-    members = memberships(tetopt.Image(labels))
+    in_ball = np.linalg.norm(at, axis=-1) < 15.0
+    members = memberships(Image(np.where(in_ball, np.where(at @ normal < 0, 1, 2), 0)))
     side = np.linalg.svd(normal[None])[2][1:]
     start = centre + np.random.default_rng(0).uniform(-8.0, 8.0, size=(2000, 2)) @ side
-    off = crossings(
-        between(members, 1, 2), start, np.tile(normal, (2000, 1)), np.linspace(-0.95, 0.95, 191)
-    )
+    off = steps_to(between(members, 1, 2), start, np.tile(normal, (2000, 1)))
     assert np.abs(off).mean() < 0.08
     assert np.abs(off).max() < 0.3
-    others = map_coordinates(
-        members.levels[members.channel[0]], (start + off[:, None] * normal).T, order=1
-    )
+    there = (start + off[:, None] * normal).T
+    others = map_coordinates(members.levels[members.channel[0]], there, order=1)
     assert others.min() > 1.0  # the background does not come between them
-    way = directions()
-    way = way[np.abs(way @ normal) > 0.3]
-    for label, part in ((1, way[way @ normal < 0.0]), (2, way[way @ normal > 0.0])):
-        off = crossings(
-            between(members, label, 0), centre + 15.0 * part, part, np.linspace(-0.95, 0.95, 191)
-        )
+    way = np.random.default_rng(0).normal(size=(3000, 3))
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    for label, is_part in ((1, way @ normal < -0.3), (2, way @ normal > 0.3)):
+        level = between(members, label, 0)
+        off = steps_to(level, centre + 15.0 * way[is_part], way[is_part])
         assert np.abs(off).mean() < 0.08
 
 
-def test_supersampling():
-    assert supersampling(np.array([0.9, 0.9, 5.0])) == (1, 1, 5)
-    assert supersampling(np.array([6.5, 1.0, 1.0])) == (7, 1, 1)
-    assert supersampling(np.array([1.0, 1.4])) == (1, 1)
+@pytest.mark.parametrize(
+    ("spacing", "factors"),
+    [((0.9, 0.9, 5.0), (1, 1, 5)), ((6.5, 1.0, 1.0), (7, 1, 1)), ((1.0, 1.4), (1, 1))],
+)
+def test_supersampling(spacing, factors):
+    assert supersampling(np.array(spacing)) == factors
 
 
 @pytest.mark.parametrize("factors", [(1, 1, 1), (1, 1, 5), (2, 1, 3)])
 def test_finer_voxels_fill_the_same_box(factors):
-    image = tetopt.Image(grid((4, 5, 6)) @ [1.0, -2.0, 3.0], OBLIQUE)
+    image = Image(grid((4, 5, 6)) @ [1.0, -2.0, 3.0], OBLIQUE)
     fine = finer(image, factors)
     assert fine.shape == tuple(np.multiply(image.shape, factors))
-    corners = np.array([[-0.5] * 3, np.array(image.shape) - 0.5])
-    fine_corners = np.array([[-0.5] * 3, np.array(fine.shape) - 0.5])
-    assert_allclose(fine.to_world(fine_corners), image.to_world(corners), atol=1e-9)
+    corners, there = (each.to_world(box_corners(each.shape)) for each in (image, fine))
+    assert_allclose(there, corners, atol=1e-9)
     at = np.clip(image.to_index(fine.to_world(grid(fine.shape))), 0.0, np.array(image.shape) - 1.0)
     assert_allclose(fine.data, at @ [1.0, -2.0, 3.0], atol=1e-5)
 
@@ -165,18 +159,20 @@ def test_thick_slices_do_not_show(spacing, shape):
     assert_array_equal(labels[planes], image.data)  # each slice keeps what it has
     affine = finer_affine(image.affine, factors)
     true, inner = bumpy(grid(labels.shape) * np.diag(affine)[:3] + affine[:3, 3])
-    nearest = image.data
-    for axis, factor in enumerate(factors):
-        nearest = np.repeat(nearest, factor, axis)
+    nearest = divide_voxels(image, factors).data
     for value in (3, 8):
-        assert dice(labels == value, true == value) > 0.97
-        assert 1.0 - dice(labels == value, true == value) < 0.35 * (
-            1.0 - dice(nearest == value, true == value)
-        )
-        assert (labels == value).sum() == pytest.approx((nearest == value).sum(), rel=0.02)
-        assert components(labels == value)[1] == 1
+        own, expected, steps = (each == value for each in (labels, true, nearest))
+        assert 1.0 - dice(own, expected) < min(0.03, 0.35 * (1.0 - dice(steps, expected)))
+        assert own.sum() == pytest.approx(steps.sum(), rel=0.02)
+        assert components(own)[1] == 1
     beside = (np.abs(between(members, 8, 3)) < 0.5) & (members.levels[members.channel[1]] < 1.0)
     assert np.abs(inner[beside]).mean() < 0.4
+
+
+def thick_memberships(labels, spacing=5):
+    """Of slices several times as thick as voxels are wide."""
+    affine = np.diag([1.0, 1.0, spacing, 1.0])
+    return memberships(Image(labels, affine), (1, 1, spacing)).partition
 
 
 def test_a_piece_that_ends_between_slices_is_rounded():
@@ -185,9 +181,7 @@ def test_a_piece_that_ends_between_slices_is_rounded():
     """
     labels = np.zeros((30, 30, 5))
     labels[..., 2] = distance((30, 30), 14.6, 14.2) < 10.0
-    members = memberships(tetopt.Image(labels, np.diag([1.0, 1.0, 5.0, 1.0])), (1, 1, 5))
-    area = (members.partition == 1).sum(axis=(0, 1))
-    disc = labels.sum()
+    area, disc = (thick_memberships(labels) == 1).sum(axis=(0, 1)), labels.sum()
     assert area[12] == disc
     assert np.flatnonzero(area).tolist() == [10, 11, 12, 13, 14]
     assert 0.6 * disc < area[10] < 0.9 * disc
@@ -198,13 +192,9 @@ def test_a_piece_that_ends_between_slices_is_rounded():
 
 def test_labels_get_no_pieces_between_slices():
     """What two slices have in common stays between them, and nothing is there that no slice has."""
-    rng = np.random.default_rng(2)
-    labels = np.stack(
-        [gaussian_filter(rng.normal(size=(40, 40, 9)), (2.0, 2.0, 0.4)) for _ in range(6)]
-    ).argmax(axis=0)
-    partition = memberships(
-        tetopt.Image(labels, np.diag([1.0, 1.0, 5.0, 1.0])), (1, 1, 5)
-    ).partition
+    fields = np.random.default_rng(2).normal(size=(6, 40, 40, 9))
+    labels = gaussian_filter(fields, (0.0, 2.0, 2.0, 0.4)).argmax(axis=0)
+    partition = thick_memberships(labels)
     for k in range(8):
         same = labels[..., k] == labels[..., k + 1]
         for fine in range(5 * k + 2, 5 * k + 8):
@@ -216,19 +206,12 @@ def test_labels_get_no_pieces_between_slices():
 
 def test_the_same_on_any_number_of_threads():
     image = voxelised((1.5, 1.5, 4.5), (44, 44, 16))
-    before = numba.get_num_threads()
-    results = []
-    for threads in (1, min(2, numba.config.NUMBA_NUM_THREADS)):
-        numba.set_num_threads(threads)
-        results.append(memberships(image, (1, 1, 3)))
-    numba.set_num_threads(before)
-    for one, other in zip(*results, strict=True):
-        assert_array_equal(one, other)
+    assert_same_bits(lambda: memberships(image, (1, 1, 3)))
 
 
 def test_labels_must_be_whole_numbers():
     with pytest.raises(tetopt.InputError, match="labels must be whole numbers from 0"):
-        memberships(tetopt.Image(np.array([[0.0, 1.5], [2.0, 3.0]])))
+        memberships(Image(np.array([[0.0, 1.5], [2.0, 3.0]])))
 
 
 def test_a_rod_of_one_voxel_between_two_labels_keeps_its_volume():
@@ -239,13 +222,11 @@ def test_a_rod_of_one_voxel_between_two_labels_keeps_its_volume():
     labels = np.where(i + j < 23, 1, 2)
     # diagonal, where the two others meet
     labels[(i + j >= 22) & (i + j <= 23) & (abs(i - j - k + 12) <= 2)] = 3
-    members = memberships(tetopt.Image(labels.astype(float), np.eye(4)))
-    place = np.stack(
-        np.meshgrid(*3 * [np.arange(-0.375, 23.5, 0.25)], indexing="ij"), axis=-1
-    ).reshape(-1, 3)
+    members = memberships(Image(labels.astype(float)))
+    assert (members.labels[members.partition] == labels).all()
+    place = 0.25 * grid((96, 96, 96)).reshape(-1, 3) - 0.375
     cells = np.repeat(np.arange(len(place))[:, None], 4, axis=1)
     row = labels_at(members, place, cells, np.eye(1, 4))
-    assert (members.labels[members.partition] == labels).all()
-    for number, tolerance in ((1, 0.01), (2, 0.01), (3, 0.05)):
-        fraction = (row == number - 1).sum() / 64.0 / (labels == number).sum()
-        assert fraction == pytest.approx(1.0, abs=tolerance), number
+    fractions = np.bincount(row.ravel()) / 64.0 / np.bincount(labels.ravel())[1:]
+    assert_allclose(fractions[:2], 1.0, atol=0.01)
+    assert fractions[2] == pytest.approx(1.0, abs=0.05)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.ndimage import gaussian_filter
 
 from tetopt.contents.smoothing import FARTHEST_LEVEL, raw_level, smooth_level
@@ -21,16 +22,16 @@ def test_turned_and_mirrored_voxels_have_the_same_level_turned(shape):
     """Without a preferred axis or direction."""
     inside = blob(shape)
     level, axes = level_of(inside), tuple(range(len(shape)))[::-1]
-    np.testing.assert_allclose(level_of(inside.transpose(axes)), level.transpose(axes), atol=2e-5)
+    assert_allclose(level_of(inside.transpose(axes)), level.transpose(axes), atol=2e-5)
     for axis in axes:
-        np.testing.assert_allclose(level_of(np.flip(inside, axis)), np.flip(level, axis), atol=2e-5)
+        assert_allclose(level_of(np.flip(inside, axis)), np.flip(level, axis), atol=2e-5)
 
 
 @pytest.mark.parametrize("shape", [(26, 22), (20, 18, 22)])
 def test_what_is_not_the_label_has_the_opposite_level(shape):
     inside = blob(shape, 1)
     level = level_of(inside)
-    np.testing.assert_allclose(level_of(~inside), -level, atol=2e-4)
+    assert_allclose(level_of(~inside), -level, atol=2e-4)
     assert ((level < 0.0) == inside).all()
     assert np.abs(level).max() <= FARTHEST_LEVEL
 
@@ -39,7 +40,7 @@ def test_a_level_in_the_plane_is_that_of_a_column():
     """One code in 2-D and 3-D: far from the ends of a shape that does not change along an axis."""
     inside = blob((26, 22), 2)
     column = level_of(np.repeat(inside[None], 24, axis=0))
-    np.testing.assert_allclose(column[12], level_of(inside), atol=1e-3)
+    assert_allclose(column[12], level_of(inside), atol=1e-3)
 
 
 @pytest.mark.parametrize("normal", [(0.98, 0.2, 0.0), (0.9, 0.4, 0.17), (0.7, 0.6, 0.3)])

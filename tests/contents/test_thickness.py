@@ -5,6 +5,7 @@ shapes.
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
+from shapes import distance
 
 from tetopt.contents import thickness as thickness_module
 from tetopt.contents.memberships import finer, memberships, supersampling
@@ -19,13 +20,9 @@ def thickness_of(data, spacing=(1.0, 1.0, 1.0), inside=None):
     return local_thickness(memberships(image), image.spacing, MOST, inside)
 
 
-def radius(n, centre=0.13):
-    return np.linalg.norm(np.indices((n, n, n)) - 0.5 * (n - 1) + centre, axis=0)
-
-
 @pytest.mark.parametrize("size", [1.5, 2.0, 3.0, 5.0])
 def test_a_shell_is_as_thick_as_it_is(size):
-    r = radius(44)
+    r = distance((44,) * 3, *[21.37] * 3)
     shell = (r >= 14.0) & (r < 14.0 + size)
     thickness = thickness_of(np.where(shell, 2, r < 14.0))
     assert np.median(thickness[shell]) == pytest.approx(size, rel=0.04)
@@ -33,41 +30,42 @@ def test_a_shell_is_as_thick_as_it_is(size):
     assert np.median(thickness[r < 14.0]) == MOST  # what lies within is thicker than is looked at
 
 
-def test_a_slab_of_a_sloping_side_and_long_voxels():
-    x, y, _ = np.indices((30, 20, 12))
-    is_in = (y >= 8) & (y < 11)
-    assert np.median(thickness_of(is_in, (1.0, 2.0, 1.0))[is_in]) == pytest.approx(6.0, abs=0.1)
-    is_in = (x + y >= 20) & (x + y < 24)  # 4 / sqrt 2 thick
-    assert np.median(thickness_of(is_in)[is_in]) == pytest.approx(8.0**0.5, rel=0.06)
+@pytest.mark.parametrize(
+    ("shape", "normal", "start", "spacing", "expected"),
+    [
+        ((30, 20, 12), (0, 1, 0), 8, (1.0, 2.0, 1.0), pytest.approx(8.0, abs=0.1)),
+        ((30, 20, 12), (1, 1, 0), 20, (1.0, 1.0, 1.0), pytest.approx(8.0**0.5, rel=0.06)),
+        ((30, 30), (0, 1), 10, (1.0, 1.0), pytest.approx(4.0, abs=0.05)),
+    ],
+)
+def test_a_slab_of_four_voxels(shape, normal, start, spacing, expected):
+    """Of long voxels, with a sloping side, and in the plane."""
+    along = np.tensordot(normal, np.indices(shape), 1)
+    is_in = (along >= start) & (along < start + 4)
+    assert np.median(thickness_of(is_in, spacing)[is_in]) == expected
 
 
 def test_near_the_surface_of_a_ball_it_is_as_thick_as_in_the_middle():
-    r = radius(24)
+    r = distance((24,) * 3, *[11.37] * 3)
     thickness = thickness_of(r < 4.0)
-    near = (r > 2.5) & (r < 3.5)
-    assert np.percentile(thickness[near], 10) > 7.0
+    assert np.percentile(thickness[(r > 2.5) & (r < 3.5)], 10) > 7.0
     assert thickness[r < 4.0].max() == pytest.approx(8.0, rel=0.06)
 
 
-def test_a_way_that_leaves_the_grid_or_the_region_has_no_angle():
+@pytest.mark.parametrize(
+    ("step", "expected"),
+    [((0, -1, 0), 1.0), ((0, 0, 1), 1.0), ((1, 0, 0), 1.0), ((1, 1, 0), 0.8**0.5)],
+)
+def test_a_way_that_leaves_the_grid_or_the_region_has_no_angle(step, expected):
     """Sums of two ways may be rounded to below one that leaves the grid: nothing is read there."""
-    partition, levels = (
-        np.zeros((4, 5, 6), dtype=np.int16),
-        np.indices((4, 5, 6))[:1].astype(np.float32),
-    )
+    partition = np.zeros((4, 5, 6), dtype=np.int16)
     partition[:, :, 5], partition[3] = -1, 1
+    levels, edges = np.indices((4, 5, 6))[:1].astype(np.float32), np.array([2.0, 1.0, 1.0])
     labels = _Labels(
         partition, levels, np.zeros(2, dtype=np.int64), np.zeros((0, 1, 1, 1), dtype=np.uint16)
     )
-    for step, expected in (
-        ((0, -1, 0), 1.0),
-        ((0, 0, 1), 1.0),
-        ((1, 0, 0), 1.0),
-        ((1, 1, 0), 0.8**0.5),
-    ):
-        edges = np.array([2.0, 1.0, 1.0])
-        found = _cosine(labels, (1, 2, 3), (0, np.array(step)), np.linalg.norm(step * edges), edges)
-        assert found == pytest.approx(expected)
+    found = _cosine(labels, (1, 2, 3), (0, np.array(step)), np.linalg.norm(step * edges), edges)
+    assert found == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(
@@ -82,25 +80,22 @@ def test_chords_at_the_sides_of_the_grid_are_the_shortest_that_end_inside(
     field = gaussian_filter(np.random.default_rng(1).normal(size=(3, *shape)), (0.0, 1.5, 1.5, 1.5))
     members = memberships(Image(field.argmax(axis=0).astype(float), np.diag([*spacing, 1.0])))
     (steps, lengths), edges = thickness_module._rays(np.array(spacing))
-    labels = _Labels(
-        members.partition.astype(np.int16),
-        members.levels,
-        members.channel,
-        np.empty((0,) * 4, np.uint16),
-    )
+    partition, nothing = members.partition.astype(np.int16), np.empty((0,) * 4, np.uint16)
+    labels = _Labels(partition, members.levels, members.channel, nothing)
     monkeypatch.setattr(thickness_module, "_spread_balls", lambda *_: None)
     chords = local_thickness(members, np.array(spacing), 8.0)
     for place in np.ndindex(shape):
         ways = [
-            [_walk(members, place, sign * step, length) for sign in (1, -1)]
+            sum(_walk(members, place, sign * step, length) for sign in (1, -1))
             for step, length in zip(steps, lengths, strict=True)
         ]
-        d = int(np.argmin(np.sum(ways, axis=1)))
-        size = sum(ways[d])
+        d = int(np.argmin(ways))
+        size = ways[d]
         if size < 8.0:
-            up, down = (tuple((sign * steps[d]).tolist()) for sign in (1, -1))
-            forth = _cosine(labels, place, (d, up), lengths[d], edges)
-            size *= 0.5 * (forth + _cosine(labels, place, (-1 - d, down), lengths[d], edges))
+            size *= 0.5 * sum(
+                _cosine(labels, place, (number, tuple(way.tolist())), lengths[d], edges)
+                for number, way in ((d, steps[d]), (-1 - d, -steps[d]))
+            )
         assert chords[place] == pytest.approx(min(size, 8.0), abs=1e-5)
 
 
@@ -128,13 +123,9 @@ def test_a_region_ends_labels():
     assert (thickness[~inside] == 0.0).all()
 
 
-def test_triangles_and_divided_slices():
-    y = np.indices((30, 30))[1]
-    is_in = (y >= 10) & (y < 14)
-    assert np.median(thickness_of(is_in)[is_in]) == pytest.approx(4.0, abs=0.05)
-    thick_slices = Image(
-        (np.indices((24, 24, 6))[0] // 6 == 1).astype(float), np.diag([1.0, 1.0, 5.0, 1.0])
-    )
+def test_divided_slices():
+    is_slab = np.indices((24, 24, 6))[0] // 6 == 1
+    thick_slices = Image(is_slab.astype(float), np.diag([1.0, 1.0, 5.0, 1.0]))
     factors = supersampling(thick_slices.spacing)
     fine = finer(thick_slices, factors)
     thickness = local_thickness(memberships(thick_slices, factors), fine.spacing, MOST)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from meshes import both_dimensions, dimensions, seeds
+from meshes import both_dimensions, dimensions, mesh_edges, seeds
 from numpy.testing import assert_allclose, assert_array_equal
 from shapes import ball_image, distance
 from states import OBLIQUE, Engine, assumed_case, on_lattice, random_case
@@ -37,8 +37,9 @@ from tetopt.geometry.topology import boundary_facets
 from tetopt.start.carve import part_of
 
 
-def no_limits(n_nodes):
-    return Limits(0.0, np.full(n_nodes, np.inf), 0.0, np.full(n_nodes, np.inf))
+def no_limits(n_nodes, **limits):
+    free = np.full(n_nodes, np.inf)
+    return Limits(0.0, free, 0.0, free)._replace(**limits)
 
 
 def everyone(n_nodes):
@@ -142,21 +143,18 @@ def test_splits_make_no_edge_shorter_than_asked():
     engine = swept_case(5, 3)
     (room, stars), N = room_of(engine), len(engine.complex.ticks)
     points, cells = engine.mesh.points, engine.mesh.cells
-    of_cells = np.linalg.norm(points[cells[:, 0]] - points[cells[:, 1]], axis=1)
-    shortest = 0.45 * float(np.median(of_cells))
+    shortest = 0.45 * float(np.median(mesh_edges(engine.mesh)[1]))
     made = []
     for limit in (0.0, shortest):
-        limits = no_limits(N)._replace(shortest=limit)
-        split = best_splits(room, stars, everyone(N), limits).other
+        split = best_splits(room, stars, everyone(N), no_limits(N, shortest=limit)).other
         lengths = []
         for a in np.flatnonzero(split >= 0):
-            star = cells[(cells == a).any(axis=1) & (cells == split[a]).any(axis=1)]
+            star = cells[np.isin(cells, [a, split[a]]).sum(axis=1) == 2]
             middle = (points[a] + points[split[a]]) / 2.0
             lengths.append(np.linalg.norm(points[np.unique(star)] - middle, axis=1).min())
-        made.append(np.array(lengths))
-    assert made[0].min() < 0.95 * shortest
-    assert len(made[1]) > 0
-    assert made[1].min() >= shortest * (1 - 1e-3)  # ticks round the middle
+        made.append(min(lengths))
+    assert made[0] < 0.95 * shortest
+    assert made[1] >= shortest * (1 - 1e-3)  # ticks round the middle
 
 
 @both_dimensions
@@ -165,32 +163,30 @@ def test_edges_too_long_for_their_targets_are_split_first(n):
     if they have to.
     """
     engine = swept_case(5, n)
-    N = len(engine.complex.ticks)
-    points, cells = engine.mesh.points, engine.mesh.cells
-    ends = np.array([cells[:, [i, j]] for i in range(n + 1) for j in range(i)]).reshape(-1, 2)
-    length = np.linalg.norm(points[ends[:, 0]] - points[ends[:, 1]], axis=1)
+    mesh, N = engine.mesh, len(engine.complex.ticks)
+    ends, length = mesh_edges(mesh)
     target = np.random.default_rng(2).uniform(0.6, 0.8, N) * np.percentile(length, 90)
-    expected = naive.too_long(points.tolist(), cells.tolist(), target.tolist())
+    expected = naive.too_long(mesh.points.tolist(), mesh.cells.tolist(), target.tolist())
     assert_array_equal(too_long(engine.state, target), expected)
     assert 0 < sum(expected) < N
     assert not too_long(engine.state, np.full(N, np.inf)).any()
     room, stars = room_of(engine)
-    limits = no_limits(N)._replace(target=target)
-    plain, sized = (best_splits(room, stars, everyone(N), each) for each in (no_limits(N), limits))
-    a = np.flatnonzero(sized.other >= 0)
-    b = sized.other[a]
-    is_long = np.linalg.norm(points[a] - points[b], axis=1) > 2.0**0.5 * (target[a] + target[b]) / 2
-    for field in ("other", "gain"):
-        own, without = (getattr(each, field)[a[~is_long]] for each in (sized, plain))
-        assert_array_equal(own, without)
-    assert 0 < is_long.sum() < N
-    assert sized.gain[a[is_long]].min() > plain.gain.max() + 1e3
-    made = exchange(engine.state, N, 2, limits)
+    plain, sized = (
+        best_splits(room, stars, everyone(N), each)
+        for each in (no_limits(N), no_limits(N, target=target))
+    )
+    (is_one,) = np.nonzero(length > 2.0**0.5 * target[ends].mean(axis=1))
+    long = set(map(frozenset, ends[is_one].tolist()))
+    is_long = np.array([{a, b} in long for a, b in enumerate(sized.other.tolist())])
+    for one, other in zip((sized.other, sized.gain), (plain.other, plain.gain), strict=True):
+        assert_array_equal(one[~is_long], other[~is_long])
+    assert 0 < is_long.sum() < np.count_nonzero(sized.other >= 0)
+    assert sized.gain[is_long].min() > plain.gain.max() + 1e3
+    made = exchange(engine.state, N, 2, no_limits(N, target=target))
     engine.state = made.state
     engine.assert_sound()
     assert made.n_split == made.n_collapsed == 2
-    is_one = length > 2.0**0.5 * target[ends].mean(axis=1)
-    middles = points[ends[is_one]].mean(axis=1)
+    middles = mesh.points[ends[is_one]].mean(axis=1)
     for point in engine.mesh.points[made.source < 0]:
         assert np.linalg.norm(middles - point, axis=1).min() < 1e-2  # ticks round them
 
@@ -228,31 +224,29 @@ def test_collapses_are_the_best_of_all_neighbours(is_bounded):
     points, cells = engine.mesh.points, engine.mesh.cells
     is_frozen, ticks, N = engine.complex.is_frozen, engine.complex.ticks, len(points)
     longest = np.random.default_rng(0).uniform(8.0, 20.0, N) if is_bounded else np.full(N, np.inf)
-    limits = no_limits(N)._replace(longest=longest)
+    limits = no_limits(N, longest=longest)
     collapses = best_collapses(engine.state, stars, groups, everyone(N), limits)
-    size = volumes(points, cells).sum()
+    away = np.linalg.norm(points[:, None] - points, axis=2)
     joined, refused = 0, 0
     for a in range(N):
-        best = np.inf
-        of_a = (cells == a).any(axis=1)
+        costs, of_a = [], (cells == a).any(axis=1)
         near = np.setdiff1d(cells[of_a], [a])
-        old = np.linalg.norm(points[near] - points[a], axis=1).max()
         for b in near:
-            new_edges = np.linalg.norm(points[near] - points[b], axis=1)
-            if (new_edges > np.maximum(np.minimum(longest[near], longest[b]), old)).any():
+            most = np.maximum(np.minimum(longest[near], longest[b]), away[a, near].max())
+            if (away[b, near] > most).any():
                 refused += 1
                 continue
             new = np.where(cells == a, b, cells)[~(of_a & (cells == b).any(axis=1))]
             volume = volumes(points, new)
-            if (volume <= 1e-6 / 6.0).any() or abs(volume.sum() / size - 1) > 1e-9:
+            if (volume <= 1e-6 / 6.0).any() or abs(volume.sum() / engine.image.volume - 1) > 1e-9:
                 continue
             if (is_frozen[a, :3] & ~(is_frozen[b, :3] & (ticks[a] == ticks[b]))).any():
                 continue
             weights = engine.objective.geometry, engine.objective.image
-            best = min(best, np.dot(weights, energies(engine.fresh(new))) - engine.E)
-        if best < np.inf:
+            costs.append(np.dot(weights, energies(engine.fresh(new))) - engine.E)
+        if costs:
             joined += 1
-            assert -collapses.gain[a] == pytest.approx(best, rel=1e-6, abs=1e-9)
+            assert -collapses.gain[a] == pytest.approx(min(costs), rel=1e-6, abs=1e-9)
         else:
             assert collapses.other[a] == -1
     assert joined > 5

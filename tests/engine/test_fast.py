@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from meshes import both_dimensions, dimensions, seeds, split_box
+from meshes import REGULAR_TET, both_dimensions, dimensions, seeds, split_box
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial import Delaunay
 from states import CASES, OBLIQUE, Engine, assumed_case, on_lattice, random_case
@@ -49,39 +49,29 @@ def test_cells_that_are_surely_above_a_minimum_dihedral_angle():
     """The bound by the shape measure never lets one through that is below, and lets most regular
     ones through.
     """
-    rng = np.random.default_rng(4)
+    rng, sharp = np.random.default_rng(4), np.zeros((200, 4, 3))
     corners = rng.normal(size=(800, 4, 3))
-    corners[:400] = [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]] + 0.5 * corners[:400]
+    corners[:400] = REGULAR_TET[0] + 0.5 * corners[:400]
     corners[200:300, :, 0] *= 0.2  # flat ones
     # and the very ones that the bound is sharp for
     half = np.radians(rng.uniform(1.0, 70.0, 200)) / 2.0
-    edge = 0.5 * np.sqrt(1.0 + np.sin(half) ** 2)
-    zero = np.zeros_like(half)
-    ends = np.stack([np.stack([zero, zero, s * edge], 1) for s in (1, -1)], 1)
-    others = np.stack([np.stack([np.cos(half), s * np.sin(half), zero], 1) for s in (-1, 1)], 1)
-    corners = np.concatenate([corners, np.concatenate([ends, others], axis=1)])
-    mirrored = np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0
-    corners[mirrored] = corners[mirrored][:, [1, 0, 2, 3]]
-    angles = dihedral_angles(
-        corners.reshape(-1, 3), np.arange(4 * len(corners)).reshape(-1, 4)
-    ).min(axis=1)
-    objective = random_case(1, 3).objective
+    sharp[:, :2, 2] = np.outer(0.5 * np.sqrt(1.0 + np.sin(half) ** 2), [1, -1])
+    sharp[:, 2:, 0], sharp[:, 2:, 1] = np.cos(half)[:, None], np.outer(np.sin(half), [-1, 1])
+    points = np.concatenate([corners, sharp]).reshape(-1, 3)
+    cells = orient_cells(points, np.arange(len(points)).reshape(-1, 4))
+    angles, objective = dihedral_angles(points, cells).min(axis=1), random_case(1, 3).objective
+
+    def cosines(limit, safe):
+        limited = objective._replace(angle_limit=limit, safe=safe)
+        return np.array([cosine_up_to_limit(x, limited) for x in points[cells]])
+
     for min_dihedral in (5.0, 12.0, 40.0):
-        cosine, safe = angle_limit_of(min_dihedral)
-        cosines = np.array(
-            [
-                cosine_up_to_limit(x, objective._replace(angle_limit=cosine, safe=safe))
-                for x in corners
-            ]
-        )
-        assert (angles[cosines >= cosine] >= min_dihedral * (1 - 1e-12)).all()
-        assert_allclose(
-            cosines[cosines < cosine], -np.cos(np.radians(angles[cosines < cosine])), atol=1e-9
-        )
-    objective = objective._replace(angle_limit=-0.97, safe=angle_limit_of(12.0)[1])
-    assert (
-        np.array([cosine_up_to_limit(x, objective) for x in corners[:160]]) == -0.97
-    ).mean() > 0.5
+        limit, safe = angle_limit_of(min_dihedral)
+        found = cosines(limit, safe)
+        is_below = found < limit
+        assert (angles[~is_below] >= min_dihedral * (1 - 1e-12)).all()
+        assert_allclose(found[is_below], -np.cos(np.radians(angles[is_below])), atol=1e-9)
+    assert (cosines(-0.97, angle_limit_of(12.0)[1])[:160] == -0.97).mean() > 0.5
 
 
 @both_dimensions
@@ -476,21 +466,17 @@ def test_edges_with_many_cells_are_left_alone(is_open):
     """Twelve tetrahedra around one edge, closed and open: no polygon, and nothing written past
     its room.
     """
-    angles = np.linspace(0.0, np.pi if is_open else 2.0 * np.pi, 13)[: 13 if is_open else 12]
-    rim = np.column_stack([3.0 * np.cos(angles), 3.0 * np.sin(angles), 0.0 * angles])
+    turns = np.linspace(0.0, np.pi if is_open else 2.0 * np.pi, 13)[: 12 + is_open]
+    rim = np.column_stack([3.0 * np.cos(turns), 3.0 * np.sin(turns), 0.0 * turns])
     points = np.vstack([[[0, 0, -3.0], [0, 0, 3.0]], rim]) + 5.0
     cells = [[0, 1, 2 + k, 2 + (k + 1) % len(rim)] for k in range(12)]
-    image = Image(np.arange(1000.0).reshape(10, 10, 10))
-    made = Engine(image, Mesh(points, cells)).complex
-    most = flips.POLYGON_CORNERS
+    made = Engine(Image(np.arange(1000.0).reshape(10, 10, 10)), Mesh(points, cells)).complex
+    most, nothing = flips.POLYGON_CORNERS, np.zeros(0, dtype=bool)
     room, around = np.full(most + 5, -7), np.full(most, -7)
-    for cell in range(12):
-        for i, j in flips.TET_EDGES:
-            m, _ = flips.ring_of_edge(
-                room[:most], around, made.cells, made.across, cell, i, j, np.zeros(0, dtype=bool)
-            )
-            is_axis = set(made.cells[cell, [i, j]].tolist()) == {0, 1}
-            assert m == 0 if is_axis else m in (2, 3)
+    for cell, (i, j) in itertools.product(range(12), flips.TET_EDGES):
+        m, _ = flips.ring_of_edge(room[:most], around, made.cells, made.across, cell, i, j, nothing)
+        is_axis = set(made.cells[cell, [i, j]]) == {0, 1}
+        assert m in ((0,) if is_axis else (2, 3))
     assert (room[most:] == -7).all()
 
 

@@ -180,11 +180,11 @@ def test_pairs_that_do_not_touch():
 @pytest.mark.parametrize(("thickness", "percent"), [(3.0, 2.0), (1.5, 8.0)])
 def test_a_shell_of_one_cell_is_whole(thickness, percent):
     """Volume, one component, no hole, and hardly any contact of what lies within and without."""
-    r = distance((36,) * 3, *[17.37] * 3)
-    image = Image(1.0 + (r >= 10.0) + (r >= 10.0 + thickness))
+    r = distance((30,) * 3, *[14.37] * 3)
+    image = Image(1.0 + (r >= 8.0) + (r >= 8.0 + thickness))
     sizes = tetopt.Sizes(edge_size=8.0, cells_across=1)
     result = mesh_image(labels_alone(image), sizes=sizes, iterations=8)
-    volume = 4.0 / 3.0 * np.pi * ((10.0 + thickness) ** 3 - 10.0**3)
+    volume = 4.0 / 3.0 * np.pi * ((8.0 + thickness) ** 3 - 8.0**3)
     of_shell = result.mesh.cell_volumes[result.labels == 2].sum()
     assert of_shell == pytest.approx(volume, rel=0.01 * percent)
     rows = label_interfaces(image, result.mesh, result.labels)

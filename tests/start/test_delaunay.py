@@ -3,20 +3,15 @@
 import numpy as np
 import pytest
 from hypothesis import given
-from hypothesis import strategies as st
-from meshes import box_corners, random_affine
+from meshes import box_corners, dimensions, random_affine, seeds
 from naive import circumcentres
-from scipy.spatial import Delaunay
+from scipy.spatial import Delaunay, cKDTree
 from shapes import grid
 
 from tetopt import Image, lattice_mesh
 from tetopt.geometry.simplex import squared_edges, volumes
 from tetopt.geometry.topology import facets
 from tetopt.start.delaunay import delaunay
-
-seeds = st.integers(0, 2**32 - 1)
-dimensions = st.sampled_from([2, 3])
-IDENTITY = {2: np.eye(3), 3: np.eye(4)}
 
 
 def world(index, affine):
@@ -27,14 +22,14 @@ def as_set(cells):
     return set(map(tuple, np.sort(cells, axis=1).tolist()))
 
 
-def random_box_nodes(rng, n, n_nodes, per_wall=0.1):
-    """Corners of a box, random nodes inside, some moved to a wall."""
+def random_box_nodes(rng, n):
+    """Corners of a box, random nodes inside, some moved to a wall; and the box's sides."""
     shape = rng.integers(3, 10, n)
-    low, high = -0.5, shape - 0.5
-    nodes = rng.uniform(low, high, (n_nodes, n))
-    is_on_wall = rng.random(nodes.shape) < per_wall
+    low, high = np.full(n, -0.5), shape - 0.5
+    nodes = rng.uniform(low, high, (60, n))
+    is_on_wall = rng.random(nodes.shape) < 0.1
     nodes = np.where(is_on_wall, np.where(rng.random(nodes.shape) < 0.5, low, high), nodes)
-    return np.unique(np.vstack([box_corners(shape), nodes]), axis=0), shape
+    return np.unique(np.vstack([box_corners(shape), nodes]), axis=0), (low, high)
 
 
 def check_tiling(index, cells, box):
@@ -67,10 +62,10 @@ def test_generic_nodes_get_scipy_s_cells(seed, n):
 def test_cells_tile_the_box(seed, n):
     """With nodes on walls and edges, whatever the affine."""
     rng = np.random.default_rng(seed)
-    index, shape = random_box_nodes(rng, n, 60)
+    index, sides = random_box_nodes(rng, n)
     affine = random_affine(rng, n)
     cells = delaunay(index, affine)
-    check_tiling(index, cells, (np.full(n, -0.5), shape - 0.5))
+    check_tiling(index, cells, sides)
     assert (volumes(world(index, affine), cells) > 0).all()
     assert cells.dtype == np.int64
 
@@ -83,31 +78,26 @@ def test_a_cubic_grid_has_no_flat_cell(sizes):
     """Cells with corners on a unit cube have 1/2, or 1/6 or 1/3; Qhull by itself makes cells of
     0 here.
     """
-    index = grid(sizes).reshape(-1, len(sizes))
     n = len(sizes)
-    cells = delaunay(index, IDENTITY[n])
+    index = grid(sizes).reshape(-1, n)
+    cells = delaunay(index, np.eye(n + 1))
     check_tiling(index, cells, (np.zeros(n), np.array(sizes) - 1.0))
-    v = volumes(index, cells)
     allowed = [1 / 2] if n == 2 else [1 / 6, 1 / 3]
-    assert np.isclose(v[:, None], allowed).any(axis=1).all()
+    assert np.isclose(volumes(index, cells)[:, None], allowed).any(axis=1).all()
     assert (np.ptp(index[cells], axis=1) == 1).all()
 
 
 @pytest.mark.parametrize(("n", "kind"), [(2, "criss-cross"), (3, "bcc"), (3, "five-tet")])
 def test_nodes_of_lattices(n, kind):
-    image = Image(
-        np.zeros((12, 9, 10)[:n]), np.diag([-1.0, 1.0, 1.0, 1.0])[-n - 1 :, -n - 1 :] * 1.0
-    )
+    image = Image(np.zeros((12, 9, 10)[:n]), np.diag([-1.0, 1.0, 1.0, 1.0][-n - 1 :]))
     mesh = lattice_mesh(image, kind, blocks=(4, 3, 3)[:n])
-    index = image.to_index(mesh.points)
+    points, index = mesh.points, image.to_index(mesh.points)
     cells = delaunay(index, image.affine)
     check_tiling(index, cells, (np.full(n, -0.5), np.array(image.shape) - 0.5))
-    smallest = volumes(mesh.points, mesh.cells).min()
-    assert volumes(mesh.points, cells).min() > 0.3 * smallest
-    centres = circumcentres(mesh.points, cells)
-    radii = np.linalg.norm(mesh.points[cells[:, 0]] - centres, axis=1)
-    distances = np.linalg.norm(mesh.points[None] - centres[:, None], axis=2)
-    assert (distances >= radii[:, None] * (1 - 1e-5)).all()
+    assert volumes(points, cells).min() > 0.3 * mesh.cell_volumes.min()
+    centres = circumcentres(points, cells)
+    radii = np.linalg.norm(points[cells[:, 0]] - centres, axis=1)
+    assert (cKDTree(points).query(centres)[0] >= radii * (1 - 1e-5)).all()
 
 
 @given(seeds)
@@ -128,26 +118,19 @@ def test_no_cell_is_flat_on_jittered_and_plain_grids_of_any_affine(seed):
 
 
 def test_the_same_nodes_get_the_same_cells_in_the_same_order():
-    rng = np.random.default_rng(1)
-    index, _ = random_box_nodes(rng, 3, 60)
+    """And the same cells far from the origin and in small voxels."""
+    index, _ = random_box_nodes(np.random.default_rng(2), 3)
     first, second = delaunay(index, np.eye(4)), delaunay(index.copy(), np.eye(4))
     np.testing.assert_array_equal(first, second)
     keys = np.sort(first, axis=1).tolist()
     assert keys == sorted(keys)
-
-
-def test_far_from_the_origin_and_in_small_voxels_the_cells_are_the_same():
-    rng = np.random.default_rng(2)
-    index, _ = random_box_nodes(rng, 3, 60)
-    far = np.eye(4)
+    far, small = np.eye(4), np.diag([1e-3, 1e-3, 1e-3, 1.0])
     far[:3, 3] = 1e6
-    small = np.diag([1e-3, 1e-3, 1e-3, 1.0])
     for affine in (far, small):
-        assert as_set(delaunay(index, affine)) == as_set(delaunay(index, np.eye(4)))
+        assert as_set(delaunay(index, affine)) == as_set(first)
 
 
 def test_no_cells_for_nodes_in_a_plane_or_given_twice():
-    flat = grid((3, 3, 1)).reshape(-1, 3)
-    assert delaunay(flat, np.eye(4)) is None
-    twice = np.vstack([grid((3, 3, 3)).reshape(-1, 3), [[1.0, 1.0, 1.0]]])
-    assert delaunay(twice, np.eye(4)) is None
+    flat, whole = (grid((3, 3, n)).reshape(-1, 3) for n in (1, 3))
+    for nodes in (flat, np.vstack([whole, [[1.0, 1.0, 1.0]]])):
+        assert delaunay(nodes, np.eye(4)) is None

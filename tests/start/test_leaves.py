@@ -2,25 +2,19 @@
 cubes.
 """
 
-import sys
-
 import numpy as np
 import pytest
 from hypothesis import given
-from hypothesis import strategies as st
-from meshes import random_affine
+from meshes import dimensions, random_affine, seeds
 from naive import circumcentres
 from scipy.spatial import cKDTree
-from shapes import grid
+from shapes import ball_image
 
 import tetopt
-from tetopt.geometry.simplex import volumes
+from tetopt import Image, check_mesh, quality
 from tetopt.start import leaves
 from tetopt.start.leaves import FACE_RING, leaf_cells, leaf_nodes
 from tetopt.start.octree import _Blocks, _divide_blocks, octree_mesh
-
-seeds = st.integers(0, 2**32 - 1)
-dimensions = st.sampled_from([2, 3])
 
 
 def random_leaves(rng, n):
@@ -45,20 +39,19 @@ def test_cells_fill_the_box(seed, n):
     """
     rng = np.random.default_rng(seed)
     roots, divided = random_leaves(rng, n)
-    image = tetopt.Image(np.zeros(rng.integers(3, 9, n)), random_affine(rng, n))
-    mesh = joined(
-        roots, divided, lambda places: image.to_world(places / np.array(roots) * image.shape - 0.5)
-    )
-    assert tetopt.check_mesh(mesh, image) == []
-    assert volumes(mesh.points, mesh.cells).sum() == pytest.approx(image.volume, rel=1e-12)
+    image = Image(np.zeros(rng.integers(3, 9, n)), random_affine(rng, n))
+
+    def made():
+        scale = np.array(image.shape) / roots
+        return joined(roots, divided, lambda places: image.to_world(places * scale - 0.5))
+
+    mesh = made()
+    assert check_mesh(mesh, image) == []
+    assert mesh.cell_volumes.sum() == pytest.approx(image.volume, rel=1e-12)
     assert np.unique(mesh.cells).tolist() == list(range(len(mesh.points)))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(leaves, "LEAVES_AT_A_TIME", 7)
-        again = joined(
-            roots,
-            divided,
-            lambda places: image.to_world(places / np.array(roots) * image.shape - 0.5),
-        )
+        again = made()
     assert set(map(tuple, again.cells.tolist())) == set(map(tuple, mesh.cells.tolist()))
 
 
@@ -70,7 +63,7 @@ def test_cells_of_cubes_are_delaunay(seed, n):
     centres = circumcentres(mesh.points, mesh.cells)
     radii = np.linalg.norm(mesh.points[mesh.cells[:, 0]] - centres, axis=1)
     assert (cKDTree(mesh.points).query(centres)[0] >= radii * (1.0 - 1e-9)).all()
-    numbers = tetopt.quality(mesh.points, mesh.cells)
+    numbers = quality(mesh.points, mesh.cells)
     assert numbers.min_rho >= (0.4142 if n == 2 else 0.2058)
     if n == 3:
         assert numbers.min_dihedral >= 30.0 - 1e-9
@@ -85,19 +78,18 @@ def test_blocks_that_are_no_cubes(seed):
     roots, divided = random_leaves(rng, 3)
     stretched = np.diag(rng.uniform(1.0, 1.5, 3)) + np.triu(rng.uniform(-0.2, 0.2, (3, 3)), 1)
     mesh = joined(roots, divided, lambda places: places @ stretched)
-    assert tetopt.quality(mesh.points, mesh.cells).min_dihedral > 17.0
+    assert quality(mesh.points, mesh.cells).min_dihedral > 17.0
 
 
 @pytest.mark.parametrize(("kind", "blocks"), [("criss-cross", (5, 4)), ("bcc", (4, 3, 5))])
 def test_undivided_blocks_are_a_lattice(kind, blocks):
-    image = tetopt.Image(np.zeros(blocks), np.eye(len(blocks) + 1))
-    lattice = tetopt.lattice_mesh(image, kind, blocks=blocks)
+    lattice = tetopt.lattice_mesh(Image(np.zeros(blocks)), kind, blocks=blocks)
     mesh = joined(blocks, [], lambda places: places - 0.5)
-
-    def places(each):
-        return {tuple(sorted(map(tuple, cell))) for cell in each.points[each.cells].tolist()}
-
-    assert places(mesh) == places(lattice)
+    ours, theirs = (
+        {tuple(sorted(map(tuple, cell))) for cell in each.points[each.cells].tolist()}
+        for each in (mesh, lattice)
+    )
+    assert ours == theirs
 
 
 def test_a_square_between_two_leaves_is_cut_along_their_face():
@@ -108,9 +100,11 @@ def test_a_square_between_two_leaves_is_cut_along_their_face():
     divided[[0, 2], 0, 0] = True
     mesh = joined((3, 1, 2), [divided])
     corners = mesh.points[mesh.cells]
-    for node in ([1.5, 0.5, 0.5], [1.5, 0.5, 1.5]):
-        corners = corners[(corners == node).all(axis=2).any(axis=1)]
-    assert len(corners) == 0
+    has_node = [
+        (corners == node).all(axis=2).any(axis=1) for node in ([1.5, 0.5, 0.5], [1.5, 0.5, 1.5])
+    ]
+    assert all(map(np.any, has_node))
+    assert not np.logical_and(*has_node).any()
 
 
 @pytest.mark.parametrize("mask", range(16))
@@ -131,17 +125,14 @@ def test_within_a_mask_one_octree_is_enough(monkeypatch, n):
     within.
     """
     made = []
-    octree = sys.modules["tetopt.start.octree"]
-    monkeypatch.setattr(octree, "leaf_cells", lambda *args: made.append(args) or leaf_cells(*args))
-    place = grid((40,) * n) - 18.0
+    monkeypatch.setattr(
+        "tetopt.start.octree.leaf_cells", lambda *args: made.append(args) or leaf_cells(*args)
+    )
     affine = random_affine(np.random.default_rng(5), n, is_sheared=False)
-    distance = np.linalg.norm(place, axis=-1)
-    image = tetopt.Image(100.0 * (distance < 8.0), affine)
-    content = tetopt.content(image, mask=tetopt.Image(1.0 * (distance < 16.0), affine))
-    nodes = 2500 if n == 3 else 400
+    ball, mask = (ball_image((40,) * n, (18.0,) * n, radius, affine) for radius in (8.0, 16.0))
+    content, nodes = tetopt.content(ball, mask=mask), 2500 if n == 3 else 400
     mesh = octree_mesh(content, nodes)
     assert len(made) == 1
     assert len(mesh.points) == pytest.approx(nodes, rel=0.1)
-    assert tetopt.check_mesh(mesh, is_whole=False) == []
-    volume = float(volumes(mesh.points, mesh.cells).sum())
-    assert volume == pytest.approx(float((distance < 16.0).sum()) * image.voxel_volume, rel=0.02)
+    assert check_mesh(mesh, is_whole=False) == []
+    assert mesh.cell_volumes.sum() == pytest.approx(mask.data.sum() * ball.voxel_volume, rel=0.02)
