@@ -104,7 +104,7 @@ def contains(polygon, point):
     return bool((side > 1e-9).all() or (side < -1e-9).all())
 
 
-def drawn(axes, kind=PolyCollection):
+def collections_in(axes, kind=PolyCollection):
     return [each for each in axes.collections if isinstance(each, kind)]
 
 
@@ -244,8 +244,8 @@ def test_slice_figure_holds_each_mesh_under_its_title(n):
         assert over.get_title() == title
         assert_pixels(over, view)
         for axes in (over, flat):
-            assert_drawn(drawn(axes)[0], polygons)
-        means = drawn(flat)[0]
+            assert_drawn(collections_in(axes)[0], polygons)
+        means = collections_in(flat)[0]
         assert_array_equal(means.get_array(), cell_moments(image, mesh).mean[cells])
         assert means.get_clim() == over.images[0].get_clim()
 
@@ -271,7 +271,7 @@ def test_nothing_is_drawn_where_a_mesh_leaves_the_image_uncovered(n):
     image = spaced(n)
     over, flat = slice_figure(image, [("part", lower_part(image, 0, 2))]).axes
     for axes in (over, flat):
-        polygons = np.concatenate([path.vertices for path in drawn(axes)[0].get_paths()])
+        polygons = np.concatenate([path.vertices for path in collections_in(axes)[0].get_paths()])
         ends = polygons.min(axis=0), polygons.max(axis=0)
         assert_allclose(ends, [[0.0, 0.0], [4.0, 7.0]], atol=1e-9)
         assert axes.get_xlim() == (0.0, 10.0)  # the whole image stays in view
@@ -384,7 +384,7 @@ def test_voxels_and_cells_have_the_same_colours(worlds, signs):
         assert_array_equal(left.images[0].get_array(), colours[view.pixels.T.astype(int)])
         assert left.images[0].get_extent() == [0.0, view.size[0], 0.0, view.size[1]]
         polygons, cells = view.section(mesh)
-        (painted,) = drawn(right)
+        (painted,) = collections_in(right)
         assert_drawn(painted, polygons)
         assert_array_equal(painted.get_facecolors()[:, :3], colours[of_cell[cells]])
         assert texts(left.texts) == texts(right.texts)
@@ -408,11 +408,13 @@ def test_interfaces_are_drawn_over_the_image(worlds, signs):
     for axes, normal in zip(figure.axes[2::3], (2, 1, 0), strict=True):
         view = SliceView(image, worlds.index(normal), None)
         assert_pixels(axes, view)
-        under, over = (each.get_segments() for each in drawn(axes, LineCollection))
+        under, over = (each.get_segments() for each in collections_in(axes, LineCollection))
         assert_array_equal(under, over)
         _, sides = view.interfaces(mesh, of_cell)
         rarer = np.where(n_cells[sides[:, 0]] <= n_cells[sides[:, 1]], sides[:, 0], sides[:, 1])
-        assert_array_equal(drawn(axes, LineCollection)[1].get_colors()[:, :3], colours[rarer])
+        assert_array_equal(
+            collections_in(axes, LineCollection)[1].get_colors()[:, :3], colours[rarer]
+        )
         if worlds.index(normal) != 0:
             along = view.axes.index(0)
             steps = np.abs(np.diff(over, axis=1))[:, 0]
@@ -421,18 +423,9 @@ def test_interfaces_are_drawn_over_the_image(worlds, signs):
     assert "2 left lung" in texts(figure.legends[0].get_texts())
 
 
-def test_interfaces_of_a_plane():
-    labels = Image(np.repeat([0, 3], 4)[:, None] + np.zeros((1, 6)), np.diag([2.0, 1.0, 1.0]))
-    mesh = lattice(labels)
-    lines, sides = middle_view(labels).interfaces(mesh, cell_labels(labels, mesh))
-    assert_allclose(lines[..., 0], 8.0)
-    assert np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).sum() == pytest.approx(6.0)
-    assert {tuple(sorted(pair)) for pair in sides.tolist()} == {(0, 3)}
-
-
 def test_labels_of_a_part_and_of_a_plane():
     labels = blocks_of_labels(4)
-    (painted,) = drawn(label_figure(labels, lower_part(labels, 0, 4)).axes[1])
+    (painted,) = collections_in(label_figure(labels, lower_part(labels, 0, 4)).axes[1])
     farthest = max(path.vertices[:, 0].max() for path in painted.get_paths())
     assert farthest == pytest.approx(8.0)  # of 16 mm
     flat = Image(labels.data[:, :, 0], np.diag([2.0, 1.0, 1.0]))
@@ -477,7 +470,7 @@ def test_boundary_and_outline_lie_between_the_same_pixels(worlds, signs):
     place = SPACING[axis] * (np.flatnonzero(np.diff(pixels[:, 0]))[0] + 1)
     for axes in figure.axes:
         assert_pixels(axes, middle_view(image))
-        for each in drawn(axes, LineCollection):
+        for each in collections_in(axes, LineCollection):
             x, y = np.moveaxis(each.get_segments(), -1, 0)
             assert_allclose(x, place, atol=1e-4)
             assert_allclose([y.min(), y.max()], [0.0, top])
@@ -534,7 +527,10 @@ def test_the_slice_is_in_the_middle_of_the_mask():
 def test_a_mask_without_outline_can_be_drawn(tmp_path, value):
     image = noise(SHAPE)
     figure = boundary_figure(image, Image(np.full(SHAPE, value)), lattice(image), "mask")
-    assert [each.get_segments() for each in drawn(figure.axes[0], LineCollection)] == [[], []]
+    assert [each.get_segments() for each in collections_in(figure.axes[0], LineCollection)] == [
+        [],
+        [],
+    ]
     save_figure(figure, tmp_path / "a.png", dpi=40)
 
 
@@ -545,7 +541,7 @@ def test_a_mask_of_another_shape_is_refused():
 
 
 def test_curved_cells_are_drawn_as_straight_pieces():
-    """Titles say so, and no title of straight cells."""
+    """Of a plane, as their interfaces are; titles say so, and no title of straight cells."""
     labels = Image(np.repeat([0, 3], 4)[:, None] + np.zeros((1, 6)), np.diag([2.0, 1.0, 1.0]))
     straight, view = lattice(labels), middle_view(labels)
     mesh, of_cell = with_bent_edges(straight, 0.1), cell_labels(labels, straight)
@@ -553,8 +549,11 @@ def test_curved_cells_are_drawn_as_straight_pieces():
     pieces, n_pieces = mesh.straight_pieces()
     assert_array_equal(cells, np.repeat(np.arange(len(mesh.cells)), n_pieces))
     assert_allclose(areas(polygons), pieces.cell_volumes)
-    lines, of_corners = (view.interfaces(each, of_cell)[0] for each in (mesh, straight))
-    assert len(lines) == 2 * len(of_corners) > 0
+    lines, sides = view.interfaces(straight, of_cell)
+    assert_allclose(lines[..., 0], 8.0)
+    assert np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).sum() == pytest.approx(6.0)
+    assert {tuple(sorted(pair)) for pair in sides.tolist()} == {(0, 3)}
+    assert len(view.interfaces(mesh, of_cell)[0]) == 2 * len(lines)
     size = f"{len(mesh.points)} corner nodes, {node_count(mesh.points, mesh.cells, 2)} in all"
     mask, thumbnails = Image(labels.data == 3, labels.affine), set()
     for each, words in ((mesh, "\ncurved cells drawn as 4 straight ones"), (straight, "")):
@@ -655,7 +654,7 @@ def test_titles_say_how_many_nodes_and_how_good(monkeypatch, run):
         titles = [f"lattice, {len(initial.points)} nodes", f"optimised, {words}"]
         for axes, title, mesh in zip(slices.axes, titles, (initial, made.mesh), strict=False):
             assert axes.get_title() == title
-            assert len(drawn(axes)[0].get_paths()) == len(mesh.cells)
+            assert len(collections_in(axes)[0].get_paths()) == len(mesh.cells)
         assert len(energies.axes[0].lines) == n_lines
     save_run_figures("abc", image, initial, result, order=2)
     assert saved[-3].axes[0].get_title() == f"lattice, {nodes_in_words(initial, 2)}"

@@ -11,6 +11,7 @@ import pytest
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.model.label_names import LabelTable
+from tetopt.report import thumbnail
 from tetopt.report.thumbnail import SIDE_PIXELS, thumbnail_png
 from tetopt.start.lattice import lattice_mesh
 
@@ -81,23 +82,23 @@ def test_left_is_left_and_front_is_up():
     assert y < -10  # above
 
 
-def test_letters_say_which_side_is_which():
-    """L and P on the left of the views, R and A on the right; their shapes: an L has most of
-    itself on its left.
-    """
+def test_letters_say_which_side_is_which(monkeypatch):
+    """In the lower corners of the views of a volume."""
     image = ball()
     is_letter = pixels(image)[-LETTER_ROWS:].min(axis=-1) > 60  # the mesh's orange has no blue
-    ends = np.add.outer([0, SIDE_PIXELS], [0, 12, SIDE_PIXELS - 12]).ravel()[1:]
-    left, between, right, back, middle, front = np.split(is_letter, ends, axis=1)
-    assert not between.any()
-    assert not middle.any()
-    assert min(each.sum() for each in (left, right, back, front)) >= 5
-    of_left, of_back = (np.flatnonzero(each.any(axis=1)) for each in (left, back))
-    assert left[of_left[-1]].sum() > left[of_left[0]].sum()  # an L stands on its long side
-    # a P on its short one
-    assert back[of_back[-1]].sum() < back[of_back[0] : of_back[-1]].sum(axis=1).max()
+    corners = np.add.outer([0, SIDE_PIXELS], np.r_[0:12, -12:0] % SIDE_PIXELS).ravel()
+    assert (is_letter[:, corners].reshape(-1, 4, 12).sum(axis=(0, 2)) >= 5).all()
+    assert not np.delete(is_letter, corners, axis=1).any()
+    figures = []
+    monkeypatch.setattr(thumbnail, "_png", figures.append)
     plane = Image(image.data[:, :, 7], np.diag([1.0, 1.0, 1.0]))
-    assert not (pixels(plane)[-LETTER_ROWS:].min(axis=-1) > 60).any()
+    for each in (image, plane):
+        thumbnail_png(each, coarse(each))
+    sides = [[text.get_text() for text in axes.texts] for axes in figures[0].axes]
+    assert sides == [["L", "R"], ["P", "A"]]
+    for axes in figures[0].axes:
+        assert [text.get_position() for text in axes.texts] == [(0.04, 0.05), (0.96, 0.05)]
+    assert [axes.texts[:] for axes in figures[1].axes] == [[]]
 
 
 @pytest.mark.parametrize(("order", "signs"), [((2, 0, 1), (1, -1, 1)), ((1, 0, 2), (-1, -1, -1))])

@@ -37,7 +37,7 @@ def test_same_bits_as_in_process():
     assert 2e7 < outcome.peak_bytes < 4e9
 
 
-def ended(pipeline, job=JOB, max_seconds=60.0, **limits):
+def outcome_of(pipeline, job=JOB, max_seconds=60.0, **limits):
     return run_in_child(pipeline, job, max_seconds=max_seconds, **limits)
 
 
@@ -46,7 +46,7 @@ def test_job_arrives_whole():
     affine = np.array([[0, -2.0, 0, 5], [3, 0, 0.5, 1], [0, 0, 1.5, 2], [0, 0, 0, 1]])
     image = tetopt.Image(IMAGE.data + 0.1, affine)
     labels = tetopt.Image((IMAGE.data > 50).astype(int), affine)
-    outcome = ended(pipes.fine, PipelineInput(image, labels, 200))
+    outcome = outcome_of(pipes.fine, PipelineInput(image, labels, 200))
     assert outcome.mesh.points.tobytes() == tetopt.lattice_mesh(image, nodes=200).points.tobytes()
     assert list(outcome.seconds.items()) == [("first", 1.5), ("second", 0.25)]
     assert outcome.notes == ["a note"]
@@ -65,7 +65,7 @@ def test_job_arrives_whole():
     ],
 )
 def test_failure_is_one_line(pipeline, line):
-    outcome = ended(pipeline)
+    outcome = outcome_of(pipeline)
     assert outcome.mesh is None
     assert outcome.failure == line
 
@@ -76,7 +76,7 @@ def test_a_crash_is_repeated_once(tmp_path, monkeypatch):
     monkeypatch.setenv("PIPES_PID", str(tmp_path / "pid"))
     events = []
     with listen_with(events.append):
-        outcome = ended(pipes.crash_once, title="mine")
+        outcome = outcome_of(pipes.crash_once, title="mine")
     said = "mine: crashed: signal 11, SIGSEGV; running it again, with smoother surfaces"
     assert events == [Event("note", said)]
     assert (outcome.failure, outcome.is_crash) == (None, False)
@@ -84,11 +84,11 @@ def test_a_crash_is_repeated_once(tmp_path, monkeypatch):
     assert first.startswith("the first run crashed: signal 11, SIGSEGV; this is the second")
     assert last == "smoothing 2"
     (tmp_path / "pid").unlink()
-    outcome = ended(pipes.crash_and_refuse)
+    outcome = outcome_of(pipes.crash_and_refuse)
     assert outcome.failure == "crashed: signal 11, SIGSEGV; then thing: expected a, got b; do c"
     events.clear()
     with listen_with(events.append):
-        outcome = ended(pipes.absent)
+        outcome = outcome_of(pipes.absent)
     assert (outcome.failure, events) == ("thing: not installed", [])
 
 
@@ -98,7 +98,7 @@ def test_modules_of_the_current_folder_are_not_run(tmp_path, monkeypatch):
     for name in ("numpy", "json", "tempfile"):
         (tmp_path / f"{name}.py").write_text("open('executed', 'w')\n")
     monkeypatch.chdir(tmp_path)
-    assert ended(pipes.fine).failure is None
+    assert outcome_of(pipes.fine).failure is None
     assert not (tmp_path / "executed").exists()
 
 
@@ -114,10 +114,10 @@ def test_signals_in_words():
     assert {signal_words(code) for code in (0, 1, 127, 130, 143, 255)} == {None}
 
 
-def timed_out(pipeline, path, n):
+def processes_of(pipeline, path, n):
     """The n processes whose ids stand in a file, after the pipeline ran out of time."""
     for most in (4.0, 16.0, 64.0):  # a busy machine may not have started them earlier
-        outcome = ended(pipeline, max_seconds=most)
+        outcome = outcome_of(pipeline, max_seconds=most)
         assert outcome.failure == f"out of time: killed after {most:g} s"
         pids = path.read_text().split() if path.exists() else []
         if len(pids) >= n:
@@ -131,27 +131,27 @@ def test_what_escapes_its_group_ends_too(tmp_path, monkeypatch):
     """Orphans in sessions of their own end with the child; the temporary folder has gone."""
     monkeypatch.setenv("PIPES_PID", str(tmp_path / "pid"))
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    pids = timed_out(pipes.escape, tmp_path / "pid", 2)
+    pids = processes_of(pipes.escape, tmp_path / "pid", 2)
     assert [pid for pid in pids if is_running(pid)] == []
     assert [path.name for path in tmp_path.iterdir()] == ["pid"]
 
 
 @pytest.mark.deep
 def test_memory_of_a_session_below_counts():
-    outcome = ended(pipes.hoard_below, max_bytes=600_000_000)
+    outcome = outcome_of(pipes.hoard_below, max_bytes=600_000_000)
     assert outcome.failure.startswith("too much memory: ")
 
 
 @pytest.mark.deep
 def test_time_out_kills_the_whole_group(tmp_path, monkeypatch):
     monkeypatch.setenv("PIPES_PID", str(tmp_path / "pid"))
-    (pid,) = timed_out(pipes.sleep, tmp_path / "pid", 1)
+    (pid,) = processes_of(pipes.sleep, tmp_path / "pid", 1)
     assert not is_running(pid)
 
 
 @pytest.mark.deep
 def test_too_much_memory():
-    outcome = ended(pipes.hoard, max_bytes=600_000_000)
+    outcome = outcome_of(pipes.hoard, max_bytes=600_000_000)
     assert outcome.failure.startswith("too much memory: ")
     assert outcome.failure.endswith(" MB resident, 600 MB allowed")
     assert 600e6 < outcome.peak_bytes < 1500e6
@@ -161,7 +161,7 @@ def test_too_much_memory():
 def test_peak_is_the_childs_own():
     """Not that of a large parent, which ru_maxrss would begin with."""
     hoard = np.ones(100_000_000)
-    outcome = ended(pipes.fine)
+    outcome = outcome_of(pipes.fine)
     assert outcome.peak_bytes < 0.7 * hoard.nbytes
 
 
