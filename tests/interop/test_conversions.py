@@ -73,24 +73,16 @@ def test_data_go_with_the_mesh(n):
 
 @pytest.mark.parametrize("convert", ["to_pyvista", "to_meshio"])
 def test_data_that_do_not_fit_are_one_line(convert):
+    """More cases of the check that writers share are in test_formats."""
     mesh = sample_model().mesh
-    ragged = [[1.0, 2.0]] + [[1.0]] * (len(mesh.cells) - 1)
-    for data in (
-        [1.0, 2.0],
-        ["a"] * len(mesh.cells),
-        3.0,
-        None,
-        ragged,
-        np.zeros((len(mesh.cells), 0)),
+    rows = r"expected an array of numbers with \d+ rows"
+    for data, words in (
+        ({"cell_data": {"a\nb": [1.0, 2.0]}}, rf"cell_data: 'a\\nb': {rows}, got "),
+        ({"point_data": {"u": np.zeros(len(mesh.cells) + 1)}}, f"point_data: 'u': {rows}"),
+        ({"point_data": np.zeros(len(mesh.points))}, "point_data: expected a dict of arrays"),
     ):
-        with refusal(r"^cell_data: 'a\\nb': expected an array of numbers with \d+ rows, got "):
-            getattr(mesh, convert)({"a\nb": data})
-    with refusal(r"^point_data: 'u': expected an array of numbers with \d+ rows"):
-        getattr(mesh, convert)(point_data={"u": np.zeros(len(mesh.cells) + 1)})
-    with refusal(r"^cell_data: expected strings as names, got 3"):
-        getattr(mesh, convert)({3: np.zeros(len(mesh.cells))})
-    with refusal(r"^point_data: expected a dict of arrays by name, got ndarray"):
-        getattr(mesh, convert)(point_data=np.zeros(len(mesh.points)))
+        with refusal(f"^{words}"):
+            getattr(mesh, convert)(**data)
 
 
 @pytest.mark.parametrize("kind", [">f8", ">f4", ">i4", ">u2", "f2", "g"])

@@ -2,6 +2,8 @@
 told.
 """
 
+from pathlib import Path
+
 import nibabel
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from refusals import assert_refused, refusal
 from tetopt.io.units import mm_of_unit
 
 pytest.importorskip("SimpleITK")
+pytestmark = pytest.mark.usefixtures("here")
 
 VOXELS = np.arange(3 * 4 * 500, dtype=np.uint8)  # 3 x 4 x 500: 10 mm long at 0.02 mm
 LPS = (
@@ -20,17 +23,17 @@ LPS = (
 )
 
 
-def nrrd(folder, fields, sizes="3 4 500"):
+def nrrd(fields, sizes="3 4 500"):
     n_axes = len(sizes.split())
     head = f"NRRD0004\ntype: uint8\ndimension: {n_axes}\nsizes: {sizes}\nencoding: raw\n{fields}\n"
-    (folder / "a.nrrd").write_bytes(head.encode() + VOXELS.tobytes())
-    return folder / "a.nrrd"
+    Path("a.nrrd").write_bytes(head.encode() + VOXELS.tobytes())
+    return Path("a.nrrd")
 
 
-def mha(folder, fields, data=VOXELS):
+def mha(fields, data=VOXELS):
     head = f"ObjectType = Image\nNDims = 3\nDimSize = 3 4 500\n{fields}ElementType = MET_UCHAR\n"
-    (folder / "a.mha").write_bytes(f"{head}ElementDataFile = LOCAL\n".encode() + data.tobytes())
-    return folder / "a.mha"
+    Path("a.mha").write_bytes(f"{head}ElementDataFile = LOCAL\n".encode() + data.tobytes())
+    return Path("a.mha")
 
 
 # Units
@@ -82,9 +85,9 @@ UNITS_OF_NRRD = {  # fields, voxel edges in mm, first voxel in RAS mm
 
 
 @pytest.mark.parametrize("name", UNITS_OF_NRRD)
-def test_units_of_nrrd(tmp_path, name):
+def test_units_of_nrrd(name):
     fields, steps, corner = UNITS_OF_NRRD[name]
-    image, said = read_warned(nrrd(tmp_path, fields))
+    image, said = read_warned(nrrd(fields))
     assert_allclose(image.spacing, steps, rtol=1e-12)
     assert_allclose(image.to_world([0, 0, 0]), corner, rtol=1e-12, atol=1e-12)
     assert ("or in another unit?" in "".join(said)) == (name == "none")  # 10 m long
@@ -92,27 +95,27 @@ def test_units_of_nrrd(tmp_path, name):
     assert ("it has no space" in "".join(said)) == (name == "of axes")
 
 
-def test_unit_of_no_length_in_nrrd(tmp_path):
+def test_unit_of_no_length_in_nrrd():
     for units, words in (
         ('"mm" "mm" "furlong"', 'expected a length such as "mm" or "um", got "furlong"'),
         ("um um um", "expected a unit in quotation marks per axis, got um um um"),
     ):
-        path = nrrd(tmp_path, f"{LPS}space units: {units}\n")
+        path = nrrd(f"{LPS}space units: {units}\n")
         assert_refused(path, f"space units: {words}")
-    image, said = read_warned(nrrd(tmp_path, LPS + 'space units: "um" "um" ""\n'))
+    image, said = read_warned(nrrd(LPS + 'space units: "um" "um" ""\n'))
     assert image.spacing.tolist() == pytest.approx([0.02, 0.02, 20.0])
     assert said == ['space units: expected a unit of length, got none for axis 2: ""; assuming mm']
 
 
-def test_unit_of_metaimage(tmp_path):
-    image, said = read_warned(mha(tmp_path, "ElementSpacing = 20 20 20\nDistanceUnits = um\n"))
+def test_unit_of_metaimage():
+    image, said = read_warned(mha("ElementSpacing = 20 20 20\nDistanceUnits = um\n"))
     assert (image.spacing.tolist(), said) == (pytest.approx([0.02] * 3), [])
 
 
 @pytest.mark.parametrize(
     ("unit", "said"), [("micron", None), ("mm", "0.1 mm, in the unit that"), ("unknown", "or in")]
 )
-def test_small_box_of_a_stated_unit(here, unit, said):
+def test_small_box_of_a_stated_unit(unit, said):
     step = 20.0 if unit == "micron" else 0.02
     file = nibabel.Nifti1Image(ramp(3, 4, 5), np.diag([step] * 3 + [1.0]))
     file.header.set_xyzt_units(unit)
@@ -125,7 +128,7 @@ def test_small_box_of_a_stated_unit(here, unit, said):
 # Headers that contradict themselves
 
 
-def nifti(folder, sform, qform, codes=(1, 1), **fields):
+def nifti(sform, qform, codes=(1, 1), **fields):
     header = nibabel.Nifti1Image(ramp(3, 4, 5), None).header
     header.set_qform(qform, codes[1])
     header.set_sform(sform, codes[0])
@@ -134,8 +137,8 @@ def nifti(folder, sform, qform, codes=(1, 1), **fields):
         header[name] = value
     # Saved by nibabel, a file would get one affine.
     raw = header.binaryblock + bytes(4) + ramp(3, 4, 5).tobytes(order="F")
-    (folder / "a.nii").write_bytes(raw)
-    return folder / "a.nii"
+    Path("a.nii").write_bytes(raw)
+    return Path("a.nii")
 
 
 def moved(by, affine=None):
@@ -189,16 +192,16 @@ PLACES = {  # sform, qform, codes, what is told; None for nothing
 
 
 @pytest.mark.parametrize("name", PLACES)
-def test_two_places_of_nifti(tmp_path, name):
+def test_two_places_of_nifti(name):
     sform, qform, codes, told = PLACES[name]
-    image, said = read_warned(nifti(tmp_path, sform, qform, codes))
+    image, said = read_warned(nifti(sform, qform, codes))
     assert said == [] if told is None else told in said[-1]
     if any(codes):
         expected = sform if codes[0] else qform
         assert_allclose(image.affine, expected.astype(np.float32), rtol=0, atol=1e-6)
 
 
-def test_shear_that_a_qform_cannot_have(here):
+def test_shear_that_a_qform_cannot_have():
     file = nibabel.Nifti1Image(np.zeros((200, 200, 90), np.uint8), OBLIQUE)
     file.header.set_qform(OBLIQUE, 1, strip_shears=True)
     file.header.set_sform(OBLIQUE, 1)
@@ -206,8 +209,8 @@ def test_shear_that_a_qform_cannot_have(here):
     assert not any("sform" in line for line in read_warned("a.nii.gz")[1])
 
 
-def test_sizes_of_nifti(tmp_path):
-    path = nifti(tmp_path, STEPS, STEPS, dim=[3, 3, 4, 4, 1, 1, 1, 1])
+def test_sizes_of_nifti():
+    path = nifti(STEPS, STEPS, dim=[3, 3, 4, 4, 1, 1, 1, 1])
     assert read_warned(path)[1] == [
         "its header declares 3 x 4 x 4 voxels, but the file has 24 more bytes after them; check "
         "its sizes"
@@ -250,12 +253,10 @@ METAIMAGES = {  # fields, what is told, voxel edges, RAS direction of the first 
 
 
 @pytest.mark.parametrize("name", METAIMAGES)
-def test_two_statements_of_metaimage(tmp_path, name):
+def test_two_statements_of_metaimage(name):
     fields, told, steps, first = METAIMAGES[name]
     has_size = "Element" in fields or name == "no size"
-    image, said = read_warned(
-        mha(tmp_path, fields if has_size else f"{fields}ElementSpacing = 1 1 1\n")
-    )
+    image, said = read_warned(mha(fields if has_size else f"{fields}ElementSpacing = 1 1 1\n"))
     assert said == [] if told is None else told in said[0], said
     if steps is not None:
         assert image.spacing.tolist() == pytest.approx(steps)
@@ -263,8 +264,8 @@ def test_two_statements_of_metaimage(tmp_path, name):
         assert_allclose(image.affine[:3, 0] / image.spacing[0], first)
 
 
-def test_more_voxels_than_metaimage_declares(tmp_path):
-    path = mha(tmp_path, "ElementSpacing = 1 1 1\n", data=np.zeros(3 * 4 * 501, np.uint8))
+def test_more_voxels_than_metaimage_declares():
+    path = mha("ElementSpacing = 1 1 1\n", data=np.zeros(3 * 4 * 501, np.uint8))
     assert "declares 3 x 4 x 500 voxels, but the file has 12 more bytes" in read_warned(path)[1][0]
 
 
@@ -295,9 +296,9 @@ NRRDS = {
 
 
 @pytest.mark.parametrize("name", NRRDS)
-def test_two_statements_of_nrrd(tmp_path, name):
+def test_two_statements_of_nrrd(name):
     fields, told = NRRDS[name]
-    said = read_warned(nrrd(tmp_path, fields))[1]
+    said = read_warned(nrrd(fields))[1]
     assert said == [] if told is None else told in said[0]
 
 
@@ -315,5 +316,5 @@ def test_two_statements_of_nrrd(tmp_path, name):
         ("space: LPS\nspacings: 1 1 1\n", 'has the space "LPS" but no "space directions"'),
     ],
 )
-def test_statements_that_nrrd_excludes(tmp_path, fields, told):
-    assert_refused(nrrd(tmp_path, fields), told)
+def test_statements_that_nrrd_excludes(fields, told):
+    assert_refused(nrrd(fields), told)

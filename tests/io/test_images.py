@@ -500,10 +500,13 @@ def test_files_that_cannot_be_used(here, name, raw, words):
 
 
 def test_flipped_bit_in_a_compressed_file(tmp_path):
-    """Stored, not deflated, blocks: only the checksum behind the last voxel can tell."""
-    packed, path = bytearray(gzip.compress(WHOLE, compresslevel=0)), tmp_path / "a.nii.gz"
+    """Stored, not deflated, blocks of 1 MiB in all, which are read at once: only the checksum
+    behind the last voxel can tell.
+    """
+    data, path = ramp(32, 3, 10919, dtype=np.uint8), tmp_path / "a.nii.gz"
+    packed = bytearray(gzip.compress(nifti(data), compresslevel=0))
     path.write_bytes(packed)
-    assert_array_equal(load_image(path).data, ramp(3, 4, 5))
+    assert_array_equal(load_image(path).data, data)
     packed[-20] ^= 1
     path.write_bytes(packed)
     assert_refused(path, f"{DAMAGED}; copy it again .*CRC")

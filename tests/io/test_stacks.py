@@ -1,5 +1,7 @@
 """TIFF stacks and folders of slices: voxel sizes, order, and what is refused."""
 
+from pathlib import Path
+
 import numpy as np
 import PIL.Image
 import pytest
@@ -10,12 +12,13 @@ from refusals import assert_refused
 from tetopt.io.images import load_image
 
 tifffile = pytest.importorskip("tifffile")
+pytestmark = pytest.mark.usefixtures("here")
 VOXELS = np.arange(10 * 5 * 7, dtype=np.uint16).reshape(10, 5, 7)  # slices, rows, columns
 
 
-def stack(folder, voxels=VOXELS, name="a.tif", **options):
-    tifffile.imwrite(folder / name, voxels, **options)
-    return folder / name
+def stack(voxels=VOXELS, path="a.tif", **options):
+    tifffile.imwrite(path, voxels, **options)
+    return Path(path)
 
 
 def folder_of(folder, numbers, suffix=".tif"):
@@ -53,9 +56,9 @@ CALIBRATED = {  # options of tifffile, voxel sizes
 
 
 @pytest.mark.parametrize("name", CALIBRATED)
-def test_calibrated_stack(tmp_path, name):
+def test_calibrated_stack(name):
     options, steps = CALIBRATED[name]
-    path = stack(tmp_path, **options)
+    path = stack(**options)
     image = load_image(path)
     assert_array_equal(image.data, VOXELS.T)
     assert_allclose(image.affine, np.diag([-steps[0], -steps[1], steps[2], 1.0]))
@@ -72,8 +75,8 @@ def test_calibrated_stack(tmp_path, name):
         {"imagej": True, "metadata": {"unit": "pixel", "spacing": 2.0, "axes": "ZYX"}},
     ],
 )
-def test_stack_without_voxel_size(tmp_path, options):
-    path = stack(tmp_path, **options)
+def test_stack_without_voxel_size(options):
+    path = stack(**options)
     assert_refused(path, r"this stack of 10 slices states no voxel size .*unknown mm.*`spacing_mm`")
     if options.get("imagej") is None:
         assert load_image(path, spacing_mm=[0.02, 0.02, 0.05]).spacing.tolist() == [
@@ -96,12 +99,12 @@ def test_stack_without_voxel_size(tmp_path, options):
         (VOXELS, {"ome": True, "metadata": {"axes": "TYX"}}, "got 10 time points"),
     ],
 )
-def test_stacks_of_no_volume(tmp_path, voxels, options, match):
-    assert_refused(stack(tmp_path, voxels, **options), match, spacing_mm=1.0)
+def test_stacks_of_no_volume(voxels, options, match):
+    assert_refused(stack(voxels, **options), match, spacing_mm=1.0)
 
 
-def test_truncated_stack(tmp_path):
-    path = stack(tmp_path)
+def test_truncated_stack():
+    path = stack()
     path.write_bytes(path.read_bytes()[:500])
     assert_refused(path, "truncated or damaged; copy it again", spacing_mm=1.0)
 
@@ -122,10 +125,11 @@ def test_folder_of_slices(tmp_path, suffix):
     )
 
 
-def sliced(folder, voxels=VOXELS, **options):
+def sliced(voxels=VOXELS, **options):
+    folder = Path("d")
     folder.mkdir(exist_ok=True)
     for k, plane in enumerate(voxels):
-        stack(folder, plane, f"s{k}.tif", **options)
+        stack(plane, folder / f"s{k}.tif", **options)
     return folder
 
 
@@ -134,12 +138,12 @@ def sliced(folder, voxels=VOXELS, **options):
     "options",
     [{"photometric": "miniswhite"}, *({"extratags": [(274, 3, 1, k, True)]} for k in (2, 3, 4))],
 )
-def test_stack_and_folder_of_the_same_slices_agree(tmp_path, kind, options):
+def test_stack_and_folder_of_the_same_slices_agree(kind, options):
     """Values are as stored, and the first voxel is where Orientation says."""
     voxels = VOXELS.astype(kind)
     images = [
         load_image(each, spacing_mm=1)
-        for each in (stack(tmp_path, voxels, **options), sliced(tmp_path / "d", voxels, **options))
+        for each in (stack(voxels, **options), sliced(voxels, **options))
     ]
     right = {2: voxels[:, :, ::-1], 3: voxels[:, ::-1, ::-1], 4: voxels[:, ::-1]}.get(
         options.get("extratags", [[0] * 4])[0][3], voxels
@@ -149,7 +153,7 @@ def test_stack_and_folder_of_the_same_slices_agree(tmp_path, kind, options):
     assert_array_equal(*(image.affine for image in images))
 
 
-def test_order_of_ome_and_its_full_level(here):
+def test_order_of_ome_and_its_full_level():
     planes = "".join(f'<TiffData IFD="{k}" FirstZ="{9 - k}" PlaneCount="1"/>' for k in range(10))
     words = (
         '<?xml version="1.0"?><OME '
@@ -158,19 +162,19 @@ def test_order_of_ome_and_its_full_level(here):
         'SizeZ="10" SizeC="1" SizeT="1" '
         f'PhysicalSizeX="20" PhysicalSizeY="20" PhysicalSizeZ="20">{planes}</Pixels></Image></OME>'
     )
-    with tifffile.TiffWriter(here / "a.ome.tif") as writer:
+    with tifffile.TiffWriter("a.ome.tif") as writer:
         for k, plane in enumerate(VOXELS):
             writer.write(
                 plane, description=words if k == 0 else None, contiguous=False, metadata=None
             )
     assert_array_equal(load_image("a.ome.tif").data, VOXELS[::-1].T)
-    with tifffile.TiffWriter(here / "b.ome.tif", ome=True) as writer:
+    with tifffile.TiffWriter("b.ome.tif", ome=True) as writer:
         writer.write(VOXELS, subifds=1, metadata={"axes": "ZYX"})
         writer.write(VOXELS[:, ::2, ::2], subfiletype=1)
     assert_array_equal(load_image("b.ome.tif", spacing_mm=1).data, VOXELS.T)
 
 
-def test_calibrated_values_of_imagej(here):
+def test_calibrated_values_of_imagej():
     """As signed numbers of 16 bits, which ImageJ stores without a sign; a page and a folder have
     them, too.
     """
@@ -180,7 +184,7 @@ def test_calibrated_values_of_imagej(here):
         "resolution": (20, 10),
         "metadata": IMAGEJ | line | {"unit": "mm", "spacing": 0.5},
     }
-    path = stack(here, **options)
+    path = stack(**options)
     assert_array_equal(load_image(path).data, 2.0 * VOXELS.T - 32768)
     page = load_image(path, volume=3)
     assert_array_equal(page.data, 2.0 * VOXELS[3] - 32768)
@@ -189,25 +193,25 @@ def test_calibrated_values_of_imagej(here):
         path, r"voxels of 0\.05 x 0\.1 mm, but `spacing_mm` is 1 x 1", volume=3, spacing_mm=1
     )
     options["metadata"].pop("axes")
-    folder = load_image(sliced(here / "d", **options))
+    folder = load_image(sliced(**options))
     assert_array_equal(folder.data, 2.0 * VOXELS.T - 32768)
     assert folder.spacing.tolist() == pytest.approx([0.05, 0.1, 0.5])
     assert_refused("d", r"0\.05 x 0\.1 x 0\.5 mm, but `spacing_mm` is 1 x 1 x 1", spacing_mm=1)
-    stack(here / "d", VOXELS[2], "s2.tif", **options | {"resolution": (20, 20)})
+    stack(VOXELS[2], "d/s2.tif", **options | {"resolution": (20, 20)})
     assert_refused("d", r"s2\.tif: expected the pixel size and calibration of s0\.tif")
     options["metadata"] |= IMAGEJ | {"cf": 3}
     with pytest.warns(
         UserWarning, match="calibration of them is no straight line and is not applied"
     ):
-        assert_array_equal(load_image(stack(here, **options)).data, VOXELS.T)
+        assert_array_equal(load_image(stack(**options)).data, VOXELS.T)
 
 
-def test_slices_written_one_by_one(here):
-    with tifffile.TiffWriter(here / "a.tif") as writer:
+def test_slices_written_one_by_one():
+    with tifffile.TiffWriter("a.tif") as writer:
         for plane in VOXELS:
             writer.write(plane)
     assert_array_equal(load_image("a.tif", spacing_mm=1).data, VOXELS.T)
-    with tifffile.TiffWriter(here / "b.tif") as writer:
+    with tifffile.TiffWriter("b.tif") as writer:
         for plane in VOXELS[0], VOXELS[1, :3]:
             writer.write(plane)
     assert_refused("b.tif", "expected slices of one size and type, got 5 x 7, 3 x 7", spacing_mm=1)
@@ -228,13 +232,13 @@ def test_slices_that_differ(tmp_path):
     assert_refused(path, "expected one series of numbered slices", spacing_mm=1.0)
 
 
-def test_a_command_names_its_option(tmp_path, capfd):
-    path = stack(tmp_path)
+def test_a_command_names_its_option(capfd):
+    path = stack()
     assert_command_refused(
-        capfd, ["mesh", path, "-o", tmp_path / "a.vtu"], "states no voxel size .* --spacing-mm"
+        capfd, ["mesh", path, "-o a.vtu"], "states no voxel size .* --spacing-mm"
     )
     assert_command_refused(
         capfd,
-        ["mesh", path, "-o", tmp_path / "a.vtu", "--spacing-mm", "x"],
+        ["mesh", path, "-o a.vtu", "--spacing-mm", "x"],
         'expected one number or three, .*got "x"',
     )

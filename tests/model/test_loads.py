@@ -77,6 +77,11 @@ WORDS = {  # and what they mean in 3-D
 }
 
 
+def loads_of(*texts):
+    model = sample_model()
+    return parse_loads(texts, model.mesh, model.sets)
+
+
 def plain(load):
     return load.kind, load.set_name, load.numbers.tolist(), load.step
 
@@ -97,17 +102,15 @@ def test_words_in_two_dimensions():
 
 
 def test_a_model_may_hold_without_pushing():
-    model = sample_model()
-    (load,) = parse_loads(["hold:left"], model.mesh, model.sets)
+    (load,) = loads_of("hold:left")
     assert plain(load) == ("displacement", "left", [0.0, 0.0, 0.0], 0)
-    assert len(parse_loads(["gravity:0,0,1"], model.mesh, model.sets)) == 1
-    assert parse_loads([], model.mesh, model.sets) == ()
+    assert len(loads_of("gravity:0,0,1")) == 1
+    assert loads_of() == ()
 
 
 def test_step_1_may_have_the_loads_of_all_steps_alone():
     """As weight in all, and a pressure from step 2 on."""
-    model = sample_model()
-    loads = parse_loads(["hold:left", "2/pressure:right:1"], model.mesh, model.sets)
+    loads = loads_of("hold:left", "2/pressure:right:1")
     assert count_of_steps(loads) == 2
     assert [load.kind for load in in_step(loads, 1)] == ["displacement"]
     assert [load.kind for load in in_step(loads, 2)] == ["displacement", "pressure"]
@@ -117,16 +120,12 @@ def test_components_and_steps_keep_displacements_apart():
     """The same nodes may be held along one axis by one load and along another by the next, or in
     other steps.
     """
-    model = sample_model()
     sliding = ["move:left:0,free,free", "move:superior:free,free,0", "move:inferior:free,0,1"]
-    assert len(parse_loads(sliding, model.mesh, model.sets)) == 3
-    steps = ["hold:superior", "1/move:inferior:0,0,1", "2/move:inferior:0,1,0"]
-    loads = parse_loads(steps, model.mesh, model.sets)
+    assert len(loads_of(*sliding)) == 3
+    loads = loads_of("hold:superior", "1/move:inferior:0,0,1", "2/move:inferior:0,1,0")
     assert count_of_steps(loads) == 2
-    assert [[load.numbers.tolist() for load in in_step(loads, step)][1] for step in (1, 2)] == [
-        [0, 0, 1],
-        [0, 1, 0],
-    ]
+    for step, numbers in ((1, [0, 0, 1]), (2, [0, 1, 0])):
+        assert in_step(loads, step)[1].numbers.tolist() == numbers
     assert count_of_steps(()) == 1
 
 
@@ -165,9 +164,8 @@ def test_components_and_steps_keep_displacements_apart():
     ],
 )
 def test_loads_that_are_none(texts, match):
-    model = sample_model()
     with refusal(match):
-        parse_loads(texts, model.mesh, model.sets)
+        loads_of(*texts)
 
 
 def test_an_organ_is_pressed_along_the_world_axis(n):
