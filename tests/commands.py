@@ -1,12 +1,14 @@
 """The command as its tests call it."""
 
+import io
 import json
 import os
 import re
 import shlex
 import shutil
-from contextlib import chdir
+from contextlib import chdir, redirect_stderr, redirect_stdout
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 from models import sample_image
@@ -75,6 +77,35 @@ def numbers_in(path):
     return json.loads(Path(path).read_text())
 
 
+class Printed(NamedTuple):
+    out: str
+    err: str
+
+
+def run_command(*words, code=0):
+    """What `tetopt` prints, which returns the code, or 0 or 1 where that is None."""
+    texts = [
+        io.TextIOWrapper(io.BytesIO(), encoding="utf-8", newline="", write_through=True)
+        for _ in range(2)
+    ]
+    with redirect_stdout(texts[0]), redirect_stderr(texts[1]):
+        ended = exit_code(*words)
+    printed = Printed(*[text.buffer.getvalue().decode() for text in texts])
+    assert ended in ((0, 1) if code is None else (code,)), printed.err
+    return printed
+
+
+def assert_refuses(words, said, code=2):
+    """A line says so, a part or pattern of which is known, and nothing is written."""
+    files = files_here()
+    out, err = run_command(*[words] if isinstance(words, str) else words, code=code)
+    assert out == ""
+    assert err.count("\n") == 1, err
+    assert err.startswith("tetopt: ")
+    assert said in err or re.search(said, err), err
+    assert files_here() == files
+
+
 def assert_refused(capture, words, said, code=2):
     """A line says so, a part or pattern of which is known, and nothing is written."""
     capture.readouterr()
@@ -88,6 +119,24 @@ def assert_refused(capture, words, said, code=2):
     assert files_here() == files
 
 
+def refusals(text):
+    """A test of each command line of a text; the line after it has a part or pattern of what is
+    said. Nothing else is printed, also by libraries.
+    """
+    rows = re.findall(r"^(\S.*)\n +(.*)$", text, re.MULTILINE)
+
+    @pytest.mark.parametrize(("words", "said"), rows, ids=[words for words, _ in rows])
+    def test_refused(words, said, capfd):
+        assert_refuses(words, said)
+        assert capfd.readouterr() == ("", "")
+
+    return test_refused
+
+
 def files_here():
-    """Those in the folder that a test works in; none in the repository, where others write."""
-    return set() if Path("pyproject.toml").exists() else set(Path().rglob("*"))
+    """Those in the folder that a test works in, and their bytes; none in the repository, where
+    others write.
+    """
+    if Path("pyproject.toml").exists():
+        return {}
+    return {path: path.is_file() and path.read_bytes() for path in Path().rglob("*")}

@@ -11,10 +11,8 @@ import shutil
 import signal
 import subprocess
 import sys
-from itertools import product
 from pathlib import Path
 
-import meshio
 import nibabel
 import numba
 import numpy as np
@@ -22,16 +20,16 @@ import PIL.Image
 import pytest
 from commands import (
     assert_done,
-    assert_refused,
+    assert_refuses,
     exit_code,
     in_copy_of,
     numbers_in,
-    separate,
+    refusals,
+    run_command,
 )
 from numpy.testing import assert_allclose, assert_array_equal
 
 import tetopt
-import tetopt.cli.mesh
 import tetopt.cli.phantom
 import tetopt.engine.meshing
 from tetopt import (
@@ -49,7 +47,6 @@ from tetopt import (
 )
 from tetopt.cli.app import COMMANDS, help_line, loaded_command
 from tetopt.cli.console import show_error, show_event
-from tetopt.geometry.simplex import volumes
 from tetopt.job.advice import order_problems, sentences, tell, unmet_requirements
 from tetopt.job.events import listen_with
 from tetopt.measure.judge import ERROR_RATE
@@ -77,6 +74,11 @@ label = 1
 """
 
 
+UNSET = (
+    "spacing volume crop slice start max_seconds max_gb target_error nodes_max size_min edge_size"
+)
+UNSET += " edge_max gradation sizing"
+
 here = in_copy_of("inputs")
 MESH = "mesh sphere.nii.gz -o a.vtu --json a.json"
 
@@ -90,182 +92,101 @@ def _same_threads_afterwards():
 
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory):
-    """A folder with small images and a mesh."""
+    """A folder with small images, meshes, and one run in 3-D with all its outputs."""
     folder = tmp_path_factory.mktemp("inputs")
-    assert_done("phantom sphere -o", folder / "sphere.nii.gz", "--voxel-mm 4")
-    assert_done("phantom disc_2d -o", folder / "disc.nii", "--voxel-mm 2")
-    save_image(folder / "flat.nii", Image(np.full((5, 6, 7), 3.0)))
-    save_mesh(folder / "lattice.vtu", lattice_mesh(load_image(folder / "sphere.nii.gz"), nodes=60))
+    assert_done(f"phantom sphere -o {folder}/sphere.nii.gz --voxel-mm 4")
+    assert_done(f"phantom disc_2d -o {folder}/disc.nii --voxel-mm 2")
+    save_image(f"{folder}/flat.nii", Image(np.full((5, 6, 7), 3.0)))
+    mesh = lattice_mesh(load_image(f"{folder}/sphere.nii.gz"), nodes=60)
+    save_mesh(f"{folder}/lattice.vtu", mesh)
+    # Once more a cell, and not all of the others: together they hold no more voxels than there are.
+    save_mesh(
+        f"{folder}/twice.vtu", Mesh(mesh.points, np.vstack([mesh.cells[3:], mesh.cells[4:5]]))
+    )
+    save_mesh(f"{folder}/far.vtu", Mesh(mesh.points + 1000.0, mesh.cells))
+    sphere = load_image(f"{folder}/sphere.nii.gz")
+    shifted = sphere.affine.copy()
+    shifted[0, 3] += 3.0
+    for name, values, affine in (
+        ("truth", sphere.data > 50, sphere.affine),
+        ("shifted", sphere.data > 50, shifted),
+        ("odd", np.where(sphere.data > 50, 1e30, 0.5), sphere.affine),
+    ):
+        save_image(f"{folder}/{name}.nii", Image(values, affine))
+    (folder / "a_file").write_text("a file")
+    run = f"mesh {folder}/sphere.nii.gz -o {folder}/run.vtu --json {folder}/run.json"
+    assert_done(f"{run} --nodes 150 --iterations 3 --k-d 0.3 --method paper --n-t 1")
     return folder
 
 
-@pytest.fixture(scope="module")
-def run(inputs, tmp_path_factory):
-    """One run in 3-D with all its outputs: folder, run.json, mesh file, image."""
-    folder = tmp_path_factory.mktemp("run")
-    command = [
-        "mesh",
-        inputs / "sphere.nii.gz",
-        "-o",
-        folder / "mesh.vtu",
-        "--nodes 150 --json",
-        folder / "run.json",
-        "--iterations 3 --k-d 0.3 --method paper --n-t 1",
-    ]
-    assert_done(*command)
-    return (
-        folder,
-        numbers_in(folder / "run.json"),
-        load_mesh(folder / "mesh.vtu"),
-        load_image(inputs / "sphere.nii.gz"),
-    )
-
-
-def box_corners(image):
-    return image.to_world(np.array(list(product(*[(-0.5, s - 0.5) for s in image.shape]))))
-
-
 def assert_covers(mesh, image):
-    """The mesh fills the image's box: its volume, and every corner is a node."""
-    v = volumes(mesh.points, mesh.cells)
-    assert v.min() > 0.0
-    assert v.sum() == pytest.approx(image.volume, rel=1e-9)
-    corners = box_corners(image)
-    distance = np.linalg.norm(mesh.points[:, None] - corners[None], axis=2).min(axis=0)
-    assert distance.max() < 1e-6
-    assert_allclose(mesh.points.min(axis=0), corners.min(axis=0), atol=1e-6)
-    assert_allclose(mesh.points.max(axis=0), corners.max(axis=0), atol=1e-6)
-
-
-def assert_round_trips(points, image):
-    """World -> voxel -> world within 1e-6 mm."""
-    assert np.abs(image.to_world(image.to_index(points)) - points).max() < 1e-6
+    """The mesh fills the image's box; places in the world are those of voxels within 1e-6 mm."""
+    assert tetopt.check_mesh(mesh, image) == []
+    assert mesh.cell_volumes.sum() == pytest.approx(image.volume, rel=1e-9)
+    assert_allclose(image.to_world(image.to_index(mesh.points)), mesh.points, rtol=0, atol=1e-6)
 
 
 # --------------------------------------------------------------------------------------------------
 # mesh
 
 
-def test_mesh_in_3d(run):
-    folder, numbers, file, image = run
-    assert sorted(p.name for p in folder.iterdir()) == ["mesh.vtu", "run.json"]
+def test_numbers_and_file_of_a_run():
+    numbers, file, image = (
+        numbers_in("run.json"),
+        load_mesh("run.vtu"),
+        load_image("sphere.nii.gz"),
+    )
     assert_covers(file.mesh, image)
-    assert_round_trips(file.mesh.points, image)
-    assert file.n_turned == 0
-    assert file.mesh.ndim == 3
-    assert numbers["quality"]["n_nodes"] == len(file.mesh.points)
     assert abs(len(file.mesh.points) - 150) <= 5
     assert numbers["energies"]["E_D_relative"] < 0.5  # the sphere is found
-
-
-SIZES = ("size_min", "edge_size", "edge_max", "gradation", "sizing")
-
-
-def test_json_of_a_run(run):
-    _, numbers, file, _ = run
-    assert numbers["image"] == "sphere.nii.gz"
-    assert numbers["image_sha256"] == hashlib.sha256(Path("sphere.nii.gz").read_bytes()).hexdigest()
-    options = numbers["options"]
-    assert (options["method"], options["n_t"], options["retessellate"]) == ("paper", 1, "first")
-    assert (options["nodes"], options["lattice"], options["boundary"]) == (150, "bcc", "slide")
-    assert (options["k_D"], options["iterations"]) == (0.3, 3)
-    for name in (
-        "spacing",
-        "volume",
-        "crop",
-        "slice",
-        "start",
-        "max_seconds",
-        "max_gb",
-        "target_error",
-        "nodes_max",
-        *SIZES,
-    ):
-        assert options[name] is None
+    checksum = hashlib.sha256(Path("sphere.nii.gz").read_bytes()).hexdigest()
+    assert (numbers["image"], numbers["image_sha256"]) == ("sphere.nii.gz", checksum)
+    given = {"method": "paper", "n_t": 1, "nodes": 150, "k_D": 0.3, "iterations": 3}
+    defaults = {"retessellate": "first", "lattice": "bcc", "boundary": "slide"} | dict.fromkeys(
+        UNSET.split()
+    )
+    assert numbers["options"].items() >= (given | defaults).items()
     assert numbers["versions"]["tetopt"] == tetopt.__version__
     assert numbers["versions"]["numba"] == numba.__version__
     assert numbers["machine"]["threads"] == numba.get_num_threads()
-    assert numbers["ended"] == "iterations"
-    assert numbers["iterations_done"] == 3
-    assert [row["iteration"] for row in numbers["history"]] == [0, 1, 2, 3]
-    assert [row["n_voxels"] for row in numbers["history"]] == [16**3] * 4
+    assert (numbers["ended"], numbers["iterations_done"]) == ("iterations", 3)
+    rows = [(row["iteration"], row["n_voxels"]) for row in numbers["history"]]
+    assert rows == [(k, 16**3) for k in range(4)]
     E = [row["E"] for row in numbers["history"]]
     assert E[0] == 1.0
-    assert E[2] >= E[3]  # the connectivity is fixed from iteration 2 on
-    assert numbers["energies"]["E"] == E[-1]
+    assert E[2] >= E[3] == numbers["energies"]["E"]  # the connectivity is fixed from 2 on
     assert numbers["mesh_sha256"] == mesh_hash(file.mesh)
     measured = quality(file.mesh.points, file.mesh.cells)
+    assert numbers["quality"]["n_nodes"] == len(file.mesh.points)
     assert numbers["quality"]["errors"] == measured.errors._asdict()
     assert numbers["quality"]["min_dihedral"] == measured.min_dihedral
     assert set(numbers["seconds"]) == {"load", "optimize", "all"}
     assert numbers["seconds"]["all"] >= numbers["seconds"]["optimize"] > 0.0
-
-
-def test_mesh_file_of_a_run(run):
-    folder, numbers, file, image = run
-    assert list(file.cell_data) == [
-        "mean",
-        "variance",
-        "n_voxels",
-        "min",
-        "max",
-        "volume",
-        "rho",
-        "min_dihedral",
-    ]
-    moments = tetopt.cell_moments(image, file.mesh)
-    assert_array_equal(file.cell_data["n_voxels"], moments.n_voxels)
-    assert_array_equal(file.cell_data["mean"], moments.mean)
-    assert file.cell_data["n_voxels"].sum() == image.data.size
-    assert (file.cell_data["n_voxels"] * file.cell_data["mean"]).sum() == pytest.approx(
-        image.data.sum(), rel=1e-12
-    )
-    assert_array_equal(file.cell_data["volume"], volumes(file.mesh.points, file.mesh.cells))
+    fields, moments = file.cell_data, tetopt.cell_moments(image, file.mesh)
+    names = "mean variance n_voxels min max volume rho min_dihedral"
+    assert list(fields) == names.split()
+    assert_array_equal(fields["n_voxels"], moments.n_voxels)
+    assert_array_equal(fields["mean"], moments.mean)
+    assert fields["n_voxels"] @ fields["mean"] == pytest.approx(image.data.sum(), rel=1e-12)
+    assert_array_equal(fields["volume"], file.mesh.cell_volumes)
     texts = {name: values[0] for name, values in file.field_data.items()}
     assert texts["tetopt"] == tetopt.__version__
-    assert texts["image"] == "sphere.nii.gz"
-    assert texts["image_sha256"] == numbers["image_sha256"]
+    assert (texts["image"], texts["image_sha256"]) == ("sphere.nii.gz", checksum)
     assert json.loads(texts["options"]) == numbers["options"]
-    other = meshio.read(folder / "mesh.vtu")
-    assert_array_equal(other.points, file.mesh.points)
-    assert_array_equal(other.cells_dict["tetra"], file.mesh.cells)
 
 
 def test_mesh_in_2d(here):
     assert_done("mesh disc.nii -o disc.vtu --nodes 80 --iterations 4")
     image, file = load_image("disc.nii"), load_mesh("disc.vtu")
     assert_covers(file.mesh, image)
-    assert_round_trips(file.mesh.points, image)
     assert file.cell_data["n_voxels"].sum() == image.data.size
     # The disc of 20 mm, of intensity 100 on 20: what the cells hold of it lies in its place, (0,
     # 0).
-    weight = file.cell_data["volume"] * (file.cell_data["mean"] - 20.0)
-    assert weight.sum() / 80.0 == pytest.approx(np.pi * 20.0**2, rel=0.05)
+    area = file.cell_data["volume"] @ (file.cell_data["mean"] - 20.0) / 80.0
+    assert area == pytest.approx(np.pi * 20.0**2, rel=0.05)
     assert here() == ["disc.vtu"]
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        "--method paper --boundary fixed --retessellate never",
-        "--retessellate accept --n-t 0 --method paper",
-        "--shape-power 1 --min-dihedral 0",
-        "--k-d 0 --lattice five-tet",
-        "--crop 2:14,:,1:15",
-    ],
-)
-def test_other_options(options):
-    assert_done(f"{MESH} --spacing 16 --iterations 1 {options}")
-    image = load_image(
-        "sphere.nii.gz",
-        crop=[(2, 14), (None, None), (1, 15)] if "--crop" in options else None,
-    )
-    file = load_mesh("a.vtu")
-    assert_covers(file.mesh, image)
-    stated = numbers_in("a.json")["options"]
-    for name, value in zip(*[iter(options.split())] * 2, strict=True):
-        key = {"--k-d": "k_D"}.get(name, name[2:].replace("-", "_"))
-        assert str(stated[key]) in (value, f"{value}.0")
+    area = run_command("quality disc.vtu --image disc.nii").out
+    assert re.search(r"^area, mm2 +4096.00$", area, re.M)
 
 
 @pytest.mark.parametrize(
@@ -281,112 +202,85 @@ def test_no_iterations_write_the_lattice_itself(name, size):
     assert_array_equal(mesh.cells, expected.cells)
 
 
-def test_the_table_shows_before_and_after_and_lines_the_progress(capsys):
-    assert_done(f"{MESH} --nodes 150 --iterations 3")
-    numbers, said = numbers_in("a.json"), capsys.readouterr()
+def test_the_table_shows_before_and_after_and_lines_the_progress():
+    said, numbers = run_command(f"{MESH} --nodes 150 --iterations 3"), numbers_in("a.json")
     lines = said.out.splitlines()
-    table = {
-        row[0]: row[1:]
-        for row in (re.split(r"\s{2,}", line.strip()) for line in lines)
-        if len(row) == 3
-    }
-    first, last = numbers["quality_initial"], numbers["quality"]
     assert lines[0].split() == ["octree", "optimised"]
-    energies = numbers["energies"]
-    fractions = [energies[f"E_D_fraction_of_variance{when}"] for when in ("_initial", "")]
-    assert table["E_D, fraction of the image's variance"] == [
-        f"{fraction:.5f}" for fraction in fractions
-    ]
-    assert table["rho, mean"] == [f"{first['mean_rho']:.4f}", f"{last['mean_rho']:.4f}"]
-    assert table["smallest angle, degrees"] == [
-        f"{first['min_dihedral']:.2f}",
-        f"{last['min_dihedral']:.2f}",
-    ]
-    assert table["rho, mean"][0] != table["rho, mean"][1]
-    nodes, cells = last["n_nodes"], last["n_cells"]
+    table = dict(re.findall(r"^(.+?)\s{2,}(.*\S)", said.out, re.M))
+    for row, of, key, digits in (
+        ("E_D, fraction of the image's variance", "energies", "E_D_fraction_of_variance", 5),
+        ("rho, mean", "quality", "mean_rho", 4),
+        ("smallest angle, degrees", "quality", "min_dihedral", 2),
+    ):
+        before, after = (
+            [numbers[of][f"{key}_initial"], numbers[of][key]]
+            if of == "energies"
+            else [numbers[f"{of}_initial"][key], numbers[of][key]]
+        )
+        assert before != after
+        assert table[row].split() == [f"{before:.{digits}f}", f"{after:.{digits}f}"]
+    nodes, cells = numbers["quality"]["n_nodes"], numbers["quality"]["n_cells"]
     assert lines[-2:] == [
         "a.json: every number of the run",
         f"all requirements are met; a.vtu: {nodes} nodes, {cells} cells",
     ]
-    history, lines = numbers["history"], said.err.splitlines()
+    first, *lines = said.err.splitlines()
     words = (
         "16 x 16 x 16 voxels of 4 x 4 x 4 mm; octree of 148 nodes, 576 cells, edges up to 26.7 mm"
     )
-    first = f"sphere.nii.gz: {words}"
-    assert re.fullmatch(rf"{re.escape(first)}; about \d\.\d+ GB of memory", lines[0])
-    progress = [line for line in lines[1:] if line.startswith("iteration")]
-    assert len(progress) == 4
+    assert re.fullmatch(rf"sphere.nii.gz: {words}; about \d\.\d+ GB of memory", first)
+    history = numbers["history"]
+    progress = [line for line in lines if line.startswith("iteration")]
     for k, (line, row) in enumerate(zip(progress, history, strict=True)):
         E_D = row["E_D"] / history[0]["E_D"]
         assert line.startswith(f"iteration   {k}/3  E {row['E']:.4f}  E_G ")
         assert f"  E_D {E_D:.4f}  {row['n_cells']} cells  " in line
-    assert not any("\x1b" in line for line in lines)  # no colours, no cursor movements
+    assert "\x1b" not in said.err  # no colours, no cursor movements
 
 
-def test_a_constant_image_warns_and_works(capsys):
-    assert_done("mesh flat.nii -o a.vtu --json a.json --nodes 50 --iterations 2")
-    captured = capsys.readouterr()
+def test_a_constant_image_warns_and_works():
+    said = run_command("mesh flat.nii -o a.vtu --json a.json --nodes 50 --iterations 2")
     warning = "tetopt: warning: flat.nii: the image is 3 everywhere, so E_D is 0 everywhere"
-    assert captured.err.splitlines()[0] == warning
-    assert captured.err.count("warning") == 1
-    assert "E_D" not in captured.out
+    assert said.err.splitlines()[0] == warning
+    assert said.err.count("warning") == 1
+    assert "E_D" not in said.out
     assert numbers_in("a.json")["energies"]["E_D_relative"] is None
-    assert_covers(load_mesh("a.vtu").mesh, load_image_quietly("flat.nii"))
-
-
-def load_image_quietly(path):
     with pytest.warns(UserWarning, match="everywhere"):
-        return load_image(path)
+        assert_covers(load_mesh("a.vtu").mesh, load_image("flat.nii"))
 
 
-def test_a_name_with_markup_and_letters(capsys):
+def test_a_name_with_markup_and_letters():
     """Rich would take [red] for a colour and :cat: for a picture."""
     folder = Path("Schädel [red] :cat:")
     folder.mkdir()
     shutil.copy("disc.nii", folder / "ä[1].nii")
-    command = [
-        "mesh",
-        folder / "ä[1].nii",
-        "-o",
-        folder / "a[b].vtu",
-        "--nodes 30 --iterations 1",
-    ]
-    assert_done(*command)
-    captured = capsys.readouterr()
-    assert captured.err.startswith(f"{folder / 'ä[1].nii'}: 32 x 32 voxels")
-    assert f"{folder / 'a[b].vtu'}: " in captured.out
-    assert load_mesh(folder / "a[b].vtu").field_data["image"].tolist() == ["ä[1].nii"]
-    assert_done("quality", folder / "a[b].vtu")
-    assert capsys.readouterr().out.splitlines()[0].strip() == "a[b].vtu"
+    mesh = folder / "a[b].vtu"
+    said = run_command("mesh", folder / "ä[1].nii", "-o", mesh, "--nodes 30 --iterations 1")
+    assert said.err.startswith(f"{folder / 'ä[1].nii'}: 32 x 32 voxels")
+    assert f"{mesh}: " in said.out
+    assert load_mesh(mesh).field_data["image"].tolist() == ["ä[1].nii"]
+    assert run_command("quality", mesh).out.splitlines()[0].strip() == "a[b].vtu"
 
 
 @pytest.mark.skipif(
     numba.config.NUMBA_NUM_THREADS < 2, reason="one core: there are no two thread counts to compare"
 )
 def test_the_same_bits_for_any_number_of_threads():
-    hashes = []
-    for threads in ("1", "2"):
-        out = threads
-        command = f"mesh sphere.nii.gz -o {out}.vtu --json {out}.json --nodes 400"
+    for threads in (1, 2):
+        command = f"mesh sphere.nii.gz -o {threads}.vtu --json {threads}.json --nodes 400"
         assert_done(f"{command} --iterations 3 --threads {threads}")
-        numbers = numbers_in(f"{out}.json")
-        assert numbers["machine"]["threads"] == int(threads)
-        hashes.append(numbers["mesh_sha256"])
-        assert hashes[-1] == mesh_hash(load_mesh(f"{out}.vtu").mesh)
-    assert hashes[0] == hashes[1]
+        assert numbers_in(f"{threads}.json")["machine"]["threads"] == threads
     assert Path("1.vtu").read_bytes() == Path("2.vtu").read_bytes()
 
 
-def test_max_seconds_leaves_a_valid_mesh(capsys):
-    assert_done(f"{MESH} --nodes 400 --iterations 1000 --max-seconds 1e-6")
-    numbers = numbers_in("a.json")
-    assert numbers["ended"] == "max_seconds"
-    assert numbers["options"]["max_seconds"] == 1e-6
+def test_max_seconds_leaves_a_valid_mesh():
+    said = run_command(f"{MESH} --nodes 400 --iterations 1000 --max-seconds 1e-6").err
+    assert "out of time: the current mesh is kept" in said
+    numbers, mesh = numbers_in("a.json"), load_mesh("a.vtu").mesh
+    assert (numbers["ended"], numbers["options"]["max_seconds"]) == ("max_seconds", 1e-6)
     assert numbers["iterations_done"] < 1000
-    mesh = load_mesh("a.vtu").mesh
     assert_covers(mesh, load_image("sphere.nii.gz"))
     assert numbers["mesh_sha256"] == mesh_hash(mesh)
-    assert "out of time: the current mesh is kept" in capsys.readouterr().err
 
 
 def test_what_is_violated_is_told_in_the_commands_options(capsys):
@@ -398,8 +292,7 @@ def test_what_is_violated_is_told_in_the_commands_options(capsys):
         problems = order_problems(unmet_requirements(violated, {}))
         assert sentences(problems) == violated
         tell(problems)
-    said = capsys.readouterr().err
-    assert said == (
+    assert capsys.readouterr().err == (
         "tetopt: requirement violated: min_dihedral: 2 of 9 cells; allow a lower --k-d, or a "
         "lower --min-dihedral\n"
         "tetopt: requirement violated: box: k_D.nii lies beyond\n"
@@ -410,45 +303,9 @@ def test_what_is_violated_is_told_in_the_commands_options(capsys):
 # Ctrl-C
 
 
-def child(arguments, **options):
-    environment = os.environ | {"PYTHONPATH": str(Path(tetopt.__file__).parents[1])}
-    return subprocess.Popen(
-        [sys.executable, "-m", "tetopt", *separate(arguments)],
-        env=environment,
-        text=True,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        **options,
-    )
-
-
 @pytest.mark.deep
 @pytest.mark.skipif(os.name == "nt", reason="Windows sends no SIGINT to one process")
-def test_ctrl_c_leaves_a_valid_mesh(here):
-    process = child([MESH, "--nodes 400 --iterations 100000 --k-d 0.9"])
-    try:
-        for line in process.stderr:
-            if line.startswith("iteration   2/100000"):
-                break
-        process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=60)
-    finally:
-        process.kill()
-    assert process.returncode == 130
-    assert "interrupted: the current mesh is kept" in errors
-    assert "Traceback" not in errors
-    mesh = load_mesh("a.vtu").mesh
-    assert_covers(mesh, load_image("sphere.nii.gz"))
-    numbers = numbers_in("a.json")
-    assert numbers["ended"] == "stopped"
-    assert 2 <= numbers["iterations_done"] < 100000
-    assert numbers["mesh_sha256"] == mesh_hash(mesh)
-    assert here() == ["a.json", "a.vtu"]
-
-
-@pytest.mark.deep
-@pytest.mark.skipif(os.name == "nt", reason="Windows sends no SIGINT to one process")
-def test_a_second_ctrl_c_gives_up(here, monkeypatch, capsys):
+def test_a_second_ctrl_c_gives_up(here, monkeypatch):
     def impatient(*_, stop, **__):
         signal.raise_signal(signal.SIGINT)
         assert stop()
@@ -461,9 +318,9 @@ def test_a_second_ctrl_c_gives_up(here, monkeypatch, capsys):
         functools.wraps(tetopt.engine.meshing.optimize)(impatient),
     )
     before = signal.getsignal(signal.SIGINT)
-    assert exit_code("mesh disc.nii -o a.vtu") == 130
+    said = run_command("mesh disc.nii -o a.vtu", code=130).err
     assert signal.getsignal(signal.SIGINT) is before
-    assert capsys.readouterr().err.splitlines()[-3:] == [
+    assert said.splitlines()[-3:] == [
         "interrupted: finishing the current nodes, then writing the mesh (interrupt again to end "
         "at once)",
         "interrupted again: unwritten results are discarded",
@@ -486,127 +343,187 @@ def test_ctrl_c_while_reading(here, monkeypatch):
 # Inputs to mend
 
 
-BAD_OPTIONS = [  # of one image
-    ("--nodes 6", "9 or more in 3-D, got 6"),
-    ("--uniform --nodes 6", "expected 9 to 50000000 nodes"),
-    ("--nodes 1000000000", "--nodes: expected a whole number from 5 to 50000000, got 1000000000"),
-    ("--nodes 1e9", "--nodes: expected a whole number from 5 to 50000000, got 1000000000"),
-    ("--nodes many", "--nodes: expected a whole number, got 'many'"),
-    ("--nodes -5", "--nodes: expected a whole number from 5 to 50000000, got -5"),
-    ("--spacing 0", "--spacing: expected a length above 0 mm"),
-    ("--k-d 1", "--k-d: expected 0 <= k_D < 1, got 1.0"),
-    ("--k-d abc", "--k-d: expected a number, got 'abc'"),
-    ("--iterations -1", "--iterations: expected 0 or more, got -1"),
-    ("--threads 10000", "--threads: expected 1 to .* got 10000"),
-    ("--max-seconds 0", "--max-seconds: expected more than 0"),
-    ("--lattice criss-cross", "expected one of bcc, five-tet in 3-D"),
-    ("--method fast --n-t 2", "--n-t: only with --method paper"),
-    ("--method paper --shape-power 3", "--shape-power: only with --method fast"),
-    ("--min-dihedral 80", "--min-dihedral: expected 0 to below 70"),
-    ("--shape-power 0.5", "--shape-power: expected 1"),
-    ("--retessellate always", "--retessellate"),
-    ("--slice z", 'slice: expected .* got "z"'),
-    ("--slice k=99", "slice: expected an index from 0 to 15 along axis 2, got 99"),
-    ("--crop 0:100:5", 'crop: expected .* got "0:100:5"'),  # :100: is an emoji to rich
-    ("--crop 0:99,:,:", "crop"),
-    ("--volume 1", "got 1: the file has one volume"),
-    ("--json no/such/run.json", "folder does not exist"),
-    ("--json run.txt", "ending in .json"),
-    ("--unknown", "No such option: --unknown"),
-    ("--lattice octree --method paper", "only with --method fast"),
-    ("--lattice octree --spacing 3", "no single spacing"),
-    ("--lattice octree --nodes 900000", "too many for 16 x 16 x 16 voxels; use at most 5000"),
-    (
-        "--lattice octree --target-error 1.5",
-        "expected a fraction of the image's variance, 0 to 1, got 1.5",
-    ),
-    (
-        "--lattice octree --edge-size 0.2",
-        "sizes: the requested edges are so short that cells are smaller",
-    ),
-    (
-        "--lattice octree --size-min 9 --edge-max 8",
-        "--edge-max: 8 mm is below the smallest size, 9 mm",
-    ),
-    ("--lattice octree --edge-size -1", "--edge-size: expected a length above 0"),
-    ("--lattice octree --gradation 3", "gradation: expected 0.05 (gentle) to 1, got 3"),
-    ("--uniform --target-error 0.1", "--target-error: needs a graded mesh"),
-    ("--spacing 8 --edge-size 9", "--edge-size: needs a graded mesh"),
-    ("--method paper --edge-max 9", "--edge-max: needs a graded mesh"),
-    ("--nodes-max 300", "--nodes-max: needs --target-error"),
-    ("--nodes-max 300 --nodes 200", "--nodes-max: needs --target-error"),
-    ("--nodes-max 300 --spacing 9", "--nodes-max: needs --target-error"),
-    ("--nodes-max 4 --target-error 0.2", "--nodes-max: expected 5 or more, got 4"),
-    (
-        "--nodes-max 8 --target-error 0.2",
-        "--nodes-max: expected a whole number, 9 or more in 3-D, got 8",
-    ),
-    ("--nodes-max 60 --target-error 0.2 --edge-max 9", "--nodes-max: sizes require about"),
-    ("second.nii", "second.nii"),
-]
-
-
-@pytest.mark.parametrize(
-    ("options", "said"), BAD_OPTIONS, ids=[options for options, _ in BAD_OPTIONS]
+test_refused = refusals(
+    r"""
+mesh sphere.nii.gz -o a.vtu --nodes 6
+    9 or more in 3-D, got 6
+mesh sphere.nii.gz -o a.vtu --uniform --nodes 6
+    expected 9 to 50000000 nodes
+mesh sphere.nii.gz -o a.vtu --nodes 1000000000
+    --nodes: expected a whole number from 5 to 50000000, got 1000000000
+mesh sphere.nii.gz -o a.vtu --nodes 1e9
+    --nodes: expected a whole number from 5 to 50000000, got 1000000000
+mesh sphere.nii.gz -o a.vtu --nodes many
+    --nodes: expected a whole number, got 'many'
+mesh sphere.nii.gz -o a.vtu --nodes -5
+    --nodes: expected a whole number from 5 to 50000000, got -5
+mesh sphere.nii.gz -o a.vtu --spacing 0
+    --spacing: expected a length above 0 mm
+mesh sphere.nii.gz -o a.vtu --k-d 1
+    --k-d: expected 0 <= k_D < 1, got 1.0
+mesh sphere.nii.gz -o a.vtu --k-d abc
+    --k-d: expected a number, got 'abc'
+mesh sphere.nii.gz -o a.vtu --iterations -1
+    --iterations: expected 0 or more, got -1
+mesh sphere.nii.gz -o a.vtu --threads 10000
+    --threads: expected 1 to .* got 10000
+mesh sphere.nii.gz -o a.vtu --max-seconds 0
+    --max-seconds: expected more than 0
+mesh sphere.nii.gz -o a.vtu --lattice criss-cross
+    expected one of bcc, five-tet in 3-D
+mesh sphere.nii.gz -o a.vtu --method fast --n-t 2
+    --n-t: only with --method paper
+mesh sphere.nii.gz -o a.vtu --method paper --shape-power 3
+    --shape-power: only with --method fast
+mesh sphere.nii.gz -o a.vtu --min-dihedral 80
+    --min-dihedral: expected 0 to below 70
+mesh sphere.nii.gz -o a.vtu --shape-power 0.5
+    --shape-power: expected 1
+mesh sphere.nii.gz -o a.vtu --retessellate always
+    --retessellate
+mesh sphere.nii.gz -o a.vtu --slice z
+    slice: expected .* got "z"
+mesh sphere.nii.gz -o a.vtu --slice k=99
+    slice: expected an index from 0 to 15 along axis 2, got 99
+mesh sphere.nii.gz -o a.vtu --crop 0:100:5
+    crop: expected .* got "0:100:5"
+mesh sphere.nii.gz -o a.vtu --crop 0:99,:,:
+    crop
+mesh sphere.nii.gz -o a.vtu --volume 1
+    got 1: the file has one volume
+mesh sphere.nii.gz -o a.vtu --json no/such/run.json
+    folder does not exist
+mesh sphere.nii.gz -o a.vtu --json run.txt
+    ending in .json
+mesh sphere.nii.gz -o a.vtu --unknown
+    No such option: --unknown
+mesh sphere.nii.gz -o a.vtu --lattice octree --method paper
+    only with --method fast
+mesh sphere.nii.gz -o a.vtu --lattice octree --spacing 3
+    no single spacing
+mesh sphere.nii.gz -o a.vtu --lattice octree --nodes 900000
+    too many for 16 x 16 x 16 voxels; use at most 5000
+mesh sphere.nii.gz -o a.vtu --lattice octree --target-error 1.5
+    expected a fraction of the image's variance, 0 to 1, got 1.5
+mesh sphere.nii.gz -o a.vtu --lattice octree --edge-size 0.2
+    sizes: the requested edges are so short that cells are smaller
+mesh sphere.nii.gz -o a.vtu --lattice octree --size-min 9 --edge-max 8
+    --edge-max: 8 mm is below the smallest size, 9 mm
+mesh sphere.nii.gz -o a.vtu --lattice octree --edge-size -1
+    --edge-size: expected a length above 0
+mesh sphere.nii.gz -o a.vtu --lattice octree --gradation 3
+    gradation: expected 0.05 (gentle) to 1, got 3
+mesh sphere.nii.gz -o a.vtu --uniform --target-error 0.1
+    --target-error: needs a graded mesh
+mesh sphere.nii.gz -o a.vtu --spacing 8 --edge-size 9
+    --edge-size: needs a graded mesh
+mesh sphere.nii.gz -o a.vtu --method paper --edge-max 9
+    --edge-max: needs a graded mesh
+mesh sphere.nii.gz -o a.vtu --nodes-max 300
+    --nodes-max: needs --target-error
+mesh sphere.nii.gz -o a.vtu --nodes-max 300 --nodes 200
+    --nodes-max: needs --target-error
+mesh sphere.nii.gz -o a.vtu --nodes-max 300 --spacing 9
+    --nodes-max: needs --target-error
+mesh sphere.nii.gz -o a.vtu --nodes-max 4 --target-error 0.2
+    --nodes-max: expected 5 or more, got 4
+mesh sphere.nii.gz -o a.vtu --nodes-max 8 --target-error 0.2
+    --nodes-max: expected a whole number, 9 or more in 3-D, got 8
+mesh sphere.nii.gz -o a.vtu --nodes-max 60 --target-error 0.2 --edge-max 9
+    --nodes-max: sizes require about
+mesh sphere.nii.gz -o a.vtu second.nii
+    second.nii
+mesh no.nii -o a.vtu
+    no.nii: no such file
+mesh disc.nii -o a.vtu --lattice bcc
+    expected one of criss-cross in 2-D
+mesh disc.nii -o a.vtu --slice k=3
+    slice
+mesh disc.nii -o a.vtu --crop 1:5,1:5,1:5
+    crop
+mesh disc.nii -o a.obj
+    unknown suffix; known suffixes are .vtu
+mesh disc.nii
+    --output
+mesh -o a.vtu
+    Missing argument 'IMAGE\.\.\.'
+mesh lattice.vtu -o a.vtu
+    unknown image format
+quality no.vtu
+    no such file
+quality disc.nii
+    expected a .vtu, .vtk, .msh or .msh2 mesh
+quality lattice.vtu --image no.nii
+    no such file
+quality lattice.vtu --image disc.nii
+    a 3-D image like the mesh, got a 2-D one
+quality
+    Missing argument '\[IMAGE\] MESH'
+phantom nothing -o a.nii
+    phantom 'nothing': no such phantom; use one of constant
+phantom no.toml -o a.nii
+    no.toml
+phantom sphere -o a.png
+    ending in .nii or .nii.gz
+phantom sphere -o a.nii --labels ./a.nii
+    or another output
+phantom sphere -o a.nii --voxel-mm 0
+    --voxel-mm:
+phantom sphere -o a.nii --noise-sd -1
+    --noise-sd:
+phantom sphere -o a.nii --seed x
+    --seed
+refine
+    No such command 'refine'
+mesh sphere.nii.gz -o a.vtu --figures new/deep --mask no.nii
+    no.nii
+mesh sphere.nii.gz -o a.vtu --figures a_file
+    expected a folder for the results, found a file
+mesh sphere.nii.gz -o a.vtu --figures a_file/a
+    a: cannot create the folder for the results
+compare disc.nii -o new
+    expected a volume
+mesh sphere.nii.gz -o a.vtu --json run.json
+    run.json: already exists; pass --force
+phantom sphere -o odd.nii
+    already exists
+phantom sphere -o new.nii --labels odd.nii
+    already exists
+quality lattice.vtu --json run.json
+    already exists
+segment sphere.nii.gz lattice.vtu -o odd.nii
+    exists
+quality far.vtu --image sphere.nii.gz
+    no voxel centre is inside the mesh
+segment sphere.nii.gz twice.vtu -o s.nii.gz
+    twice.vtu: cells overlap:
+segment sphere.nii.gz lattice.vtu -o l.nii --truth shifted.nii
+    expected labels on the image's grid
+segment sphere.nii.gz lattice.vtu -o l.nii --truth disc.nii
+    disc.nii
+segment sphere.nii.gz lattice.vtu -o l.nii --classes 300
+    classes: 300 requested
+segment sphere.nii.gz lattice.vtu -o l.nii --truth odd.nii
+    labels must be whole numbers
+"""
 )
-def test_bad_options_of_mesh(capfd, options, said):
-    assert_refused(capfd, f"mesh sphere.nii.gz -o a.vtu {options}", said)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "match"),
-    [
-        ("mesh no.nii -o a.vtu", "no.nii: no such file"),
-        ("mesh disc.nii -o a.vtu --lattice bcc", "expected one of criss-cross in 2-D"),
-        ("mesh disc.nii -o a.vtu --slice k=3", "slice"),
-        ("mesh disc.nii -o a.vtu --crop 1:5,1:5,1:5", "crop"),
-        ("mesh disc.nii -o a.obj", "unknown suffix; known suffixes are .vtu"),
-        ("mesh disc.nii", "--output"),
-        ("mesh -o a.vtu", r"Missing argument 'IMAGE\.\.\.'"),
-        ("mesh lattice.vtu -o a.vtu", "unknown image format"),
-        ("quality no.vtu", "no such file"),
-        ("quality disc.nii", "expected a .vtu, .vtk, .msh or .msh2 mesh"),
-        ("quality lattice.vtu --image no.nii", "no such file"),
-        ("quality lattice.vtu --image disc.nii", "a 3-D image like the mesh, got a 2-D one"),
-        ("quality", r"Missing argument '\[IMAGE\] MESH'"),
-        ("phantom nothing -o a.nii", "phantom 'nothing': no such phantom; use one of constant"),
-        ("phantom no.toml -o a.nii", "no.toml"),
-        ("phantom sphere -o a.png", "ending in .nii or .nii.gz"),
-        ("phantom sphere -o a.nii --labels ./a.nii", "or another output"),
-        ("phantom sphere -o a.nii --voxel-mm 0", "--voxel-mm: "),
-        ("phantom sphere -o a.nii --noise-sd -1", "--noise-sd: "),
-        ("phantom sphere -o a.nii --seed x", "--seed"),
-        ("refine", "No such command 'refine'"),
-        ("demo -o disc.nii", "expected a folder"),
-    ],
-)
-def test_bad_inputs(capfd, arguments, match):
-    if arguments.startswith("demo"):
-        pytest.importorskip("nilearn", reason="the demo's image comes in nilearn's wheel")
-    assert_refused(capfd, arguments, match)
+def test_demo_needs_nilearn_and_a_folder(monkeypatch):
+    pytest.importorskip("nilearn", reason="the demo's image comes in nilearn's wheel")
+    assert_refuses("demo -o disc.nii", "expected a folder")
+    monkeypatch.setattr(tetopt.io.mni.importlib.util, "find_spec", lambda name: None)
+    assert_refuses("demo -o demo", r'pip install "nilearn(>=[0-9.]+)?"')
 
 
-def test_existing_outputs_are_refused(capfd):
-    names = ("a.nii", "b.nii", "a.json")
-    for name in names:
-        Path(name).write_text("old")
-    assert_refused(capfd, MESH, "a.json: already exists; pass --force")
-    assert_refused(capfd, "phantom sphere -o a.nii", "already exists")
-    assert_refused(capfd, "phantom sphere -o new.nii --labels b.nii", "already exists")
-    assert_refused(capfd, "quality lattice.vtu --json a.json", "already exists")
-    assert [Path(name).read_text() for name in names] == ["old"] * 3
-
-
-def test_the_systems_errors_take_one_line(monkeypatch, capfd):
-    assert_refused(capfd, f"mesh disc.nii -o {'a' * 300}.vtu", "too long")
+def test_the_systems_errors_take_one_line(monkeypatch):
+    assert_refuses(f"mesh disc.nii -o {'a' * 300}.vtu", "too long")
 
     def full_disk(*_):
         raise OSError(28, "No space left on device", "a[b].vtu")
 
     monkeypatch.setattr(tetopt.cli.phantom, "save_image", full_disk)
-    assert_refused(
-        capfd, "phantom disc_2d -o a.nii --voxel-mm 8", r"a\[b\].vtu: No space left on device"
-    )
+    assert_refuses("phantom disc_2d -o a.nii --voxel-mm 8", r"a\[b\].vtu: No space left on device")
 
 
 def test_the_checksum_is_of_what_was_read(monkeypatch):
@@ -629,70 +546,65 @@ def test_the_checksum_is_of_what_was_read(monkeypatch):
 
 
 @pytest.mark.parametrize("width", ["80", "120"])
-def test_help_names_no_value_of_a_switch_and_breaks_no_word(monkeypatch, capsys, width):
+@pytest.mark.parametrize("words", ["--help", "mesh --help", "mesh --help-all", "fem --help"])
+def test_help_names_no_value_of_a_switch_and_breaks_no_word(monkeypatch, words, width):
     monkeypatch.setenv("COLUMNS", width)
-    for words in (("--help",), ("mesh", "--help"), ("mesh", "--help-all"), ("fem", "--help")):
-        assert_done(*words)
-        text = capsys.readouterr().out
-        assert "bool" not in text
-        assert re.search(r"--help(,--help-all)? +-h +Show this message", text)
-        assert words != ("mesh", "--help-all") or {"octree", "bcc", "five-tet"} <= set(
-            re.findall(r"[\w-]+", text)
-        )
+    text = run_command(words).out
+    assert "bool" not in text
+    assert re.search(r"--help(,--help-all)? +-h +Show this message", text)
+    assert words != "mesh --help-all" or {"octree", "bcc", "five-tet"} <= set(
+        re.findall(r"[\w-]+", text)
+    )
 
 
-def groups_of_help(capsys, *words):
+def groups_of_help(words):
     """The names of the options that the help shows, by its groups."""
-    assert_done(*words)
-    groups = re.split(r"^╭─ (.+?) ─+╮$", capsys.readouterr().out, flags=re.M)[1:]
-    pairs = zip(groups[::2], groups[1::2], strict=True)
+    groups = re.split(r"^╭─ (.+?) ─+╮$", run_command(words).out, flags=re.M)[1:]
     return {
         name: re.findall(r"^│ [ *]*(--[a-z-]+)", text, re.M)
-        for name, text in pairs
+        for name, text in zip(groups[::2], groups[1::2], strict=True)
         if name != "Arguments"
     }
 
 
-def test_help_of_mesh_is_in_six_groups(monkeypatch, capsys):
-    """Each of at most nineteen options, and the help; without `--help-all` the twenty that most
-    users take.
-    """
+def test_help_of_mesh_has_the_twenty_options_that_most_users_take(monkeypatch):
+    """In groups of at most nineteen, with the others by `--help-all`."""
     monkeypatch.setenv("COLUMNS", "80")
-    every = groups_of_help(capsys, "mesh", "--help-all")
-    assert {name: len(options) for name, options in every.items()} == {
-        "Options": 5,
-        "Region and labels": 19,
-        "Number and size of cells": 10,
-        "Initial mesh": 4,
-        "Optimisation": 11,
-        "For the solver": 14,
-    }
-    shown = groups_of_help(capsys, "mesh", "--help")
+    every, shown = (groups_of_help(f"mesh {word}") for word in ("--help-all", "--help"))
+    assert max(map(len, every.values())) <= 19
     assert sum(map(len, shown.values())) == 20 + 1
     assert all(
         set(options) < set(every[name]) or name == "Options" for name, options in shown.items()
     )
-    assert {"--output", "--mask", "--nodes", "--young", "--load"} <= {
-        each for group in shown.values() for each in group
-    }
+    assert {"--output", "--mask", "--nodes", "--young", "--load"} <= set().union(*shown.values())
     # has no shorter one
-    assert groups_of_help(capsys, "cohort", "--help")["Optimisation"] == every["Optimisation"]
+    assert groups_of_help("cohort --help")["Optimisation"] == every["Optimisation"]
 
 
-def test_help_lists_the_commands(capsys):
-    assert_done("--help")
-    captured = capsys.readouterr()
-    assert all(re.search(rf"\b{command}\b", captured.out) for command in COMMANDS)
-    assert exit_code() == 2
-    bare = capsys.readouterr()
+def test_help_lists_the_commands():
+    text = run_command("--help").out
+    assert all(re.search(rf"\b{command}\b", text) for command in COMMANDS)
     # the help, and no line of complaint
-    assert (bare.out + bare.err).strip() == captured.out.strip()
+    assert "".join(run_command(code=2)).strip() == text.strip()
+    for name in COMMANDS:
+        assert loaded_command(name).__doc__.splitlines()[0] == help_line(name)
 
 
-def test_version_also_as_a_module(capsys):
-    assert_done("--version")
-    assert capsys.readouterr() == (f"tetopt {tetopt.__version__}\n", "")
-    assert child(["--version"]).communicate(timeout=60) == (f"tetopt {tetopt.__version__}\n", "")
+def run_python(*words, **names):
+    """A program in a process of its own, with variables of the environment."""
+    return subprocess.run(
+        [sys.executable, *words],
+        env=os.environ | {"PYTHONPATH": str(Path(tetopt.__file__).parents[1])} | names,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_version_also_as_a_module():
+    done = run_python("-m", "tetopt", "--version")
+    assert run_command("--version") == (done.stdout, done.stderr)
+    assert done.stdout == f"tetopt {tetopt.__version__}\n"
 
 
 # Libraries that take time to load; the order is that of the printed line.
@@ -717,63 +629,36 @@ HEAVY = (
     ],
 )
 def test_nothing_is_loaded_before_it_is_used(code, needed):
-    environment = os.environ | {"PYTHONPATH": str(Path(tetopt.__file__).parents[1])}
-    code += (
-        f"; import sys; print('loaded:', *(name for name in {HEAVY!r}.split() if name in "
-        "sys.modules))"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
-    )
-    assert done.stdout.splitlines()[-1].split()[1:] == sorted(
-        needed.split(), key=HEAVY.split().index
-    )
+    loaded = f"print(*(name for name in {HEAVY!r}.split() if name in sys.modules))"
+    assert run_python("-c", f"{code}; import sys; {loaded}").stdout.splitlines()[-1] == needed
 
 
 @pytest.mark.parametrize("threads", ["0", "1.5", "9" * 5000])
-def test_threads_that_cannot_be_are_refused(monkeypatch, capfd, threads):
+def test_threads_that_cannot_be_are_refused(monkeypatch, threads):
     """numba ends with a traceback, or takes another number."""
     monkeypatch.setenv("NUMBA_NUM_THREADS", threads)
-    command = ["mesh sphere.nii.gz -o a.vtu --nodes 60"]
-    assert_refused(
-        capfd, command, "NUMBA_NUM_THREADS: expected a whole number of threads from 1 to 9999, got"
+    assert_refuses(
+        MESH, "NUMBA_NUM_THREADS: expected a whole number of threads from 1 to 9999, got"
     )
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "words"),
+    ("name", "words"),
     [
-        ("NUMBA_THREADING_LAYER", "foo", "NUMBA_THREADING_LAYER: expected .*workqueue.*, got foo"),
+        ("NUMBA_THREADING_LAYER", "NUMBA_THREADING_LAYER: expected .*workqueue.*, got foo"),
         (
             "NUMBA_THREADING_LAYER_PRIORITY",
-            "foo",
             "NUMBA_THREADING_LAYER_PRIORITY: expected omp tbb workqueue",
         ),
-        (
-            "NUMBA_OPT",
-            "foo",
-            "environment: .*'NUMBA_OPT'.*'foo' could not be parsed; check NUMBA_OPT",
-        ),
-        (
-            "MPLBACKEND",
-            "foo",
-            "environment: .*'foo' is not a valid value for backend; check MPLBACKEND",
-        ),
+        ("NUMBA_OPT", "environment: .*'NUMBA_OPT'.*'foo' could not be parsed; check NUMBA_OPT"),
+        ("MPLBACKEND", "environment: .*'foo' is not a valid value for backend; check MPLBACKEND"),
     ],
 )
-def test_a_variable_of_a_library_with_a_bad_value_is_one_line(name, value, words):
+def test_a_variable_of_a_library_with_a_bad_value_is_one_line(name, words):
     """In a process of its own, as numba and matplotlib read them once."""
-    command = [sys.executable, "-m", "tetopt", "quality", "a.vtu"]
-    ended = subprocess.run(
-        command, env=os.environ | {name: value}, capture_output=True, text=True, check=False
-    )
+    ended = run_python("-m", "tetopt", "quality", "a.vtu", **{name: "foo"})
     assert ended.returncode == 2
     assert re.fullmatch(f"tetopt: {words}.*\n", ended.stderr), ended.stderr
-
-
-def test_the_list_of_commands_has_their_first_lines():
-    for name in COMMANDS:
-        assert loaded_command(name).__doc__.splitlines()[0] == help_line(name)
 
 
 def test_every_public_name_is_there():
@@ -787,38 +672,26 @@ def test_every_public_name_is_there():
 # quality
 
 
-def test_quality_of_a_run(run, capsys):
-    folder, numbers, file, image = run
-    assert_done("quality", folder / "mesh.vtu", "--image sphere.nii.gz --all --json q.json")
-    report = numbers_in("q.json")
+def test_quality_of_a_run():
+    said = run_command("quality run.vtu --image sphere.nii.gz --all --json q.json")
+    numbers, report = numbers_in("run.json"), numbers_in("q.json")
     assert report["quality"] == numbers["quality"]
     assert report["n_turned"] == 0
-    assert report["fit"]["E_D"] == pytest.approx(numbers["history"][-1]["E_D"], rel=1e-6)
-    assert report["fit"]["E_D_fraction_of_variance"] == pytest.approx(
-        numbers["energies"]["E_D_fraction_of_variance"], rel=1e-6
+    n = load_image("sphere.nii.gz").data.size
+    assert (
+        report["fit"].items()
+        >= {
+            "E_D": pytest.approx(numbers["history"][-1]["E_D"], rel=1e-6),
+            "E_D_fraction_of_variance": pytest.approx(
+                numbers["energies"]["E_D_fraction_of_variance"], rel=1e-6
+            ),
+            "n_voxels": n,
+            "n_empty_cells": (load_mesh("run.vtu").cell_data["n_voxels"] == 0).sum(),
+        }.items()
     )
-    assert report["fit"]["n_voxels"] == image.data.size
-    assert report["fit"]["n_empty_cells"] == int((file.cell_data["n_voxels"] == 0).sum())
-    captured = capsys.readouterr()
-    assert captured.err == ""
-    assert re.search(
-        rf"^voxels inside +{image.data.size} of {image.data.size}$", captured.out, re.M
-    )
-    assert re.search(rf"^nodes +{len(file.mesh.points)}$", captured.out, re.M)
-
-
-def test_quality_of_a_mesh_elsewhere(run, capfd):
-    _, _, file, _ = run
-    save_mesh("far.vtu", Mesh(file.mesh.points + 1000.0, file.mesh.cells))
-    command = ["quality far.vtu --image sphere.nii.gz"]
-    assert_refused(capfd, command, "no voxel centre is inside the mesh")
-
-
-def test_quality_of_triangles(capsys):
-    image = load_image("disc.nii")
-    save_mesh("a.vtu", lattice_mesh(image, nodes=60))
-    assert_done("quality a.vtu --image disc.nii")
-    assert re.search(r"^area, mm2 +4096.00$", capsys.readouterr().out, re.M)
+    assert said.err == ""
+    assert re.search(rf"^voxels inside +{n} of {n}$", said.out, re.M)
+    assert re.search(rf"^nodes +{numbers['quality']['n_nodes']}$", said.out, re.M)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -826,20 +699,19 @@ def test_quality_of_triangles(capsys):
 
 
 @pytest.mark.parametrize("name", ["disc_2d", "two_spheres"])
-def test_phantoms_with_labels(here, name, capsys):
+def test_phantoms_with_labels(here, name):
     phantom = load_phantom(name)
     voxel = float(phantom.size_mm.max() / 16)
-    assert_done(f"phantom {name} -o a.nii.gz --labels labels.nii.gz --voxel-mm {voxel!r}")
-    expected, labels = phantom.image(voxel_mm=voxel), phantom.label_image(voxel_mm=voxel)
-    written = nibabel.load("a.nii.gz")
-    assert_array_equal(written.get_fdata().reshape(expected.shape), expected.data)
-    assert_array_equal(nibabel.load("labels.nii.gz").get_fdata().reshape(labels.shape), labels.data)
-    n = expected.ndim
-    assert_allclose(written.affine[:n, :n], expected.affine[:n, :n], rtol=1e-6)
-    captured = capsys.readouterr()
-    size = " x ".join(map(str, expected.shape))
-    assert captured.out.startswith(f"a.nii.gz: {name}, {size} voxels, ")
-    assert captured.err == ""
+    said = run_command(f"phantom {name} -o a.nii.gz --labels labels.nii.gz --voxel-mm {voxel!r}")
+    for path, image in (
+        ("a.nii.gz", phantom.image(voxel_mm=voxel)),
+        ("labels.nii.gz", phantom.label_image(voxel_mm=voxel)),
+    ):
+        written, n = nibabel.load(path), image.ndim
+        assert_array_equal(written.get_fdata().reshape(image.shape), image.data)
+        assert_allclose(written.affine[:n, :n], image.affine[:n, :n], rtol=1e-6)
+    assert said.out.startswith(f"a.nii.gz: {name}, {' x '.join(map(str, image.shape))} voxels, ")
+    assert said.err == ""
     assert here() == ["a.nii.gz", "labels.nii.gz"]
 
 
@@ -858,48 +730,34 @@ def test_a_sphere_keeps_its_place_in_an_oblique_sheared_world():
     assert_done("mesh a.nii.gz -o a.vtu --nodes 600 --iterations 4")
     image, file = load_image("a.nii.gz"), load_mesh("a.vtu")
     assert_covers(file.mesh, image)
-    assert_round_trips(file.mesh.points, image)
     owner = tetopt.cell_of_voxel(image, file.mesh).ravel()
     place = image.to_world(np.indices(image.shape).reshape(3, -1).T)
     counts = np.bincount(owner, minlength=len(file.mesh.cells))
     assert_array_equal(counts, file.cell_data["n_voxels"])
+    sums = np.stack([np.bincount(owner, x, minlength=len(counts)) for x in place.T], axis=1)
     is_held = counts > 0
-    sums = np.stack(
-        [np.bincount(owner, place[:, k], minlength=len(counts)) for k in range(3)], axis=1
-    )
-    centroids = sums[is_held] / counts[is_held, None]
+    centroids = image.to_index(sums[is_held] / counts[is_held, None])
     true = image.to_index([14.3, -10.1, 28.7])
+    contrast = file.cell_data["mean"] - 20.0
     for name, allowed in (("volume", 0.05), ("n_voxels", 0.02)):  # voxels
-        weights = (file.cell_data[name] * (file.cell_data["mean"] - 20.0))[is_held]
-        centre = (weights[:, None] * centroids).sum(axis=0) / weights.sum()
-        assert np.linalg.norm(image.to_index(centre) - true) < allowed
-    contrast = (file.cell_data["volume"] * (file.cell_data["mean"] - 20.0)).sum()
-    assert contrast == pytest.approx(80.0 * 4 / 3 * np.pi * 9.0**3, rel=0.02)
+        weights = (file.cell_data[name] * contrast)[is_held]
+        assert np.linalg.norm(weights @ centroids / weights.sum() - true) < allowed
+    expected = 80.0 * 4 / 3 * np.pi * 9.0**3
+    assert file.cell_data["volume"] @ contrast == pytest.approx(expected, rel=0.02)
 
 
-def test_an_oblique_anisotropic_volume(data_dir):
-    path = data_dir / "brain_flair_oblique_aniso.nii.gz"
-    assert_done(f"mesh {path} -o a.vtu --nodes 300 --iterations 1")
-    image, mesh = load_image(path), load_mesh("a.vtu").mesh
-    off_axis = image.affine[:3, :3] / image.spacing
-    assert np.abs(np.sort(np.abs(off_axis), axis=0)[1]).max() > 0.01  # oblique it is
-    assert image.spacing.max() / image.spacing.min() > 2.0  # and anisotropic
-    assert_covers(mesh, image)
-    assert_round_trips(mesh.points, image)
-
-
-def test_a_4d_file_needs_a_volume(data_dir, capfd):
+def test_a_volume_of_a_4d_file(data_dir):
     path = data_dir / "example4d.nii.gz"
-    command = ["mesh", path, "-o a.vtu --nodes 100 --iterations 1"]
-    assert_refused(capfd, command, "2 volumes; choose one")
-    assert_refused(capfd, [*command, "--volume 2"], "expected a volume from 0 to 1, got 2")
-    assert_done(*command, "--volume 1")
-    file, image = load_mesh("a.vtu"), load_image(path, volume=1)
-    assert_covers(file.mesh, image)
-    total = (file.cell_data["n_voxels"] * file.cell_data["mean"]).sum()
-    assert total == pytest.approx(image.data.sum(dtype=np.float64), rel=1e-9)
-    other = load_image(path, volume=0).data.sum(dtype=np.float64)
-    assert total != pytest.approx(other, rel=1e-6)
+    command = f"mesh {path} -o a.vtu --nodes 100 --iterations 1"
+    assert_refuses(command, "2 volumes; choose one")
+    assert_refuses(f"{command} --volume 2", "expected a volume from 0 to 1, got 2")
+    assert_done(f"{command} --volume 1")
+    fields, sums = (
+        load_mesh("a.vtu").cell_data,
+        [load_image(path, volume=k).data.sum(dtype=np.float64) for k in (0, 1)],
+    )
+    assert fields["n_voxels"] @ fields["mean"] == pytest.approx(sums[1], rel=1e-9)
+    assert sums[0] != pytest.approx(sums[1], rel=1e-6)
     assert_done(f"quality a.vtu --image {path} --volume 1")
 
 
@@ -910,28 +768,20 @@ def test_a_4d_file_needs_a_volume(data_dir, capfd):
 @pytest.mark.drawn
 def test_demo():
     pytest.importorskip("nilearn", reason="the demo's image comes in nilearn's wheel")
-    folder = Path("new/demo")
-    assert_done(f"demo -o {folder} --nodes 300 --iterations 2")
-    pictures = ["slice.png", "rho.png", "energies.png", "thumbnail.png"]
-    assert sorted(p.name for p in folder.iterdir()) == sorted(["mesh.vtu", "run.json", *pictures])
+    command, folder = "demo -o new/demo --nodes 300 --iterations 2", Path("new/demo")
+    assert_done(command)
+    pictures = {"slice.png", "rho.png", "energies.png", "thumbnail.png"}
+    assert {path.name for path in folder.iterdir()} == pictures | {"mesh.vtu", "run.json"}
     for name in pictures:
         with PIL.Image.open(folder / name) as picture:
             assert np.asarray(picture.convert("L")).std() > 10.0
     numbers, file = numbers_in(folder / "run.json"), load_mesh(folder / "mesh.vtu")
     assert numbers["mesh_sha256"] == mesh_hash(file.mesh)
     assert numbers["energies"]["E_D_relative"] < 0.8
-    assert file.cell_data["n_voxels"].sum() == np.prod(numbers["image_properties"]["shape"])
-    assert file.cell_data["volume"].sum() == pytest.approx(
-        numbers["image_properties"]["volume_mm"], rel=1e-9
-    )
-    before = {p.name: p.read_bytes() for p in folder.iterdir()}
-    assert exit_code(f"demo -o {folder} --nodes 300 --iterations 2") == 2
-    assert {p.name: p.read_bytes() for p in folder.iterdir()} == before
-
-
-def test_demo_without_nilearn(monkeypatch, capfd):
-    monkeypatch.setattr(tetopt.io.mni.importlib.util, "find_spec", lambda name: None)
-    assert_refused(capfd, "demo -o demo", r'pip install "nilearn(>=[0-9.]+)?"')
+    image = numbers["image_properties"]
+    assert file.cell_data["n_voxels"].sum() == np.prod(image["shape"])
+    assert file.cell_data["volume"].sum() == pytest.approx(image["volume_mm"], rel=1e-9)
+    assert_refuses(command, "new/demo")
 
 
 # --------------------------------------------------------------------------------------------------
@@ -953,124 +803,95 @@ def test_a_reader_that_goes_away_loses_no_file():
     assert numbers_in("a.json")["quality"]["n_cells"] == len(load_mesh("a.vtu").mesh.cells)
 
 
-def test_quality_of_overlapping_cells(capsys):
-    mesh = lattice_mesh(load_image("sphere.nii.gz"), nodes=60)
-    # Once more a few of them, and not all of the others: together they hold no more voxels than
-    # there are.
-    save_mesh("twice.vtu", Mesh(mesh.points, np.vstack([mesh.cells[3:], mesh.cells[4:5]])))
-    assert exit_code("quality twice.vtu --image sphere.nii.gz --json q.json") == 1
-    overlap = numbers_in("q.json")["fit"]["overlap"]
-    assert overlap["cells"] == [1, len(mesh.cells) - 3]
-    assert (
-        f"cells 1 and {len(mesh.cells) - 3} both contain voxel {overlap['voxel']}"
-        in capsys.readouterr().err
-    )
-    assert_refused(
-        capsys, "segment sphere.nii.gz twice.vtu -o s.nii.gz", "twice.vtu: cells overlap: "
-    )
+def test_quality_of_overlapping_cells():
+    said = run_command("quality twice.vtu --image sphere.nii.gz --json q.json", code=1).err
+    overlap, last = numbers_in("q.json")["fit"]["overlap"], len(load_mesh("twice.vtu").mesh.cells)
+    assert overlap["cells"] == [1, last - 1]
+    assert f"cells 1 and {last - 1} both contain voxel {overlap['voxel']}" in said
 
 
-def test_quality_with_another_image(capsys):
-    assert_done(f"{MESH} --nodes 60 --iterations 0")
+def test_quality_with_another_image():
     other = load_phantom("two_spheres").image(voxel_mm=8.0)
     save_image("other.nii", other)
     save_image("crop.nii", Image(other.data[:-1], other.affine))
-    capsys.readouterr()
-    assert_done("quality a.vtu --image sphere.nii.gz")
-    assert capsys.readouterr().err == ""
-    assert_done("quality a.vtu --image other.nii")
-    assert "a.vtu was built from a different image" in capsys.readouterr().err
+    assert run_command("quality run.vtu --image sphere.nii.gz").err == ""
+    said = run_command("quality run.vtu --image other.nii").err
+    assert "run.vtu was built from a different image" in said
     for words in ("crop.nii", "sphere.nii.gz --crop 1:,:,:"):
-        assert exit_code(f"quality a.vtu --check --image {words}") == 2
-        said = capsys.readouterr().err
-        assert "expected the box of" in said
-        assert "--check needs that image, with its crop" in said
-        assert said.count("\n") == 1
+        assert_refuses(
+            f"quality run.vtu --check --image {words}",
+            "expected the box of.*--check needs that image, with its crop",
+        )
 
 
 @pytest.mark.parametrize("part", ["--slice k=4", "--crop 1:7,:,2:"])
-def test_quality_of_a_part(part, capsys):
+def test_quality_of_a_part(part):
     """A mesh of a slice or a crop is measured against the same part: every voxel is inside."""
     assert_done(f"{MESH} --nodes 60 --iterations 1 {part}")
-    capsys.readouterr()
-    assert_done(f"quality a.vtu --image sphere.nii.gz {part}")
-    inside, all_ = re.search(r"voxels inside +(\d+) of (\d+)", capsys.readouterr().out).groups()
-    assert inside == all_
+    said = run_command(f"quality a.vtu --image sphere.nii.gz {part}").out
+    inside, every = re.search(r"voxels inside +(\d+) of (\d+)", said).groups()
+    assert inside == every
 
 
-def test_folders_of_pictures_and_results_are_made_and_none_is_left_where_a_run_is_refused(capfd):
-    mesh = "mesh sphere.nii.gz -o a.vtu --iterations 0 --spacing 16"
-    assert_refused(capfd, f"{mesh} --figures new/deep --mask no.nii", "no.nii")
-    assert_refused(capfd, "compare disc.nii -o new", "expected a volume")
-    Path("file").write_text("a file")
-    assert_refused(
-        capfd, f"{mesh} --figures file", "expected a folder for the results, found a file"
-    )
-    assert_refused(capfd, f"{mesh} --figures file/a", "a: cannot create the folder for the results")
-    assert_done(f"{mesh} --figures new/deep")
+def test_folders_of_pictures_are_made():
+    assert_done("mesh sphere.nii.gz -o a.vtu --iterations 0 --spacing 16 --figures new/deep")
     names = {"slice.png", "rho.png", "energies.png", "thumbnail.png"}
     assert {each.name for each in Path("new/deep").iterdir()} == names
 
 
-def test_nodes_too_few_for_limits_are_refused(capsys):
-    assert exit_code(f"{MESH} --lattice octree --nodes 100 --edge-size 6") == 2
-    assert (
-        "100 nodes are too few for 16 x 16 x 16 voxels and these limits" in capsys.readouterr().err
-    )
-    assert not Path("a.vtu").exists()
-
-
-def test_octree_mesh(capsys):
+def test_octree_mesh():
     """The number of nodes is met, and the terminal calls the start what it is."""
-    assert_done(f"{MESH} --lattice octree --nodes 400")
-    printed = capsys.readouterr()
-    assert "octree of" in printed.err
-    assert printed.out.split()[0] == "octree"
-    loaded = load_mesh("a.vtu")
-    assert len(loaded.mesh.points) == 400
-    assert_done(f"{MESH} --lattice octree --nodes 400 --force --k-d 0 --iterations 1")
-    n_nodes, err = len(load_mesh("a.vtu").mesh.points), capsys.readouterr().err
-    assert (f"{n_nodes} nodes instead of 400" in err) == (abs(n_nodes - 400) > 4)
+    said = run_command(f"{MESH} --lattice octree --nodes 400")
+    assert "octree of" in said.err
+    assert said.out.split()[0] == "octree"
+    assert len(load_mesh("a.vtu").mesh.points) == 400
+    said = run_command(f"{MESH} --lattice octree --nodes 400 --force --k-d 0 --iterations 1").err
+    n_nodes = len(load_mesh("a.vtu").mesh.points)
+    assert (f"{n_nodes} nodes instead of 400" in said) == (abs(n_nodes - 400) > 4)
+    said = run_command("mesh sphere.nii.gz -o b.vtu --nodes 100 --edge-size 6", code=2).err
+    assert "100 nodes are too few for 16 x 16 x 16 voxels and these limits" in said
 
 
-def test_mesh_with_limits(capfd):
+def sizes_to(x, size):
+    """The sphere's image with a target size up to an index along the first axis."""
+    field = np.zeros((16, 16, 16))
+    field[:x] = size
+    return Image(field, load_image("sphere.nii.gz").affine)
+
+
+def test_mesh_with_limits():
     """They reach the mesh, and the numbers and a line tell them."""
-    image = load_image("sphere.nii.gz")
-    field = np.where(np.arange(16)[:, None, None] < 5, 13.0, 0.0) * np.ones((1, 16, 16))
-    save_image("sizes.nii.gz", Image(field, image.affine))
-    assert_done(f"{MESH} --nodes 500 --edge-size 30 --sizing sizes.nii.gz --gradation 0.9")
-    mesh = load_mesh("a.vtu").mesh
+    field = sizes_to(5, 13.0)
+    save_image("sizes.nii.gz", field)
+    said = run_command(
+        f"{MESH} --nodes 500 --edge-size 30 --sizing sizes.nii.gz --gradation 0.9"
+    ).out
+    mesh, numbers = load_mesh("a.vtu").mesh, numbers_in("a.json")
     assert len(mesh.points) == 500
-    numbers = numbers_in("a.json")
-    options, met = numbers["options"], numbers["edges_over_target"]
-    assert [options[name] for name in SIZES] == [None, 30.0, None, 0.9, "sizes.nii.gz"]
-    sizes = Sizes(edge_size=30.0, field=Image(field, image.affine), gradation=0.9)
+    limits = {"edge_size": 30.0, "gradation": 0.9, "sizing": "sizes.nii.gz"}
+    limits |= {"size_min": None, "edge_max": None}
+    assert numbers["options"].items() >= limits.items()
+    met, sizes = numbers["edges_over_target"], Sizes(edge_size=30.0, field=field, gradation=0.9)
     assert met["mean"] == pytest.approx(edge_ratios(mesh.points, mesh.cells, sizes).mean)
     assert len(met["edges_of_bins"]) == len(met["fraction"]) + 1
-    line = (
-        f"ratio of edges to their target size: {met['mean']:.2f} on average; "
-        f"{met['below']:.1%} are below 0.71"
-    )
-    assert line in capfd.readouterr().out
-    assert_done(f"{MESH} --force --nodes 500 --edge-max 40")
+    line = f"{met['mean']:.2f} on average; {met['below']:.1%} are below 0.71"
+    assert f"ratio of edges to their target size: {line}" in said
+    said = run_command(f"{MESH} --force --nodes 500 --edge-max 40").out
     numbers = numbers_in("a.json")
     assert numbers["options"]["edge_max"] == 40.0
     assert "edges_over_target" not in numbers
-    assert "target size" not in capfd.readouterr().out
+    assert "target size" not in said
 
 
 def test_sizes_make_the_number_of_nodes():
     """Alone they say it; where only a part has a target, the rest gets its fraction of the usual
     number.
     """
-    image = load_image("sphere.nii.gz")
+    image, field = load_image("sphere.nii.gz"), sizes_to(4, 14.0)
     assert_done(f"{MESH} --iterations 6 --edge-size 14")
     needed = nodes_of_sizes(image, Sizes(edge_size=14.0))[0]
     assert numbers_in("a.json")["options"]["nodes"] == needed
     assert len(load_mesh("a.vtu").mesh.points) == needed
-    field = Image(
-        np.where(np.arange(16)[:, None, None] < 4, 14.0, 0.0) * np.ones((1, 16, 16)), image.affine
-    )
     save_image("sizes.nii.gz", field)
     assert_done(f"{MESH} --iterations 6 --sizing sizes.nii.gz --force")
     of_part, fraction = nodes_of_sizes(image, Sizes(field=field))
@@ -1078,12 +899,11 @@ def test_sizes_make_the_number_of_nodes():
     assert numbers_in("a.json")["options"]["nodes"] == round(of_part + 0.75 * 16**3 / 8)
 
 
-def test_only_the_users_longest_edge_is_told_as_missed(monkeypatch, capsys):
+def test_only_the_users_longest_edge_is_told_as_missed(monkeypatch):
     """Not that of cells of order 2, which a run chooses itself."""
     monkeypatch.setattr(tetopt.job.advice, "EDGE_MISS", -0.9)  # any edge is too long
     for words, is_told in (("", False), ("--edge-max 60", True)):
-        assert_done(f"{MESH} --nodes 300 --iterations 1 --order 2 {words} --force")
-        err = capsys.readouterr().err
+        err = run_command(f"{MESH} --nodes 300 --iterations 1 --order 2 {words} --force").err
         assert ("over --edge-max" in err) == is_told
         runs = re.findall(
             r"of up to 3: (\d+) of 300 nodes, including mid-edge nodes, ([\d.]+)%", err
@@ -1094,56 +914,44 @@ def test_only_the_users_longest_edge_is_told_as_missed(monkeypatch, capsys):
         assert numbers_in("a.json")["options"]["edge_max"] > 0.0
 
 
-def test_target_error(capfd):
+RUNS = r"run \d of up to 6: (\d+) nodes leave ([\d.]+) of the variance"
+
+
+def test_target_error():
     """As many nodes as it takes, told in the numbers; the same as asking for that many. A miss
     exits 1.
     """
-    assert_done(f"{MESH} --target-error 0.2")
-    numbers = numbers_in("a.json")
-    runs = re.findall(
-        r"run (\d) of up to 6: (\d+) nodes leave ([\d.]+) of the variance", capfd.readouterr().err
-    )
-    assert [int(number) for number, _, _ in runs] == list(range(1, len(runs) + 1))
-    assert float(runs[-1][2]) == pytest.approx(
-        numbers["energies"]["E_D_fraction_of_variance"], rel=1e-3
-    )
-    assert numbers["energies"]["E_D_fraction_of_variance"] <= 0.2
-    nodes = numbers["options"]["nodes"]
-    assert numbers["options"]["target_error"] == 0.2
-    assert_done(f"{MESH} --force --nodes {nodes}")
+    said, numbers = run_command(f"{MESH} --target-error 0.2").err, numbers_in("a.json")
+    assert re.findall(r"run (\d)", said) == [str(k + 1) for k in range(len(re.findall(RUNS, said)))]
+    error, options = numbers["energies"]["E_D_fraction_of_variance"], numbers["options"]
+    assert float(re.findall(RUNS, said)[-1][1]) == pytest.approx(error, rel=1e-3)
+    assert error <= 0.2 == options["target_error"]
+    assert_done(f"{MESH} --force --nodes {options['nodes']}")
     assert numbers_in("a.json")["mesh_sha256"] == numbers["mesh_sha256"]
-    capfd.readouterr()
-    assert exit_code(f"{MESH} --force --target-error 0.01 --size-min 32") == 1
-    assert "of the image's variance is unexplained, more than 0.01" in capfd.readouterr().err
+    said = run_command(f"{MESH} --force --target-error 0.01 --size-min 32", code=1).err
+    assert "of the image's variance is unexplained, more than 0.01" in said
 
 
-def test_target_error_with_the_most_nodes(capfd):
+def test_target_error_with_the_most_nodes():
     """What the error takes is said before the run with the most nodes, which is that of as many;
     what it left, then.
     """
     x, y = np.indices((120, 100))
     save_image("sphere.nii.gz", Image(10.0 * np.sin(x / 9.0) * np.cos(y / 8.0) + x))
-    assert exit_code(f"{MESH} --target-error 0.001 --nodes-max 230") == 1
-    numbers, err = numbers_in("a.json"), capfd.readouterr().err
-    (first, left), (last, reached) = re.findall(
-        r"run \d of up to 6: (\d+) nodes leave ([\d.]+) of the variance", err
-    )
-    pattern = r"an error of 0.001 requires about (\d+) nodes; (more than .*? has \d+ nodes)"
-    ((predicted, words),) = re.findall(pattern, err)
-    assert (int(first), int(last), words) == (
-        200,
-        230,
-        "more than --nodes-max, so that the next run has 230 nodes",
-    )
-    assert int(predicted) == pytest.approx(
-        200.0 * (float(left) / (0.925 * 0.001)) ** (1.0 / ERROR_RATE), rel=0.01
-    )
+    err = run_command(f"{MESH} --target-error 0.001 --nodes-max 230", code=1).err
+    (first, left), (last, reached) = re.findall(RUNS, err)
+    assert (first, last) == ("200", "230")
+    words = "more than --nodes-max, so that the next run has 230 nodes"
+    (predicted,) = re.findall(rf"an error of 0.001 requires about (\d+) nodes; {words}", err)
+    needed = 200.0 * (float(left) / (0.925 * 0.001)) ** (1.0 / ERROR_RATE)
+    assert int(predicted) == pytest.approx(needed, rel=0.01)
     assert err.index(words) < err.index(f"{last} nodes leave")
-    assert (
+    left = (
         f"{reached} of the image's variance is unexplained, more than 0.001, which requires about "
-        in err
     )
+    assert left in err
     assert "allow more (--nodes-max)" in err
+    numbers = numbers_in("a.json")
     options = numbers["options"]
     assert list(numbers["violated"]) == ["error"]
     assert (options["nodes"], options["nodes_max"], numbers["size"]["n_nodes"]) == (230, 230, 230)
@@ -1155,55 +963,27 @@ def test_target_error_with_the_most_nodes(capfd):
 # segment
 
 
-def test_segment(capfd):
+def test_segment():
     """The labels written are the library's; Dice with the truth is printed for mesh and voxels."""
-    phantom = load_phantom("sphere")
-    save_image("image.nii.gz", phantom.image(voxel_mm=2.0))
-    save_image("truth.nii.gz", phantom.label_image(voxel_mm=2.0))
-    image = load_image("image.nii.gz")
-    mesh = optimize(image, tetopt.lattice_mesh(image, nodes=400), k_D=0.5, iterations=4).mesh
-    tetopt.save_mesh("mesh.vtu", mesh)
-    command = "segment image.nii.gz mesh.vtu -o labels.nii.gz --classes 2 --json s.json"
-    assert_done(f"{command} --truth truth.nii.gz")
-    labels = load_image("labels.nii.gz")
-    assert_array_equal(labels.data, segment(image, mesh, 2).data)
+    truth = load_phantom("sphere").label_image(voxel_mm=4.0)
+    save_image("truth.nii.gz", truth)
+    command = "segment sphere.nii.gz run.vtu -o labels.nii.gz --classes 2 --json s.json"
+    said = run_command(f"{command} --truth truth.nii.gz").out
+    image, labels = load_image("sphere.nii.gz"), load_image("labels.nii.gz")
+    assert_array_equal(labels.data, segment(image, load_mesh("run.vtu").mesh, 2).data)
     assert_allclose(labels.affine, image.affine)
-    numbers = numbers_in("s.json")
     overlaps = dice(labels, load_image("truth.nii.gz"))
-    assert numbers["dice"]["mesh"] == {str(label): value for label, value in overlaps.items()}
-    assert overlaps[1] > 0.8
-    assert f"{overlaps[1]:.4f}" in capfd.readouterr().out
-    assert_refused(capfd, command, "exists")
+    written = {str(label): value for label, value in overlaps.items()}
+    assert numbers_in("s.json")["dice"]["mesh"] == written
+    assert overlaps[1] > 0.7
+    assert f"{overlaps[1]:.4f}" in said
 
 
-def test_segment_refuses_other_labels(capfd):
-    command = "segment sphere.nii.gz lattice.vtu -o l.nii"
-    other = load_phantom("sphere").label_image(voxel_mm=3.3)
-    save_image("other.nii", other)
-    assert_refused(capfd, f"{command} --truth other.nii", "expected labels on the image's grid")
-    assert_refused(capfd, f"{command} --classes 300", "classes: 300 requested")
-
-
-def test_segment_labels_must_lie_where_the_image_does(capfd):
-    """Truth of the same shape but elsewhere is refused; truth is cut as the image is; a foreign
-    mesh is told.
-    """
-    sphere = load_image("sphere.nii.gz")
-    shifted = sphere.affine.copy()
-    shifted[0, 3] += 3.0
-    save_image("shifted.nii", Image(sphere.data > 50, shifted))
-    save_image("truth.nii", Image(sphere.data > 50, sphere.affine))
-    command = "segment sphere.nii.gz lattice.vtu -o l.nii"
-    assert exit_code(f"{command} --truth shifted.nii") == 2
-    capfd.readouterr()
-    save_image("odd.nii", Image(np.where(sphere.data > 50, 1e30, 0.5), sphere.affine))
-    assert_refused(capfd, f"{command} --truth odd.nii", "labels must be whole numbers")
+def test_segment_cuts_the_truth_as_the_image_and_never_replaces_it():
     assert_done("mesh sphere.nii.gz --slice k=5 -o s.vtu --nodes 40 --iterations 0")
     cut = "segment sphere.nii.gz s.vtu --slice k=5 --truth truth.nii --classes 2 -o"
     assert_done(f"{cut} l.nii")
-    kept = Path("truth.nii").read_bytes()
-    assert exit_code(f"{cut} truth.nii --force") == 2
-    assert Path("truth.nii").read_bytes() == kept
+    assert_refuses(f"{cut} truth.nii --force", "truth.nii")
 
 
 def test_an_error_of_a_million_letters_is_cut(capsys):

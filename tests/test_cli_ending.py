@@ -8,12 +8,13 @@ import shutil
 import signal
 import subprocess
 import sys
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import assert_done, exit_code, numbers_in
+from commands import assert_done, assert_refuses, exit_code, numbers_in, run_command
 from models import sample_image
 
 import tetopt
@@ -32,6 +33,7 @@ NEEDS_FULL = pytest.mark.skipif(
 )
 LATE_SIGNALS = [signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)]
 MESH = "mesh in/a.nii.gz -o out/a.vtu --json out/a.json --spacing 8 --iterations 2"
+PHANTOM = "phantom disc_2d -o out/a.nii --voxel-mm 8"
 
 
 @pytest.fixture(autouse=True)
@@ -46,6 +48,21 @@ def written():
     return sorted(os.listdir("out"))
 
 
+def failing(error):
+    """A function that does nothing but raise."""
+
+    def fail(*_, **__):
+        raise error
+
+    return fail
+
+
+def before(owner, name, act, monkeypatch):
+    """Do something each time before a function is called."""
+    call = getattr(owner, name)
+    monkeypatch.setattr(owner, name, lambda *arguments: (act(), call(*arguments))[1])
+
+
 # --------------------------------------------------------------------------------------------------
 # Signals
 
@@ -53,99 +70,81 @@ def written():
 @pytest.fixture
 def signals_not_ignored():
     """As in a terminal: under nohup SIGHUP is ignored, and SIGINT in the background of a script."""
-    before = {number: signal.signal(number, signal.SIG_DFL) for number in LATE_SIGNALS}
+    handlers = {number: signal.signal(number, signal.SIG_DFL) for number in LATE_SIGNALS}
     signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
-    for number, handler in before.items():
+    for number, handler in handlers.items():
         signal.signal(number, handler)
+
+
+def name_of(number):
+    return "Ctrl-C" if number == signal.SIGINT else number.name
 
 
 @NEEDS_SIGNALS
 @pytest.mark.parametrize("number", LATE_SIGNALS)
-def test_a_signal_leaves_the_mesh_reached(monkeypatch, capsys, signals_not_ignored, number):
+def test_a_signal_leaves_the_mesh_reached(monkeypatch, signals_not_ignored, number):
     @contextmanager
     def told(*_):
         yield lambda row: signal.raise_signal(number) if row.iteration == 1 else None
 
     monkeypatch.setattr(tetopt.cli.run, "_bar", told)
-    before = signal.getsignal(number)
-    assert exit_code(f"{MESH} --iterations 200") == 128 + number
-    assert signal.getsignal(number) is before
+    handler = signal.getsignal(number)
+    lines = run_command(f"{MESH} --iterations 200", code=128 + number).err.splitlines()
+    assert signal.getsignal(number) is handler
     assert numbers_in("out/a.json")["iterations_done"] < 5
     assert len(tetopt.load_mesh("out/a.vtu").mesh.cells) > 100
-    lines = capsys.readouterr().err.splitlines()
     assert any(line.startswith("interrupted: the current mesh is kept") for line in lines)
-    name = "Ctrl-C" if number == signal.SIGINT else number.name
-    assert lines[-1] == f"ended by {name}; written: out/a.vtu, out/a.json"
+    assert lines[-1] == f"ended by {name_of(number)}; written: out/a.vtu, out/a.json"
 
 
 @NEEDS_SIGNALS
 def test_a_signal_while_the_mesh_is_written_waits_for_it(monkeypatch):
-    save = tetopt.job.write.save_for_solver
-
-    def interrupted(*arguments):
-        signal.raise_signal(signal.SIGTERM)
-        save(*arguments)
-
-    monkeypatch.setattr(tetopt.job.write, "save_for_solver", interrupted)
+    interrupt = partial(signal.raise_signal, signal.SIGTERM)
+    before(tetopt.job.write, "save_for_solver", interrupt, monkeypatch)
     assert exit_code(MESH) == 143
     assert written() == ["a.json", "a.vtu"]
 
 
 @NEEDS_SIGNALS
 @pytest.mark.parametrize("number", LATE_SIGNALS)
-def test_other_commands_end_at_once(monkeypatch, capsys, signals_not_ignored, number):
-    def interrupted(*_):
-        signal.raise_signal(number)
-
-    monkeypatch.setattr(tetopt.cli.phantom, "save_image", interrupted)
-    assert exit_code("phantom disc_2d -o out/a.nii --voxel-mm 8") == 128 + number
+def test_other_commands_end_at_once(monkeypatch, signals_not_ignored, number):
+    monkeypatch.setattr(tetopt.cli.phantom, "save_image", lambda *_: signal.raise_signal(number))
+    said = run_command(PHANTOM, code=128 + number).err
     assert written() == []
-    name = "Ctrl-C" if number == signal.SIGINT else number.name
-    assert capsys.readouterr().err == f"ended by {name}; written: nothing\n"
+    assert said == f"ended by {name_of(number)}; written: nothing\n"
 
 
 @NEEDS_SIGNALS
 def test_an_ignored_signal_stays_ignored():
     """As nohup asks for, and shells of what runs in the background."""
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    handler = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with signals_heard():
             assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
             assert signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL
         assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     finally:
-        signal.signal(signal.SIGHUP, before)
+        signal.signal(signal.SIGHUP, handler)
 
 
 # --------------------------------------------------------------------------------------------------
 # Streams
 
 
-@contextmanager
-def full_device():
-    """A stream to what is always full; what is left in its buffer must not fail when it is
-    closed.
-    """
-    with open("/dev/full", "w", encoding="utf-8") as stream:
-        yield stream
-
-
 @NEEDS_FULL
-@pytest.mark.parametrize(("names", "code"), [(["stderr"], 0), (["stdout"], 2)])
-def test_full_streams_lose_no_file(monkeypatch, capsys, names, code):
-    with full_device() as stream:
-        for name in names:
-            monkeypatch.setattr(sys, name, stream)
+@pytest.mark.parametrize(("name", "code"), [("stderr", 0), ("stdout", 2)])
+def test_full_streams_lose_no_file(monkeypatch, capsys, name, code):
+    with open("/dev/full", "w", encoding="utf-8") as stream:
+        monkeypatch.setattr(sys, name, stream)
         assert exit_code(MESH) == code
     monkeypatch.undo()
     assert written() == ["a.json", "a.vtu"]
-    if names == ["stdout"]:
-        said = capsys.readouterr().err
-        assert said.endswith(
-            "standard output cannot be written (No space left on device); the printed output is "
-            "incomplete\n"
-        )
+    words = (
+        "standard output cannot be written (No space left on device); the printed output is "
+        "incomplete\n"
+    )
+    assert capsys.readouterr().err.endswith(words) == (name == "stdout")
 
 
 def test_closed_streams_lose_no_file(monkeypatch):
@@ -153,8 +152,8 @@ def test_closed_streams_lose_no_file(monkeypatch):
     closed = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115, closed in the next line
     closed.close()
     for stream in (None, closed):
-        monkeypatch.setattr(sys, "stdout", stream)
-        monkeypatch.setattr(sys, "stderr", stream)
+        for name in ("stdout", "stderr"):
+            monkeypatch.setattr(sys, name, stream)
         assert_done(f"{MESH} --force")
         assert written() == ["a.json", "a.vtu"]
 
@@ -181,14 +180,13 @@ def test_closed_descriptors_are_not_taken_by_files(tmp_path):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="names are of bytes on Linux alone")
 @pytest.mark.parametrize("suffix", ["vtu", "xdmf", "msh", "inp"])
-def test_names_that_are_not_utf_8(suffix, capsys):
+def test_names_that_are_not_utf_8(suffix):
     name = os.fsdecode(b"caf\xe9\x1b[31m\n")
     os.rename("in/a.nii.gz", f"in/{name}.nii.gz")
     words = "--spacing 8 --iterations 0 --young 3 --json out/a.json -o"
     out = Path(f"out/{name}.{suffix}")
-    assert_done("mesh", Path(f"in/{name}.nii.gz"), words, out)
+    said = "".join(run_command("mesh", Path(f"in/{name}.nii.gz"), words, out))
     assert numbers_in("out/a.json")["image"] == "caf\\udce9\x1b[31m\n.nii.gz"
-    said = "".join(capsys.readouterr())
     assert "\x1b" not in said
     assert r"caf\udce9\x1b[31m\n" in said
     assert b"caf\xe9" not in out.read_bytes()
@@ -214,15 +212,9 @@ ARRAY_MEMORY_ERROR = (
         (ARRAY_MEMORY_ERROR((10**6, 10**6), np.dtype(float)), "not enough memory: .*7.28 TiB"),
     ],
 )
-def test_short_memory_is_a_line(monkeypatch, capsys, error, words):
-    def short(*_):
-        raise error
-
-    monkeypatch.setattr(tetopt.cli.phantom, "save_image", short)
-    assert exit_code("phantom disc_2d -o out/a.nii --voxel-mm 8") == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert re.search(words, said)
+def test_short_memory_is_a_line(monkeypatch, error, words):
+    monkeypatch.setattr(tetopt.cli.phantom, "save_image", failing(error))
+    assert_refuses(PHANTOM, words)
 
 
 @pytest.mark.parametrize(
@@ -230,61 +222,43 @@ def test_short_memory_is_a_line(monkeypatch, capsys, error, words):
     [OSError(28, "No space left on device", "a.inp"), MemoryError("to lay out"), KeyError(7)],
 )
 def test_a_mesh_whose_file_fails_is_kept(monkeypatch, capsys, error):
-    def failing(*_):
-        raise error
-
-    monkeypatch.setattr(tetopt.job.write, "save_for_solver", failing)
+    monkeypatch.setattr(tetopt.job.write, "save_for_solver", failing(error))
     command = "mesh in/a.nii.gz -o out/a.inp --spacing 8 --iterations 2"
-    if isinstance(error, KeyError):  # a fault of ours, which is not hidden
-        with pytest.raises(KeyError):
-            exit_code(command)
-    else:
+    # a fault of ours is not hidden
+    is_ours = isinstance(error, KeyError)
+    with pytest.raises(KeyError) if is_ours else nullcontext():
         assert exit_code(command) == 2
     assert "the optimised mesh is in out/a.vtu: continue from there" in capsys.readouterr().err
     assert tetopt.load_mesh("out/a.vtu").cell_data["mean"].max() > 0.0
 
 
-def test_a_mesh_whose_folder_has_gone_is_kept_elsewhere(tmp_path, monkeypatch, capsys):
+def test_a_mesh_whose_folder_has_gone_is_kept_elsewhere(tmp_path, monkeypatch):
     """Whatever else fails: the model of the mesh, then the mesh beside its name."""
-    save = tetopt.job.write.save_for_solver
-
-    def gone(*arguments):
-        shutil.rmtree("out")
-        save(*arguments)
-
     (tmp_path / "tmp").mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "tmp"))
-    monkeypatch.setattr(tetopt.job.write, "save_for_solver", gone)
-    assert exit_code(MESH) == 2
+    before(tetopt.job.write, "save_for_solver", partial(shutil.rmtree, "out"), monkeypatch)
+    said = run_command(MESH, code=2).err.splitlines()[-1]
     (kept,) = (tmp_path / "tmp").rglob("*.vtu")
-    said = capsys.readouterr().err.splitlines()
-    assert (
-        f"out/a.vtu: cannot be written: No such file or directory; the optimised mesh "
-        f"is in {kept}" in said[-1]
-    )
+    words = f"No such file or directory; the optimised mesh is in {kept}"
+    assert f"out/a.vtu: cannot be written: {words}" in said
     assert kept.parent.stat().st_mode & 0o077 == 0
     assert tetopt.load_mesh(kept).cell_data["mean"].max() > 0.0
 
 
-def test_what_was_written_before_an_error_is_said(monkeypatch, capsys):
-    def full(*_):
-        raise OSError(28, "No space left on device", "out/a.json")
-
-    monkeypatch.setattr(tetopt.job.run, "save_json", full)
-    assert exit_code(MESH) == 2
-    said = capsys.readouterr().err.splitlines()
-    assert said[-2:] == [
+def test_what_was_written_before_an_error_is_said(monkeypatch):
+    full = OSError(28, "No space left on device", "out/a.json")
+    monkeypatch.setattr(tetopt.job.run, "save_json", failing(full))
+    assert run_command(MESH, code=2).err.splitlines()[-2:] == [
         "tetopt: out/a.json: No space left on device",
         "written before the error: out/a.vtu",
     ]
 
 
-def test_a_mesh_that_the_disk_cannot_take_is_refused_before_the_run(monkeypatch, capsys):
+def test_a_mesh_that_the_disk_cannot_take_is_refused_before_the_run(monkeypatch):
     monkeypatch.setattr("shutil.disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9, 5000))
     monkeypatch.setattr(tetopt.job.mesh_stage, "watch_run", None)
-    assert exit_code(MESH) == 2
     words = "a.vtu: needs at least 8640 bytes, but only 5000 are free; free some space first"
-    assert words in capsys.readouterr().err
+    assert words in run_command(MESH, code=2).err
 
 
 def test_numbers_that_fail_lose_no_mesh(monkeypatch):
@@ -295,15 +269,6 @@ def test_numbers_that_fail_lose_no_mesh(monkeypatch):
 
 # --------------------------------------------------------------------------------------------------
 # Measures that fail
-
-
-def failing(error):
-    """A function that does nothing but raise."""
-
-    def fail(*_, **__):
-        raise error
-
-    return fail
 
 
 ERRORS = [
@@ -334,28 +299,21 @@ def measured_run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("measured")
     image = sample_image(3)
     for name, values in (("a", image.data), ("l", image.data > 30), ("m", np.ones(image.shape))):
-        tetopt.save_image(folder / f"{name}.nii", tetopt.Image(1.0 * values, image.affine))
-    words = [
-        "mesh",
-        folder / "a.nii",
-        "--labels",
-        folder / "l.nii",
-        "--mask",
-        folder / "m.nii",
-        "--edge-size 9 --nodes 60 --iterations 3",
-    ]
+        tetopt.save_image(f"{folder}/{name}.nii", tetopt.Image(1.0 * values, image.affine))
+    words = f"mesh {folder}/a.nii --labels {folder}/l.nii --mask {folder}/m.nii --edge-size 9"
+    words += " --nodes 60 --iterations 3"
     once = []
 
-    def remembered(image, aim, attempt, **options):
+    def remembered(image, aim, attempt, *required, **options):
         if once:  # what is said and checked before goes on in each run
             attempt(lambda **_: once[0], once[0].initial, aim, [])
         else:
-            once.append(search_mesh(image, aim, attempt, **options))
+            once.append(search_mesh(image, aim, attempt, *required, **options))
         return once[0]
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tetopt.job.mesh_stage, "search_mesh", remembered)
-        exit_code(*words, "-o", folder / "a.vtu", "--json", folder / "a.json")
+        exit_code(f"{words} -o {folder}/a.vtu --json {folder}/a.json")
         numbers = numbers_in(folder / "a.json")
         assert numbers["failed"] == {}
         yield words, numbers
@@ -364,34 +322,30 @@ def measured_run(tmp_path_factory):
 @pytest.mark.parametrize(
     ("name", "error"), list(zip(MEASURES, 4 * ERRORS, strict=False)), ids=MEASURES
 )
-def test_a_measure_that_fails_is_a_line(measured_run, monkeypatch, capsys, name, error):
+def test_a_measure_that_fails_is_a_line(measured_run, monkeypatch, name, error):
     """All other numbers are written, and the mesh as it is without the failure."""
     words, whole = measured_run
     where, keys = MEASURES[name]
     monkeypatch.setattr(where, name, failing(error))
-    assert exit_code(*words, "-o out/a.vtu --json out/a.json") == 1
+    said = run_command(f"{words} -o out/a.vtu --json out/a.json", code=1).err
     assert written() == ["a.json", "a.vtu"]
-    numbers, said = numbers_in("out/a.json"), capsys.readouterr().err
+    numbers = numbers_in("out/a.json")
     assert keys <= {key for key, value in numbers.items() if value is None}
     more = {"fields": {"contrasts"}, "label_contacts": {"contact_totals"}}.get(name, set())
     assert (set(numbers) | more) - {"thickness"} == set(whole)
+    failed = {"fields"} if name == "fields" else keys
+    assert set(numbers["failed"]) == failed
     assert list(numbers["violated"]) == list(numbers["failed"])
     known = {"failed", "violated", "seconds", "memory", "request", *keys}
     if name == "label_thickness":  # it is in the rows of labels
         assert all(row["thickness_mesh"] is None and row["dice"] > 0.0 for row in numbers["labels"])
         known |= {"labels"}
     assert all(numbers[key] == whole[key] for key in set(numbers) - known)
-    reason = "MemoryError" if isinstance(error, MemoryError) else str(error)
-    assert set(numbers["failed"]) == ({"fields"} if name == "fields" else keys)
-    for key, words_of_key in numbers["failed"].items():
-        assert reason in words_of_key
-        lines = [
-            line
-            for line in said.splitlines()
-            if line.startswith(f"tetopt: {key} could not be measured")
-        ]
-        assert len(lines) == 1
-        assert reason in lines[0]
+    reason = re.escape("MemoryError" if isinstance(error, MemoryError) else str(error))
+    for key in failed:
+        assert re.search(reason, numbers["failed"][key])
+        lines = re.findall(rf"^tetopt: {key} could not be measured.*", said, re.MULTILINE)
+        assert [bool(re.search(reason, line)) for line in lines] == [True]
     loaded = tetopt.load_mesh("out/a.vtu")
     assert len(loaded.mesh.cells) == whole["size"]["n_cells"]
     assert ("mean" in loaded.cell_data) == (name != "fields")

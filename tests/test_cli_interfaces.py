@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import pyvista
 import trimesh
-from commands import assert_done, assert_refused, exit_code, numbers_in
+from commands import assert_done, assert_refuses, numbers_in, run_command
 from numpy.testing import assert_allclose
 
 import tetopt
@@ -18,53 +18,43 @@ from tetopt.measure.fidelity import cell_labels
 pytestmark = [pytest.mark.full, pytest.mark.usefixtures("here")]
 
 
-def block_mesh(labels):
-    """An image of labels, a mesh with a block of cells in each voxel, and the label of each
-    cell.
+def save_blocks(name, labels, voxel=1.0):
+    """The labels, and a mesh with a block of cells in each voxel, as files of a name; the mesh and
+    the label of each cell.
     """
-    image = Image(labels)
+    image = Image(labels, np.diag([voxel, voxel, voxel, 1.0]))
     mesh = lattice_mesh(image, "five-tet", blocks=image.shape)
-    return image, mesh, cell_labels(image, mesh)
+    of_cell = cell_labels(image, mesh)
+    tetopt.save_image(f"{name}.nii.gz", image)
+    save_mesh(f"{name}.vtu", mesh, {"label": of_cell})
+    return mesh, of_cell
 
 
-@pytest.fixture(autouse=True)
-def touching(here):
-    """Two voxels of label 1 that share an edge, among 0: labels, their mesh, and the mesh of
-    label 1 alone.
+def test_a_boundary_that_is_no_manifold():
+    """Two voxels of label 1 that share an edge, among 0. It is a fault, also where the mask's
+    voxels touch like that; of an interface that no run smoothed it is said.
     """
     labels = np.zeros((4, 4, 4))
     labels[1, 1, 1] = labels[2, 2, 1] = 1
-    image, mesh, of_cell = block_mesh(labels)
-    tetopt.save_image("labels.nii.gz", image)
-    save_mesh("all.vtu", mesh, {"label": of_cell})
+    mesh, of_cell = save_blocks("all", labels)
     used, cells = np.unique(mesh.cells[of_cell == 1], return_inverse=True)
     save_mesh("ones.vtu", tetopt.Mesh(mesh.points[used], cells.reshape(-1, 4)))
-
-
-def test_a_boundary_that_is_no_manifold(capsys):
-    """It is a fault, also where the mask's voxels touch like that; of an interface that no run
-    smoothed it is said.
-    """
     check = "--check --json q.json --force"
-    assert exit_code(f"quality ones.vtu {check}") == 1
-    problems = numbers_in("q.json")["problems"]
-    assert problems[-1].startswith(
-        "edges where the boundary has more than two facets; nodes: 1, the first"
-    )
-    assert problems[-1] in capsys.readouterr().err
-
-    assert exit_code(f"quality ones.vtu {check} --image labels.nii.gz --mask labels.nii.gz") == 1
-    assert numbers_in("q.json")["problems"] == problems[-1:]
-    assert capsys.readouterr().err.count("more than two facets") == 1
-
-    assert_done(f"quality all.vtu {check} --image labels.nii.gz")
+    said = run_command(f"quality ones.vtu {check}", code=1).err
+    problem = numbers_in("q.json")["problems"][-1]
+    words = "edges where the boundary has more than two facets; nodes: 1, the first"
+    assert problem.startswith(words)
+    assert problem in said
+    masked = f"quality ones.vtu {check} --image all.nii.gz --mask all.nii.gz"
+    assert run_command(masked, code=1).err.count("more than two facets") == 1
+    assert numbers_in("q.json")["problems"] == [problem]
+    said = run_command(f"quality all.vtu {check} --image all.nii.gz")
     numbers = numbers_in("q.json")
     assert numbers["problems"] == []
     (remark,) = numbers["remarks"]
     assert remark.startswith(
         "edges where the interface of two labels has more than two facets (0 and 1 at 1); nodes: 1"
     )
-    said = capsys.readouterr()
     assert remark in said.err
     assert "checked: conforming, oriented, in one piece, fills the box" in said.out
 
@@ -72,104 +62,96 @@ def test_a_boundary_that_is_no_manifold(capsys):
 # Surfaces
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def slabs(here):
     """Slabs of labels 1, 2, 4 and 1 again, each 4 x 3 voxels wide and one or two thick, 2 mm a
     voxel.
     """
     labels = np.zeros((4, 3, 6))
     labels[:] = [1, 1, 2, 4, 4, 1]
-    mesh = lattice_mesh(Image(labels, np.diag([2.0, 2.0, 2.0, 1.0])), "five-tet", blocks=(4, 3, 6))
-    of_cell = cell_labels(Image(labels, np.diag([2.0, 2.0, 2.0, 1.0])), mesh)
-    save_mesh("slabs.vtu", mesh, {"label": of_cell})
     Path("names.csv").write_text("label,name\n2,bone\n4,left lung\n")
+    return save_blocks("slabs", labels, 2.0)[0]
 
 
 SLAB = 4 * 3 * 4.0  # mm2
+SUFFIXES = pytest.mark.parametrize("suffix", [".stl", ".ply", ".vtp", ".vtk"])
+
+
+def normals_of(corners):
+    """As long as the triangles are large."""
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2.0
+
+
+def corners_in(path):
+    """Of each triangle, by the class of VTK that 3D Slicer takes."""
+    read = pyvista.read(path)
+    return np.asarray(read.points, dtype=np.float64)[read.regular_faces]
 
 
 def labels_in(path):
-    """Places of the corners, labels inside and outside of each triangle, by readers that share
-    no code with ours.
-    """
+    """Labels inside and outside of each triangle, by readers that share no code with ours."""
+    names = "label_inside", "label_outside"
     if path.endswith(".ply"):
-        read = trimesh.load_mesh(path, process=False)
-        corners = read.vertices[read.faces]
-        sides = [
-            read.metadata["_ply_raw"]["face"]["data"][f"label_{side}"]
-            for side in ("inside", "outside")
-        ]
-        # by the class of VTK that 3D Slicer takes
-        assert pyvista.read(path).n_cells == len(corners)
+        data = trimesh.load_mesh(path, process=False).metadata["_ply_raw"]["face"]["data"]
     else:
-        read = pyvista.read(path)
-        corners = np.asarray(read.points)[read.regular_faces]
-        sides = [np.asarray(read.cell_data[f"label_{side}"]) for side in ("inside", "outside")]
-    return corners, np.column_stack(sides)
+        data = pyvista.read(path).cell_data
+    return np.column_stack([np.asarray(data[name]) for name in names])
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".vtp", ".vtk"])
 @pytest.mark.parametrize("has_boundary", [False, True])
-def test_all_interfaces_with_the_labels_of_both_sides(suffix, has_boundary, capsys):
+def test_all_interfaces_with_the_labels_of_both_sides(slabs, suffix, has_boundary):
     """Each lies in its plane, in its area, and faces out of its smaller label; so does the
     boundary.
     """
     out, more = f"all{suffix}", "--boundary" * has_boundary
-    assert_done(
-        f"surface slabs.vtu --interfaces {more} -o {out} --json a.json --label-names names.csv"
-    )
-    corners, sides = labels_in(out)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2.0
-    for (inside, outside), z, up in (((1, 2), 3.0, 1), ((2, 4), 5.0, 1), ((1, 4), 9.0, -1)):
-        mine = (sides == (inside, outside)).all(axis=1)
+    words = f"--interfaces {more} -o {out} --json a.json --label-names names.csv"
+    said = run_command(f"surface slabs.vtu {words}").out
+    corners, sides = corners_in(out), labels_in(out)
+    normals = normals_of(corners)
+    pairs = {(1, 2): (3.0, 1), (2, 4): (5.0, 1), (1, 4): (9.0, -1)}
+    for pair, (z, up) in pairs.items():
+        mine = (sides == pair).all(axis=1)
         assert_allclose(corners[mine][..., 2], z)
-        assert_allclose(normals[mine].sum(axis=0), [0.0, 0.0, up * SLAB])
+        assert_allclose(normals[mine].sum(axis=0), [0.0, 0.0, up * SLAB], atol=1e-9)
     outer = sides[:, 1] == -1
-    assert set(sides[outer, 0]) == ({1, 2, 4} if has_boundary else set())
-    centre = np.array([3.0, 2.0, 5.0])
-    assert ((normals[outer] * (corners[outer].mean(axis=1) - centre)).sum(axis=1) > 0.0).all()
-    assert np.linalg.norm(normals[outer], axis=1).sum() == pytest.approx(
-        (2 * 12 + 2 * 24 + 2 * 18) * 4.0 * has_boundary
-    )
-    assert (sides[:, 0] != sides[:, 1]).all()
-
+    outside = {(label, -1) for label in (1, 2, 4)} if has_boundary else set()
+    assert set(map(tuple, sides.tolist())) == {*pairs, *outside}
+    towards = corners[outer].mean(axis=1) - [3.0, 2.0, 5.0]
+    assert ((normals[outer] * towards).sum(axis=1) > 0.0).all()
+    area = (2 * 12 + 2 * 24 + 2 * 18) * 4.0 * has_boundary
+    assert np.linalg.norm(normals[outer], axis=1).sum() == pytest.approx(area)
     numbers = numbers_in("a.json")
     rows = {
         (row["label_inside"], row["label_outside"]): row["area_mm2"]
         for row in numbers["interfaces"]
     }
-    assert rows[1, 2] == rows[2, 4] == rows[1, 4] == pytest.approx(SLAB)
-    assert set(rows) == {(1, 2), (1, 4), (2, 4)} | (
-        {(1, -1), (2, -1), (4, -1)} if has_boundary else set()
-    )
-    assert numbers["n_triangles"] == len(corners)
+    assert rows.keys() == {*pairs, *outside}
+    assert [rows[pair] for pair in pairs] == pytest.approx([SLAB] * 3)
     # Around each interface its rim: 14 edges of voxels, to which the boundary adds two triangles.
     edges = (0, 3 * 14) if has_boundary else (3 * 14, 0)
-    assert (numbers["n_rim_edges"], numbers["n_seam_edges"]) == edges
-    said = capsys.readouterr().out
+    counts = numbers["n_triangles"], numbers["n_rim_edges"], numbers["n_seam_edges"]
+    assert counts == (len(corners), *edges)
     assert "2 (bone) to 4 (left lung)" in said
     assert ("2 (bone) to outside" in said) == has_boundary
 
 
-@pytest.mark.parametrize("suffix", [".stl", ".ply", ".vtp", ".vtk"])
-def test_one_interface(suffix):
+@SUFFIXES
+def test_one_interface(slabs, suffix):
     """Out of the label that is named first, by number or name."""
     for sides, up in (("2,4", 1.0), ("left lung,bone", -1.0)):
-        out = f"one{suffix}"
-        words = f"surface slabs.vtu --interface '{sides}' -o {out} --force"
-        assert_done(f"{words} --label-names names.csv")
-        surface = pyvista.read(out)
-        corners = np.asarray(surface.points, dtype=np.float64)[surface.regular_faces]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2.0
-        assert_allclose(normals.sum(axis=0), [0.0, 0.0, up * SLAB], atol=1e-5)
+        words = f"--interface '{sides}' -o one{suffix} --force --label-names names.csv"
+        assert_done(f"surface slabs.vtu {words}")
+        corners = corners_in(f"one{suffix}")
+        assert_allclose(normals_of(corners).sum(axis=0), [0.0, 0.0, up * SLAB], atol=1e-5)
         assert_allclose(corners[..., 2], 5.0)
 
 
-@pytest.mark.parametrize("suffix", [".stl", ".ply", ".vtp", ".vtk"])
-def test_the_whole_boundary(suffix, capsys):
+@SUFFIXES
+def test_the_whole_boundary(slabs, suffix):
     out = f"b{suffix}"
-    assert_done(f"surface slabs.vtu --boundary -o {out}")
-    assert "watertight, normals out" in capsys.readouterr().out
+    said = run_command(f"surface slabs.vtu --boundary -o {out}").out
+    assert "watertight, normals out" in said
     surface = pyvista.read(out)
     assert surface.volume == pytest.approx(4 * 3 * 6 * 8.0)
     closed = trimesh.Trimesh(surface.points, surface.regular_faces)
@@ -177,11 +159,9 @@ def test_the_whole_boundary(suffix, capsys):
     assert closed.area == pytest.approx(108 * 4.0)
 
 
-def test_one_label_has_no_interfaces(capsys):
-    mesh = tetopt.load_mesh("slabs.vtu").mesh
-    save_mesh("one.vtu", mesh, {"label": np.ones(len(mesh.cells), dtype=int)})
-    assert_refused(
-        capsys,
+def test_one_label_has_no_interfaces(slabs):
+    save_mesh("one.vtu", slabs, {"label": np.ones(len(slabs.cells), dtype=int)})
+    assert_refuses(
         "surface one.vtu --interfaces -o x.ply",
         "all cells have one label, so there are no interfaces",
     )

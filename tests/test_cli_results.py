@@ -10,7 +10,7 @@ from pathlib import Path
 import nibabel
 import numpy as np
 import pytest
-from commands import assert_done, assert_refused, numbers_in
+from commands import assert_done, numbers_in, refusals, run_command
 from numpy.testing import assert_allclose, assert_array_equal
 from results import FOLDER, our_displacement, solved_model
 
@@ -27,63 +27,61 @@ def order(request):
 
 
 @pytest.fixture(autouse=True)
-def folder(here, order):
-    """The mesh that was solved, with results of an earlier run on it, and CalculiX's file."""
+def files(here, request):
+    """The mesh that was solved, with results of an earlier run on it, CalculiX's file of both
+    orders, the mesh alone, and images; of order 1 where a test takes none.
+    """
+    order = request.getfixturevalue("order") if "order" in request.fixturenames else 1
     mesh = solved_model(order).mesh
     rest = np.zeros_like(mesh.points)
     cells = {"mean": np.arange(float(len(mesh.cells))), "stress": np.ones((len(mesh.cells), 9))}
     save_mesh("a.vtu", mesh, cells, point_data={"displacement_step7": rest, "heat": rest[:, 0]})
-    Path("a.frd").write_bytes((FOLDER / f"order_{order}.frd").read_bytes())
+    save_mesh("bare.vtu", mesh)
+    for name, k in (("a.frd", order), ("c.vtu", order), ("other.frd", 3 - order)):
+        Path(name).write_bytes((FOLDER / f"order_{k}.frd").read_bytes())
+    for name, corner in (("i", 0.0), ("far", 1e4)):
+        affine = np.eye(4)
+        affine[:3, 3] = corner
+        save_image(f"{name}.nii.gz", Image(np.zeros((3, 3, 3)), affine))
+
+
+def page_data(path):
+    """What a page holds of its mesh."""
+    page = Path(path).read_text(encoding="utf-8")
+    return json.loads(re.search(r'id="data">(.*?)</script>', page, re.DOTALL).group(1))
 
 
 @pytest.mark.parametrize(("suffix", "options"), [(".vtu", ""), (".vtk", "--space lps --units MPa")])
-def test_results_are_in_the_file_in_place_of_earlier_ones(order, suffix, options, capsys):
+def test_results_are_in_the_file_in_place_of_earlier_ones(order, suffix, options):
     out = f"b{suffix}"
-    assert_done(f"convert a.vtu {out} --results a.frd --json b.json {options}")
+    said = run_command(f"convert a.vtu {out} --results a.frd --json b.json {options}").out
     loaded = load_mesh(out)
     assert loaded.order == order
     assert list(loaded.cell_data) == ["mean"]
-    names = ["heat", "displacement", "strain_nodes", "stress_nodes", "von_mises_nodes"]
-    second = [f"{name}_step2" for name in names[1:]] if order == 1 else []
-    assert set(loaded.point_data) == {*names, *second}
+    names = ["displacement", "strain_nodes", "stress_nodes", "von_mises_nodes"]
+    steps = ("", "_step2") if order == 1 else ("",)
+    assert set(loaded.point_data) == {"heat", *(name + step for name in names for step in steps)}
     u = our_displacement(order, 1)
     assert_allclose(loaded.point_data["displacement"], u, rtol=0.0, atol=6e-6 * np.abs(u).max())
-    said = capsys.readouterr().out
-    largest = np.linalg.norm(loaded.point_data["displacement"], axis=1).max()
-    assert f"a.frd: displacement up to {largest:.4g} mm\n" in said
-    assert (
-        f"a.frd: von_mises_nodes up to {loaded.point_data['von_mises_nodes'].max():.4g} kPa\n"
-        in said
-    )
+    for name, unit in (("displacement", "mm"), ("von_mises_nodes", "kPa")):
+        values = loaded.point_data[name]
+        largest = np.linalg.norm(values.reshape(len(values), -1), axis=1).max()
+        assert f"a.frd: {name} up to {largest:.4g} {unit}\n" in said
     assert numbers_in("b.json")["results"] == "a.frd"
-
-
-def test_results_too_large_are_told(order, monkeypatch, capsys):
-    """As by `tetopt fem`: with small numbers for large ones here."""
-    words = "convert a.vtu b.vtu --results a.frd --force"
-    monkeypatch.setattr("tetopt.job.solver_files.SMALL_FRACTION", 10.0)
-    assert_done(words)
-    assert "the largest displacement" not in capsys.readouterr().err
-    monkeypatch.setattr("tetopt.job.solver_files.SMALL_FRACTION", 1e-9)
-    assert_done(words)
-    assert re.search(
-        r"warning: .*a.frd: displacement: the largest displacement, .* mm, is",
-        capsys.readouterr().err,
-    )
-
-
-def test_the_page_shows_them(order):
-    assert_done("convert a.vtu b.vtu --results a.frd")
-    assert_done("view b.vtu --html b.html")
-    page = Path("b.html").read_text(encoding="utf-8")
-    data = json.loads(re.search(r'id="data">(.*?)</script>', page, re.DOTALL).group(1))
+    assert_done(f"view {out} --html b.html")
+    data = page_data("b.html")
     assert [each["step"] for each in data["displacements"]] == ([1, 2] if order == 1 else [0])
-    assert {field["name"] for field in data["fields"]} >= {
-        "displacement",
-        "von_mises_nodes",
-        "mean",
-        "heat",
-    }
+    shown = {field["name"] for field in data["fields"]}
+    assert shown >= {"displacement", "von_mises_nodes", "mean", "heat"}
+
+
+def test_results_too_large_are_told(monkeypatch):
+    """As by `tetopt fem`: with small numbers for large ones here."""
+    for fraction, is_told in ((10.0, False), (1e-9, True)):
+        monkeypatch.setattr("tetopt.job.solver_files.SMALL_FRACTION", fraction)
+        said = run_command("convert a.vtu b.vtu --results a.frd --force").err
+        words = r"warning: .*a.frd: displacement: the largest displacement, .* mm, is"
+        assert bool(re.search(words, said)) == is_told
 
 
 def test_the_page_has_the_reactions_of_the_file():
@@ -92,38 +90,60 @@ def test_the_page_has_the_reactions_of_the_file():
         "reactions": {"superior": [1, 2, 3.5]},
         "reactions_step2": [1],
         "reactions_step3": {"a": ["x", 1, 2]},
+        "reactions_step4": {"superior": [0.0, float("nan"), 1.0]},
     }
-    about |= {"reactions_step4": {"superior": [0.0, float("nan"), 1.0]}}
     rest = {"displacement": 0.1 * mesh.points}
     save_mesh("a.vtu", mesh, {"mean": np.ones(len(mesh.cells))}, about, rest)
     assert_done("view a.vtu --html a.html")
-    page = Path("a.html").read_text(encoding="utf-8")
-    data = json.loads(re.search(r'id="data">(.*?)</script>', page, re.DOTALL).group(1))
-    assert data["reactions"] == {"0": {"superior": [1.0, 2.0, 3.5]}}
+    assert page_data("a.html")["reactions"] == {"0": {"superior": [1.0, 2.0, 3.5]}}
 
 
-@pytest.mark.parametrize("order", [1], indirect=True)
-def test_refusals_write_nothing(capsys):
-    Path("c.vtu").write_bytes(Path("a.frd").read_bytes())
-    for words, said in (
-        ("b.inp --results a.frd", "--results: expected an output file .vtu or .vtk"),
-        ("b.vtu --results c.frd", "no such file"),
-        (f"b.vtu --results {FOLDER}/order_2.frd", "belongs to another mesh"),
-        ("b.vtu --results a.vtu", "expected CalculiX's results"),
-        ("c.vtu --results c.vtu --force", "is also an input"),
-    ):
-        assert_refused(capsys, f"convert a.vtu {words}", said)
+test_refused = refusals(
+    """
+convert a.vtu b.inp --results a.frd
+    --results: expected an output file .vtu or .vtk
+convert a.vtu b.vtu --results no.frd
+    no such file
+convert a.vtu b.vtu --results other.frd
+    belongs to another mesh
+convert a.vtu b.vtu --results a.vtu
+    expected CalculiX's results
+convert a.vtu c.vtu --results c.vtu --force
+    is also an input
+convert a.vtu u.nii.gz --like i.nii.gz
+    which field
+convert a.vtu u.nii.gz --like i.nii.gz --field displacment
+    no field "displacment"; it has .*displacement_step7
+convert a.vtu u.nii.gz --field heat
+    which image
+convert a.vtu u.nii.gz --like i.nii.gz --field heat --young 3
+    --young: has no effect
+convert a.vtu u.nii.gz --field mean --warp i.nii.gz
+    displacement of nodes, but mean in .* is a field of cells
+convert a.vtu u.nii.gz --field displacement_step7 --warp i.nii.gz --outside nan
+    --outside: expected a
+convert a.vtu u.nii.gz --field displacement_step7 --warp i.nii.gz --space lps
+    --space: has no effect
+convert i.nii.gz a.vtu u.nii.gz --field heat --like i.nii.gz
+    give only one image
+convert a.vtu u.nii.gz --like i.nii.gz --field heat --nearest
+    --nearest: needs --warp
+convert a.vtu u.inp --like i.nii.gz
+    --like: has no effect
+convert a.vtu u.nii.gz --field heat --like far.nii.gz
+    no voxel centre is inside
+"""
+)
 
 
-def test_sets_of_the_solver_s_file_are_in_the_mesh_with_results(order, capsys):
+def test_sets_of_the_solver_s_file_are_in_the_mesh_with_results(order):
     corner = ",".join(f"{x:.3f}" for x in solved_model(order).mesh.points[0])
-    asked = f"--young 2 --set tip=point:{corner}:40 --set soft=below:2.5 --order {order}"
-    results = "--results a.frd --force"
-    assert_done(f"convert a.vtu b.vtu {results}")
-    assert "a.inp: missing, or not the input file of this mesh" in capsys.readouterr().err
+    results = "convert a.vtu b.vtu --results a.frd --force"
+    assert "a.inp: missing, or not the input file of this mesh" in run_command(results).err
     assert "tip" not in load_mesh("b.vtu").sets.facets
+    asked = f"--young 2 --set tip=point:{corner}:40 --set soft=below:2.5 --order {order}"
     assert_done(f"convert a.vtu a.inp {asked}")
-    assert_done(f"convert a.vtu b.vtu {results}")
+    assert_done(results)
     given, sets = input_sets("a.inp", solved_model(order).mesh), load_mesh("b.vtu").sets
     assert_array_equal(sets.facets["tip"], given.facets["tip"])
     assert_array_equal(sets.cells["soft"], given.cells["soft"])
@@ -133,29 +153,18 @@ def test_sets_of_the_solver_s_file_are_in_the_mesh_with_results(order, capsys):
 @pytest.mark.parametrize(
     ("suffix", "nu"), [(".inp", 0.45), (".inp", 0.44), (".xdmf", 0.45), (".vtu", 0.45)]
 )
-def test_stiff_linear_cells_are_warned_of_where_a_solver_s_file_is_written(suffix, nu, capsys):
-    mesh = solved_model(1).mesh
-    save_mesh("a.vtu", mesh)
-    out, is_said = f"b{suffix}", suffix != ".vtu" and nu == 0.45
-    assert_done(f"convert a.vtu {out} --young 2 --nu", str(nu))
-    said = capsys.readouterr().err
-    assert said.count("linear elements are too stiff") == is_said
+def test_stiff_linear_cells_are_warned_of_where_a_solver_s_file_is_written(suffix, nu):
+    mesh, out, n_told = solved_model(1).mesh, f"b{suffix}", int(suffix != ".vtu" and nu == 0.45)
+    words = "linear elements are too stiff"
+    assert run_command(f"convert bare.vtu {out} --young 2 --nu {nu}").err.count(words) == n_told
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        save_model(out, build_model(mesh, young=2.0, nu=nu))
-        save_model(out, build_model(mesh, young=2.0, nu=nu, order=2))
-    assert ["linear elements are too stiff" in str(each.message) for each in caught] == [
-        True
-    ] * is_said
+        for order in (1, 2):
+            save_model(out, build_model(mesh, young=2.0, nu=nu, order=order))
+    assert [words in str(each.message) for each in caught] == [True] * n_told
 
 
-def test_fem_warns_of_stiff_linear_cells_once_in_the_same_words(capsys):
-    save_mesh("a.vtu", solved_model(1).mesh)
-    assert_done("fem a.vtu --young 2 --nu 0.45 --load compress:2% -o b.vtu")
-    assert capsys.readouterr().err.count("linear elements are too stiff") == 1
-
-
-def test_a_displacement_goes_onto_the_voxels_of_an_image(order, capsys):
+def test_a_displacement_goes_onto_the_voxels_of_an_image(order):
     """As NIfTI's vectors along the world's axes, from the mesh's file or straight from the
     solver's results.
     """
@@ -165,63 +174,25 @@ def test_a_displacement_goes_onto_the_voxels_of_an_image(order, capsys):
     affine[:3, 3] = low - 0.1 * (high - low)
     image = Image(np.arange(210.0).reshape(7, 6, 5) % 97, affine)
     save_image("i.nii.gz", image)
-    assert_done(
-        "convert a.vtu u.nii.gz --results a.frd --field displacement --like i.nii.gz --json u.json"
-    )
-    expected = tetopt.field_on_image(mesh, u, image)
+    field = "--results a.frd --field displacement --like i.nii.gz --json u.json"
+    said = run_command(f"convert a.vtu u.nii.gz {field}").out
     file = nibabel.load("u.nii.gz")
     assert file.header.get_intent()[0] == "vector"
     assert file.shape == (7, 6, 5, 1, 3)
-    values = file.get_fdata()[:, :, :, 0]
-    assert_allclose(values, expected, rtol=0.0, atol=6e-6 * np.abs(u).max(), equal_nan=True)
-    assert 0 < np.isnan(values).sum() < values.size
-    said = " ".join(capsys.readouterr().out.split())
-    assert f"on {np.isfinite(values[..., 0]).sum()} of 210 voxels" in said
-    assert numbers_in("u.json")["n_voxels"] == np.isfinite(values[..., 0]).sum()
+    values, atol = file.get_fdata()[:, :, :, 0], 6e-6 * np.abs(u).max()
+    expected = tetopt.field_on_image(mesh, u, image)
+    assert_allclose(values, expected, rtol=0.0, atol=atol, equal_nan=True)
+    n_voxels = np.isfinite(values[..., 0]).sum()
+    assert 0 < n_voxels < 210
+    assert f"on {n_voxels} of 210 voxels" in " ".join(said.split())
+    assert numbers_in("u.json")["n_voxels"] == n_voxels
     assert_done("convert a.vtu b.vtu --results a.frd")
     assert_done("convert i.nii.gz b.vtu t.nii --field displacement --space lps --outside 0")
     lps = nibabel.load("t.nii").get_fdata()[:, :, :, 0]
     assert_array_equal(lps, np.nan_to_num(values * [-1, -1, 1]))
     moved = "convert b.vtu w.nii.gz --field displacement --warp i.nii.gz"
     assert_done(moved)
-    found = load_image("w.nii.gz")
-    field = load_mesh("b.vtu").point_data["displacement"]
-    again = tetopt.warped_image(mesh, field, image)
+    again = tetopt.warped_image(mesh, load_mesh("b.vtu").point_data["displacement"], image)
+    assert_allclose(load_image("w.nii.gz").data, again.data, atol=1e-5)
     assert_done(f"{moved} --nearest --force")
-    nearest = load_image("w.nii.gz").data
-    assert set(nearest.ravel()) <= {*image.data.ravel(), 0.0}
-    assert_allclose(found.data, again.data, atol=1e-5)
-
-
-def test_an_image_of_a_field_needs_the_field_and_the_voxels(order, capfd):
-    save_image("i.nii.gz", Image(np.zeros((3, 3, 3)), np.eye(4)))
-    words = "convert a.vtu u.nii.gz"
-    like = "--like i.nii.gz"
-    assert_refused(capfd, [words, like], "which field")
-    assert_refused(
-        capfd,
-        f"{words} {like} --field displacment",
-        'no field "displacment"; it has .*displacement_step7',
-    )
-    assert_refused(capfd, f"{words} --field heat", "which image")
-    assert_refused(capfd, f"{words} {like} --field heat --young 3", "--young: has no effect")
-    warp = "--warp i.nii.gz"
-    assert_refused(
-        capfd,
-        f"{words} --field mean {warp}",
-        "displacement of nodes, but mean in .* is a field of cells",
-    )
-    assert_refused(
-        capfd, f"{words} --field displacement_step7 {warp} --outside nan", "--outside: expected a"
-    )
-    assert_refused(
-        capfd, f"{words} --field displacement_step7 {warp} --space lps", "--space: has no effect"
-    )
-    twice = "convert i.nii.gz a.vtu u.nii.gz --field heat"
-    assert_refused(capfd, [twice, like], "give only one image")
-    assert_refused(capfd, f"{words} {like} --field heat --nearest", "--nearest: needs --warp")
-    assert_refused(capfd, f"convert a.vtu u.inp {like}", "--like: has no effect")
-    far = np.eye(4)
-    far[:3, 3] = 1e4
-    save_image("far.nii.gz", Image(np.zeros((3, 3, 3)), far))
-    assert_refused(capfd, f"{words} --field heat --like far.nii.gz", "no voxel centre is inside")
+    assert set(load_image("w.nii.gz").data.ravel()) <= {*image.data.ravel(), 0.0}

@@ -4,7 +4,7 @@ tables end in a count.
 
 import numpy as np
 import pytest
-from commands import exit_code
+from commands import run_command
 from label_rows import label_row, surface_of, with_numbers
 from models import sample_image
 
@@ -84,30 +84,17 @@ def test_a_label_of_another_volume_is_among_the_worst(labels):
     assert len(worst_labels(rows)) == 12
 
 
-@pytest.fixture(scope="module")
-def mesh(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("mesh")
-    tetopt.save_image(folder / "a.nii.gz", sample_image(3))
-    return folder
-
-
-def test_a_run_prints_ten_rows_and_quality_all_of_them(mesh, monkeypatch, capsys):
-    monkeypatch.chdir(mesh)
-    assert exit_code("mesh a.nii.gz -o a.vtu --spacing 6 --iterations 0 --force") == 0
-    said = capsys.readouterr()
-    lines = said.out.splitlines()
-    table = lines[
-        1 : next(k for k, line in enumerate(lines) if line.startswith("all requirements"))
-    ]
+def test_a_run_prints_ten_rows_and_quality_all_of_them(here):
+    tetopt.save_image("a.nii.gz", sample_image(3))
+    said = run_command("mesh a.nii.gz -o a.vtu --spacing 6 --iterations 0")
+    table = said.out.partition("\nall requirements")[0].splitlines()[1:]
     assert 8 <= len(table) <= 10
     assert not [line for line in table if "error (" in line or "bad cells" in line]
-    assert max(map(len, [*lines, *said.err.splitlines()])) <= 100
-    assert exit_code("quality a.vtu --image a.nii.gz") == 0
-    assert "rho error (iv), worst" not in capsys.readouterr().out
-    assert exit_code("quality a.vtu --image a.nii.gz --all") == 0
-    out = capsys.readouterr().out
-    assert "rho error (iv), worst" in out
-    assert "bad cells: slivers" in out
+    assert max(map(len, "".join(said).splitlines())) <= 100
+    words = "rho error (iv), worst", "bad cells: slivers"
+    for option, is_shown in (("", False), ("--all", True)):
+        out = run_command(f"quality a.vtu --image a.nii.gz {option}").out
+        assert [word in out for word in words] == [is_shown] * 2
 
 
 def test_messages_wrap_between_words_and_errors_stay_on_a_line(capsys):
