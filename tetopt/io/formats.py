@@ -7,7 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -394,7 +394,7 @@ def _rename_data(path: Path, model: Model) -> Model:
         raise InputError(f"{path}: two sets have the name {twice[1]}; rename one of them")
     shown = SHOWN_NAMES.get(path.suffix.lower(), file_name)
     changed = list[str]()
-    renamed = dict[str, Json]()
+    renamed = dict[str, Any]()
     for part in ("cell_data", "point_data", "about"):
         data = getattr(model, part)
         names = names_apart(data, shown)

@@ -894,7 +894,7 @@ def _number_segments(frames: list[Frame], slices: Ints, shape: tuple[int, int, i
     fraction.
     """
     tags = frames[0].file.tags
-    order = np.lexsort([[frame.segment for frame in frames], slices])
+    order = np.lexsort([np.array([frame.segment for frame in frames]), slices])
     frames = [frames[k] for k in order]
     slices = slices[order]
     names = {number: _name(each) for number, each in _segments(frames[0].file).items()}

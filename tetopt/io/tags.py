@@ -66,7 +66,7 @@ class Part(NamedTuple):
     entities: Ints  # (E,) the number of each element's entity
     # by entity, ascending: the numbers of its physical groups, the smallest set first
     groups_of: dict[int, list[int]]
-    names: dict[int, str]  # names of the groups, by number
+    names: Names  # of the groups, by number
     sets: dict[str, list[int]]  # the entities of each set
 
 

@@ -594,9 +594,13 @@ def near_hint(name: str, names: Iterable[str]) -> str:
     return f"; did you mean {near[0]}?" if near else ""
 
 
-@cache
 def kinds_of(record: Any) -> Json:
     """Return the fields of a record class with their annotations."""
+    return _known_kinds(record)
+
+
+@cache  # whose argument mypy would not take for hashable
+def _known_kinds(record: Any) -> Json:
     kinds = get_type_hints(record, include_extras=True)
     return {field.name: kinds[field.name] for field in fields(record)}
 

@@ -81,7 +81,7 @@ class Materials(NamedTuple):
 
     def fields(self) -> Arrays:
         """Return the moduli, ratios, materials from 1 and densities of cells, by fields' names."""
-        fields = {"young": self.young[self.of_cell], "nu": self.nu[self.of_cell]}
+        fields: Arrays = {"young": self.young[self.of_cell], "nu": self.nu[self.of_cell]}
         fields["material"] = self.of_cell + 1
         if self.density is not None:
             fields["density"] = self.density[self.of_cell]
@@ -115,8 +115,9 @@ def materials(
             check_cells("density", masses, masses > 0.0, "kg/m3 above 0", "water has 1000")
         )
     kinds, of_cell = np.unique(np.column_stack(columns), axis=0, return_inverse=True)
-    young, nu, *densities = (column.copy() for column in kinds.T)
-    return Materials(young, nu, of_cell.ravel().astype(np.int64), None, *densities)
+    columns = [column.copy() for column in kinds.T]
+    of_cell = of_cell.ravel().astype(np.int64)
+    return Materials(columns[0], columns[1], of_cell, None, *columns[2:])
 
 
 def without_moduli(table: Materials) -> Materials:

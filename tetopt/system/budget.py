@@ -38,7 +38,8 @@ class MemoryShortage(InputError):
 
 def memory_words(n_bytes: float) -> str:
     """Format a number of bytes."""
-    return f"{n_bytes / BYTES_PER_GB:.3g} GB" if n_bytes >= 1e8 else f"{n_bytes / 1e6:.3g} MB"
+    size, unit = (BYTES_PER_GB, "GB") if n_bytes >= 1e8 else (1e6, "MB")
+    return f"{float(f'{n_bytes / size:.3g}'):g} {unit}"
 
 
 def at_most(count: float, noun: str = "") -> str:
