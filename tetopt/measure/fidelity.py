@@ -183,13 +183,12 @@ class LabelOverlap(NamedTuple):
 
 
 class LabelDistance(NamedTuple):
-    """Distances between a label's surfaces in the mesh and in the image, both ways, mm; nan if one
-    is missing.
+    """Distances between a label's surfaces in the mesh and in the image, both ways, mm.
 
     Parameters
     ----------
     mean, p95 : float
-        Their mean and 95th percentile.
+        Their mean and 95th percentile; nan if one surface is missing.
     max : float
         The largest: it shows single spikes, unlike a percentile.
 

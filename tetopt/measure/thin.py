@@ -178,8 +178,7 @@ def _by_pair(one: NDArray, other: NDArray, weights: Floats | None = None) -> dic
 
 
 def label_thickness(what: Content, mesh: Mesh, of_cell: ArrayLike) -> dict[int, LabelThickness]:
-    """Measure the local thickness of each label, of its voxels' smooth surfaces and of its cells,
-    and the edges of the cells there.
+    """Measure the thickness of each label, between smooth surfaces and in cells, and their edges.
 
     Parameters
     ----------
