@@ -147,7 +147,7 @@ def test_foreign_files_in_the_work_directory_stay(out):
     (out / ".work" / "sub-01.run-1" / "link").symlink_to(elsewhere)
     (out / ".work" / "sub-01.run-3").symlink_to(elsewhere)
     with unchanged(elsewhere):
-        clean(out)
+        clean(out, None)
     assert content(out / ".work") == mine
 
 

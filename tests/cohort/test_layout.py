@@ -85,7 +85,7 @@ def test_what_ended_runs_have_left_is_removed(out):
     (out / ".work" / "sub-1.lock").touch()
     clean(out, ["sub-1"])
     assert set(os.listdir(out / ".work")) == {"sub-1.lock", other.name, "tetopt-lock"}
-    clean(out)
+    clean(out, None)
     assert not other.exists()
 
 

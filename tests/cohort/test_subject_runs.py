@@ -163,7 +163,7 @@ def test_a_run_that_is_given_up_ends(task, monkeypatch):
         def heard(event):
             stages.extend([event.data.name] if event.kind == "started" else [])
             if stages[-1:] == ["optimise"]:
-                clean(task.out)
+                clean(task.out, None)
 
         return tetopt.run(job, heard, stop)
 

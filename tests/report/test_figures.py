@@ -356,7 +356,7 @@ def test_a_legend_lists_the_largest_and_counts_the_others():
     labels = ["0", "4 left lung", *map(str, range(5, 15)), "and 2 more"]
     assert [entry.get_label() for entry in entries] == labels
     assert entries[1].get_facecolor() == (*colours[4], 1.0)
-    entries = legend_patches(numbers[:-2], colours, shown[:-2])
+    entries = legend_patches(numbers[:-2], colours, shown[:-2], {})
     assert [entry.get_label() for entry in entries] == [str(k) for k in (0, *range(2, 13))]
 
 

@@ -40,7 +40,7 @@ def test_micro_ct_keeps_three_digits():
         euler=2,
         mesh_euler=2,
     )
-    text = printed(mask_table(mask, 3))
+    text = printed(mask_table(mask, 3, "mask"))
     for number in ("0.0579", "0.0558 (-3.6 %)", "0.00211, 0.00422 mm", "0.00211, 12.346 mm"):
         assert number in text
     assert "0.0123 mm2, including 0.0 mm2" in contacts_in_words(

@@ -27,7 +27,7 @@ JOB = PipelineInput(IMAGE, None, 300, classes=2, iterations=3)
 def test_same_bits_as_in_process():
     labels = tetopt.Image((IMAGE.data > 50) + (np.indices(IMAGE.shape)[0] > 12), IMAGE.affine)
     job, pipeline = JOB._replace(labels=labels), PIPELINES["tetopt-uniform"].function
-    outcome, here = run_in_child(pipeline, job, max_seconds=300.0), pipeline(job)
+    outcome, here = outcome_of(pipeline, job, max_seconds=300.0), pipeline(job)
     assert outcome.failure is None
     assert outcome.mesh.points.tobytes() == here.mesh.points.tobytes()
     assert outcome.mesh.cells.tobytes() == here.mesh.cells.tobytes()
@@ -37,8 +37,8 @@ def test_same_bits_as_in_process():
     assert 2e7 < outcome.peak_bytes < 4e9
 
 
-def outcome_of(pipeline, job=JOB, max_seconds=60.0, **limits):
-    return run_in_child(pipeline, job, max_seconds=max_seconds, **limits)
+def outcome_of(pipeline, job=JOB, max_seconds=60.0, max_bytes=None):
+    return run_in_child(pipeline, job, "mine", max_seconds=max_seconds, max_bytes=max_bytes)
 
 
 def test_job_arrives_whole():
@@ -76,7 +76,7 @@ def test_a_crash_is_repeated_once(tmp_path, monkeypatch):
     monkeypatch.setenv("PIPES_PID", str(tmp_path / "pid"))
     events = []
     with listen_with(events.append):
-        outcome = outcome_of(pipes.crash_once, title="mine")
+        outcome = outcome_of(pipes.crash_once)
     said = "mine: crashed: signal 11, SIGSEGV; running it again, with smoother surfaces"
     assert events == [Event("note", said)]
     assert (outcome.failure, outcome.is_crash) == (None, False)
@@ -173,7 +173,8 @@ def test_the_end_of_the_parent_ends_the_child(tmp_path, sent):
         "import pipes, tetopt; from tetopt.study.pipeline_process import run_in_child\n"
         "from tetopt.study.pipelines import PipelineInput\n"
         "image = tetopt.load_phantom('sphere').image(voxel_mm=4.0)\n"
-        "run_in_child(pipes.sleep, PipelineInput(image, None, 300), max_seconds=300.0)"
+        "job = PipelineInput(image, None, 300)\n"
+        "run_in_child(pipes.sleep, job, 'mine', max_seconds=300.0, max_bytes=None)"
     )
     pid_file, temporary = tmp_path / "pid", tmp_path / "temporary"
     temporary.mkdir()

@@ -57,4 +57,4 @@ def test_a_box_of_labelled_cells(labels, monkeypatch):
 def test_what_is_refused(monkeypatch):
     monkeypatch.setitem(sys.modules, "mmgpy", None)
     with pytest.raises(tetopt.InputError, match=r"mmgpy: not installed; .* pip install"):
-        remesh_image(IMAGE, LABELS, 100)
+        remesh_image(IMAGE, LABELS, 100, 1, 1.0)

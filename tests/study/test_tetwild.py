@@ -98,7 +98,7 @@ def test_missed_count_is_told(monkeypatch):
     mesh = tetopt.lattice_mesh(IMAGE, nodes=600)
     points = IMAGE.to_index(mesh.points) * IMAGE.spacing
     monkeypatch.setattr(tetwild, "_run", lambda *_: (points, mesh.cells))
-    result = tetwild.fill_image(IMAGE, interfaces(IMAGE, 8.0, classes=2), 900)
+    result = tetwild.fill_image(IMAGE, interfaces(IMAGE, 8.0, classes=2), 900, 1)
     assert_fills(IMAGE, result.mesh)
     assert result.n_runs == tetwild.TETWILD_RUNS
     assert result.notes == [f"{len(points)} nodes after 6 runs of fTetWild; requested: 900"]

@@ -154,8 +154,8 @@ def publish(work: Path, out: Path, key: str) -> None:
         os.replace(work / name, place / name)
 
 
-def clean(out: Path, keys: list[str] | None = None) -> None:
-    """Remove unfinished outputs of these subjects, or, without `keys`, of all: runs that go on
+def clean(out: Path, keys: list[str] | None) -> None:
+    """Remove unfinished outputs of these subjects, or, if None, of all: runs that go on
     elsewhere then end.
     """
     for path in (out / WORK_NAME).glob("sub-*.run-*"):

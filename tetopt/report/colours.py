@@ -63,7 +63,7 @@ def legend_patches(
     labels: Ints,
     colours: Floats,
     shown: NDArray[np.integer],
-    names: Mapping[int, str] | None = None,
+    names: Mapping[int, str],
 ) -> list[Patch]:
     """Return a legend's entries: the `LISTED_LABELS` labels that cover most, ascending, and the
     number of others.
@@ -76,10 +76,9 @@ def legend_patches(
         The result of `label_colours`.
     shown : (K,) integer
         Visible amount of each label, in any unit; labels with 0 are not listed.
-    names : mapping of label to text, optional
+    names : mapping of label to text
         Names of labels.
     """
-    names = names or {}
     by_size = np.argsort(-shown, kind="stable")[: np.count_nonzero(shown)]
     entries = [
         Patch(

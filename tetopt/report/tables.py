@@ -126,7 +126,7 @@ def add_quality(
         table.add_row("scaled Jacobian of curved cells, smallest", f"{jacobian:.4f}")
 
 
-def mask_table(mask: MaskFidelity, ndim: int, word: str = "mask") -> Table:
+def mask_table(mask: MaskFidelity, ndim: int, word: str) -> Table:
     """Return a table of how well a mesh fills its mask, which the table calls `word`."""
     table = new_table(word, "in voxels", "in the mesh")
     change = 100.0 * (mask.mesh_volume / mask.volume - 1.0)

@@ -32,7 +32,7 @@ MMG_RESPONSE = Response(-2.5, -4.0, -1.0, step=1.5, after_failure=0.83)
 
 
 def remesh_image(
-    image: Image, labels: Image, nodes: int, order: int = 1, smoothing: float = 1.0
+    image: Image, labels: Image, nodes: int, order: int, smoothing: float
 ) -> tuple[Filled, Ints]:
     """Fill the image's box with about `nodes` nodes, and with cells that keep labels.
 

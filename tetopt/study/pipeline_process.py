@@ -48,10 +48,10 @@ class Outcome(NamedTuple):
 def run_in_child(
     pipeline: Callable[[PipelineInput], Produced],
     job: PipelineInput,
-    title: str = "a pipeline",
+    title: str,
     *,
-    max_seconds: float = float("inf"),
-    max_bytes: int | None = None,
+    max_seconds: float,
+    max_bytes: int | None,
 ) -> Outcome:
     """Run a pipeline in a child process, within limits; the mesh has the same bits as in this
     process.
@@ -71,7 +71,7 @@ def run_in_child(
     max_seconds : float
         Wall time of one run, including the child's start, after which it is killed with all its
         processes.
-    max_bytes : int, optional
+    max_bytes : int or None
         Resident memory at which it is killed. It is checked twenty times a second, so a fast run
         may exceed it slightly.
 

@@ -70,7 +70,7 @@ def node_spacing(image: Image, nodes: int) -> float:
     return float((np.sqrt(2.0) * image.volume / nodes) ** (1.0 / 3.0))
 
 
-def fill_image(image: Image, surfaces: Surfaces, nodes: int, order: int = 1) -> Filled:
+def fill_image(image: Image, surfaces: Surfaces, nodes: int, order: int) -> Filled:
     """Fill the image's box with tetrahedra that have facets along the surfaces, and about `nodes`
     nodes.
 
