@@ -9,11 +9,12 @@ import subprocess
 import time
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from pathlib import Path
 
 import dask.system
 import psutil
 import pytest
-from commands import exit_code
+from commands import assert_refuses
 from distributed import LocalCluster
 from models import sample_image
 
@@ -45,22 +46,23 @@ IN_PROCESS = {
 
 
 @pytest.mark.parametrize(
-    ("n_tasks", "worker_bytes", "count", "threads", "cores", "free", "expected"),
+    ("n_tasks", "need", "count", "threads", "cores", "free", "expected"),  # GB
     [
-        (100, 0.1 * GB, None, None, 8, 80 * GB, (8, 1, 10 * GB)),  # cores
-        (100, 3 * GB, None, None, 8, 12 * GB, (4, 2, 3 * GB)),  # memory
-        (3, 3 * GB, None, None, 8, 90 * GB, (3, 2, 30 * GB)),  # tasks
-        (100, 3 * GB, 2, None, 8, 90 * GB, (2, 4, 45 * GB)),  # count
-        (100, 3 * GB, None, 4, 8, 90 * GB, (2, 4, 45 * GB)),  # threads of each
-        (100, 20 * GB, 5, None, 2, 11 * GB, (1, 2, 11 * GB)),  # none fits: one
+        (100, 0.1, None, None, 8, 80, (8, 1, 10)),  # cores
+        (100, 3, None, None, 8, 12, (4, 2, 3)),  # memory
+        (3, 3, None, None, 8, 90, (3, 2, 30)),  # tasks
+        (100, 3, 2, None, 8, 90, (2, 4, 45)),  # count
+        (100, 3, None, 4, 8, 90, (2, 4, 45)),  # threads of each
+        (100, 20, 5, None, 2, 11, (1, 2, 11)),  # none fits: one
     ],
 )
 def test_as_many_workers_as_cores_memory_and_tasks_allow(
-    n_tasks, worker_bytes, count, threads, cores, free, expected, monkeypatch
+    n_tasks, need, count, threads, cores, free, expected, monkeypatch
 ):
     monkeypatch.setattr(dask.system, "CPU_COUNT", cores)
-    monkeypatch.setattr(module, "available_bytes", lambda: int(free))
-    assert share_of(n_tasks, worker_bytes, count, threads) == expected
+    monkeypatch.setattr(module, "available_bytes", lambda: int(free * GB))
+    share = share_of(n_tasks, need * GB, count, threads)
+    assert (*share[:2], share[2] / GB) == expected
 
 
 # ---- Here
@@ -242,26 +244,22 @@ def test_workers_of_a_scheduler_that_runs(others, tmp_path):
 
 def test_workers_that_cannot_run_tasks_are_refused(others, tmp_path, monkeypatch):
     """Each at its first task, as workers come and go."""
+
+    def assert_unfit(pool, words, folder=tmp_path):
+        with pytest.raises(UnfitWorker, match=words):
+            list(run_tasks(pool, limit_of, "a", str(folder)))
+
     with workers(NOTHING, others.scheduler.address, None) as pool:
-        with pytest.raises(
-            UnfitWorker,
-            match=r"cannot access .*no; expected an output folder on a file system that",
-        ):
-            list(run_tasks(pool, limit_of, "abc", str(tmp_path / "no")))
+        words = r"cannot access .*no; expected an output folder on a file system that"
+        assert_unfit(pool, words, tmp_path / "no")
         versions = iter(["tetopt 9 and Python 3.11", "tetopt 8 and Python 3.11"])
         monkeypatch.setattr(module, "_versions", lambda: next(versions, "tetopt 8 and Python 3.11"))
-        with pytest.raises(
-            UnfitWorker, match=r"expected tetopt 9 and Python 3.11 as here, got tetopt 8 and"
-        ):
-            list(run_tasks(pool, limit_of, "a", str(tmp_path)))
+        assert_unfit(pool, r"expected tetopt 9 and Python 3.11 as here, got tetopt 8 and")
     with (
         LocalCluster(n_workers=1, threads_per_worker=2, **IN_PROCESS) as cluster,
         workers(NOTHING, cluster.scheduler.address, None) as pool,
-        pytest.raises(
-            UnfitWorker, match=r"expected one task at a time, got 2; .* --nthreads 1 --nworkers 2"
-        ),
     ):
-        list(run_tasks(pool, limit_of, "abc", str(tmp_path)))
+        assert_unfit(pool, r"expected one task at a time, got 2; .* --nthreads 1 --nworkers 2")
 
 
 def test_tasks_wait_for_workers_and_a_lost_scheduler_is_said(tmp_path):
@@ -284,34 +282,18 @@ def test_tasks_wait_for_workers_and_a_lost_scheduler_is_said(tmp_path):
             next(ended)
 
 
-@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense://x", ""])
-def test_a_scheduler_that_does_not_answer_is_refused_in_one_line(address, monkeypatch, capfd):
-    monkeypatch.setattr(module, "CONNECT_SECONDS", 0.2)
-    with pytest.raises(InputError, match="does not answer") as refusal:
+def assert_no_scheduler(address, capfd):
+    """One line says that it does not answer."""
+    with pytest.raises(InputError, match=f"^`scheduler`: {address} does not answer") as refusal:
         check_workers(None, address)
     assert "\n" not in str(refusal.value)
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.fixture
-def silent():
-    """The address of a socket that takes connections and says nothing."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        yield f"tcp://127.0.0.1:{server.getsockname()[1]}"
-
-
-@pytest.mark.full
-def test_a_scheduler_that_says_nothing_is_refused_before_images_are_read(
-    silent, tmp_path, monkeypatch, capfd
-):
-    monkeypatch.setattr(module, "CONNECT_SECONDS", 0.3)
-    (tmp_path / "t.tsv").write_text("task\timage\n1\tnone.nii\n")
-    command = ["cohort", tmp_path / "t.tsv", "-o", tmp_path / "out", "--nodes", 200]
-    assert exit_code(*command, "--scheduler", silent) == 2
-    said = capfd.readouterr()
-    assert (said.out, said.err.count("\n")) == ("", 1)
-    assert f"--scheduler: {silent} does not answer (no reply of dask's within 0.3 s)" in said.err
-    assert not (tmp_path / "out").exists()
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense://x", ""])
+def test_a_scheduler_that_does_not_answer_is_refused_in_one_line(address, monkeypatch, capfd):
+    monkeypatch.setattr(module, "CONNECT_SECONDS", 0.2)
+    assert_no_scheduler(address, capfd)
 
 
 def test_another_service_at_the_address_is_no_scheduler(capfd):
@@ -326,25 +308,27 @@ def test_another_service_at_the_address_is_no_scheduler(capfd):
     with socket.create_server(("127.0.0.1", 0)) as server, ThreadPoolExecutor(1) as executor:
         server.settimeout(10)
         executor.submit(answer)
+        assert_no_scheduler(f"tcp://127.0.0.1:{server.getsockname()[1]}", capfd)
+
+
+COHORT = "cohort t.tsv -o out --nodes 60"
+
+
+@pytest.mark.full
+def test_a_scheduler_that_says_nothing_is_refused_before_images_are_read(here, monkeypatch):
+    monkeypatch.setattr(module, "CONNECT_SECONDS", 0.3)
+    Path("t.tsv").write_text("task\timage\n1\tnone.nii\n")
+    with socket.create_server(("127.0.0.1", 0)) as server:  # takes connections
         address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
-        with pytest.raises(InputError, match=f"^`scheduler`: {address} does not answer") as refusal:
-            check_workers(None, address)
-    assert "\n" not in str(refusal.value)
-    assert capfd.readouterr() == ("", "")
+        words = f"--scheduler: {address} does not answer (no reply of dask's within 0.3 s)"
+        assert_refuses(f"{COHORT} --scheduler {address}", words)
 
 
-def test_what_is_missing_or_contradictory_is_said_before_anything_is_written(
-    tmp_path, monkeypatch, capsys
-):
-    save_image(tmp_path / "a.nii.gz", sample_image(3))
-    (tmp_path / "t.tsv").write_text("task\timage\n1\ta.nii.gz\n")
-    command = ["cohort", tmp_path / "t.tsv", "-o", tmp_path / "out", "--nodes", 60]
-    assert exit_code(*command, "--scheduler", "tcp://127.0.0.1:1", "--workers", 2) == 2
-    assert "--workers: expected none with --scheduler" in capsys.readouterr().err
+def test_what_is_missing_or_contradictory_is_said_before_anything_is_written(here, monkeypatch):
+    save_image("a.nii.gz", sample_image(3))
+    Path("t.tsv").write_text("task\timage\n1\ta.nii.gz\n")
+    words = "--workers: expected none with --scheduler"
+    assert_refuses(f"{COHORT} --scheduler tcp://127.0.0.1:1 --workers 2", words)
     monkeypatch.setattr(module, "find_spec", lambda name: None)
-    assert exit_code(*command) == 2
-    assert (
-        'distributed is not installed, but dask needs it to run tasks; pip install "distributed"'
-        in (capsys.readouterr().err)
-    )
-    assert not (tmp_path / "out").exists()
+    words = "distributed is not installed, but dask needs it to run tasks; pip install"
+    assert_refuses(COHORT, f'{words} "distributed"')

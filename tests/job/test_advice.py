@@ -2,9 +2,11 @@
 meant.
 """
 
+import re
+
 import numpy as np
 import pytest
-from commands import exit_code, numbers_in
+from commands import numbers_in, run_command
 from label_rows import label_row, surface_of, with_numbers
 
 import tetopt
@@ -33,7 +35,7 @@ NEAR = MaskFidelity(9, 9.0, 9.0, 0.99, 0.1, 0.3, 0.1, 0.3, 0.1, 0.3, 0.1, 0.3, 1
 MESH = tetopt.Mesh([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], [[0, 1, 2]])
 
 
-def unmet(violated, measured, word="mask"):
+def unmet(violated, word="mask", **measured):
     """Yield what is unmet, with the verdict on the measured labels."""
     rows = {name: each for name, each in measured.items() if name == "labels"}
     of_labels = judge(rows, required_of(word, measured.get("label_names", {})))
@@ -41,23 +43,11 @@ def unmet(violated, measured, word="mask"):
 
 
 def told(*problems):
-    """Tell problems, as one list; return those that have a name."""
-    tell(order_problems(problems))
-    return sentences(problems)
-
-
-@pytest.fixture
-def said():
-    """A function that returns the texts of the events so far, a line each, and forgets them."""
+    """Tell problems, as one list; return those that have a name, and a line for each event."""
     events = []
-
-    def texts(kind=None):
-        lines = [event.text + "\n" for event in events if kind in (None, event.kind)]
-        events.clear()
-        return "".join(lines)
-
     with listen_with(events.append):
-        yield texts
+        tell(order_problems(problems))
+    return sentences(problems), "".join(event.text + "\n" for event in events)
 
 
 @pytest.mark.parametrize(
@@ -75,39 +65,33 @@ def said():
         ({"components": 3}, "the mask has 3 connected components, the mesh 1"),
     ],
 )
-def test_a_mask_that_the_mesh_does_not_show(said, change, words):
-    assert told(*unmet({}, {"mask": NEAR._replace(**change)})) == {}
-    text = said()
+def test_a_mask_that_the_mesh_does_not_show(change, words):
+    named, text = told(*unmet({}, mask=NEAR._replace(**change)))
+    assert named == {}
     assert words in text
-    assert text.count("\n") == (1 if words else 0)
+    assert text.count("\n") == bool(words)
 
 
-def test_what_background_leaves_is_no_mask(said):
-    violated = {"mask": "the mesh and the foreground overlap with a Dice of only 0.5"}
-    far = {
-        "mask": NEAR._replace(distance_p95=8.0, components=3, mesh_euler=99),
-        "dropped_components": 2,
-    }
+def test_what_background_leaves_is_no_mask():
     words = "the mesh and the foreground overlap with a Dice of only 0.5"
-    assert told(*unmet(violated, far, "foreground")) == {"mask": words}
-    text = said()
+    far = NEAR._replace(distance_p95=8.0, components=3, mesh_euler=99)
+    named, text = told(*unmet({"mask": words}, "foreground", mask=far, dropped_components=2))
+    assert named == {"mask": words}
     assert "the mask" not in text
     assert text.count("foreground") >= text.count("\n") == 4
 
 
-def test_components_that_were_dropped_are_told(said):
-    assert told(*unmet({}, {"mask": NEAR, "dropped_components": 0})) == {}
-    assert said() == ""
-    assert told(*unmet({}, {"mask": NEAR, "dropped_components": 2})) == {}
-    assert (
-        "dropped 2 small connected components of the mesh that are not separate in the mask"
-        in said()
-    )
+def test_components_that_were_dropped_are_told():
+    assert told(*unmet({}, mask=NEAR, dropped_components=0)) == ({}, "")
+    named, text = told(*unmet({}, mask=NEAR, dropped_components=2))
+    assert named == {}
+    words = "dropped 2 small connected components of the mesh that are not separate in the mask"
+    assert words in text
     volumes = {"mask": NEAR, "dropped_components": 2, "dropped_volumes": {"3": 1.5, "0": 2.0}}
-    told(*unmet({}, volumes))
-    assert "as large as 3.5 voxels; " in said()
-    told(*unmet({}, volumes | {"labels": [label_of(3)], "label_names": {3: "gland"}}))
-    assert "as large as 3.5 voxels (label 3 (gland) 1.5, label 0 2); " in said()
+    assert "as large as 3.5 voxels; " in told(*unmet({}, **volumes))[1]
+    volumes |= {"labels": [label_of(3)], "label_names": {3: "gland"}}
+    words = "as large as 3.5 voxels (label 3 (gland) 1.5, label 0 2); "
+    assert words in told(*unmet({}, **volumes))[1]
 
 
 def label_of(label, mesh_volume=9.0, is_lost=False, voxels=9):
@@ -116,61 +100,54 @@ def label_of(label, mesh_volume=9.0, is_lost=False, voxels=9):
     return label_row(label, dice=0.0 if is_lost else 0.9, **counts, **numbers)
 
 
-def test_labels_of_twice_or_half_their_volume_are_named_the_worst_first(said):
-    rows = [
-        label_of(k, volume) for k, volume in ((1, 9.0), (2, 18.5), (5, 2.0), (7, 17.9), (8, 4.6))
-    ]
-    told(*unmet({}, {"labels": [*rows, label_of(9, 0.0, True)]}))
-    (line,) = (line for line in said().splitlines() if "ratio" in line)
+def test_labels_of_twice_or_half_their_volume_are_named_the_worst_first():
+    volumes = {1: 9.0, 2: 18.5, 5: 2.0, 7: 17.9, 8: 4.6}
+    rows = [label_of(*each) for each in volumes.items()]
+    _, text = told(*unmet({}, labels=[*rows, label_of(9, 0.0, True)]))
+    (line,) = (line for line in text.splitlines() if "ratio" in line)
     assert line.startswith("2 labels with more than 2 times the volume")
     assert "(ratio in brackets): 5 (0.222), 2 (2.06); allow more nodes" in line
 
 
-def test_large_labels_of_another_volume_violate_a_requirement_by_name(said):
-    volumes = (1, 9.0), (2, 13.6), (5, 5.3), (7, 13.4), (8, 5.5)
-    rows = [label_of(k, volume, voxels=200) for k, volume in volumes]
-    assert (
-        told(*unmet({}, {"labels": [label_of(k, volume, voxels=199) for k, volume in volumes]}))
-        == {}
-    )
-    assert "labels" not in said()
-    names = {"label_names": {5: "wall"}, "labels": rows}
+def test_large_labels_of_another_volume_violate_a_requirement_by_name():
+    """With a part of the label in the mesh, the volume is that of the part."""
+    volumes = {1: 9.0, 2: 13.6, 5: 5.3, 7: 13.4, 8: 5.5}
     words = (
         "the volume of cells is not 0.6 to 1.5 times that of voxels: 0.589 for label 5 "
-        "(wall), 1.51 for label 2"
+        f"(wall), 1.51 for label 2; {LABEL_REMEDY}"
     )
-    assert told(*unmet({"labels": "by numbers"}, names)) == {"labels": f"{words}; {LABEL_REMEDY}"}
-    # With a part of the label in the mesh, the volume is that of the part.
-    half = [
-        with_numbers(row, covered_voxels=300, voxels=600, mesh_volume=0.5 * row.extent.mesh_volume)
-        for row in rows
-    ]
-    assert told(*unmet({}, names | {"labels": half})) == {"labels": f"{words}; {LABEL_REMEDY}"}
-    few = [
-        with_numbers(row, covered_voxels=199, voxels=398, mesh_volume=0.5 * row.extent.mesh_volume)
-        for row in rows
-    ]
-    assert told(*unmet({}, names | {"labels": few})) == {}
+    for voxels, expected in ((200, {"labels": words}), (199, {})):
+        rows = [label_of(*each, voxels=voxels) for each in volumes.items()]
+        parts = [
+            with_numbers(row, voxels=2 * voxels, mesh_volume=0.5 * row.extent.mesh_volume)
+            for row in rows
+        ]
+        for each in (rows, parts):
+            violated = {"labels": "by numbers"} if expected else {}
+            named, text = told(*unmet(violated, labels=each, label_names={5: "wall"}))
+            assert named == expected
+            assert expected or "labels: " not in text
 
 
-def test_components_without_a_cell_violate_a_requirement_the_largest_first(said):
+def test_components_without_a_cell_violate_a_requirement_the_largest_first():
     lost = tuple(LostComponent(n, (1.0, 2.5, 1234.56)) for n in (99, 60, 50, 50))
     rows = [
         with_numbers(label_of(3), lost_components=lost),
         with_numbers(label_of(4, is_lost=True), lost_components=lost[:2]),
     ]
-    words = told(*unmet({}, {"labels": rows}))["labels"]
+    named, text = told(*unmet({}, labels=rows))
+    words = named["labels"]
     assert words.startswith(
         "components of labels of 50 voxels or more without a cell: 99 voxels of label 3 at (1, 2.5,"
     )
     assert words.endswith(f"50 voxels of label 3 at (1, 2.5, 1235) mm and 1 more; {PIECES_REMEDY}")
     assert "label_weight" not in words
-    assert "no cell has label" not in said()  # named above
+    assert "no cell has label" not in text  # named above
     few = tuple(each._replace(voxels=49) for each in lost)
     small = [with_numbers(label_of(3), lost_components=few)]
-    assert told(*unmet({}, {"labels": small})) == {}
+    assert told(*unmet({}, labels=small))[0] == {}
     large = [with_numbers(label_of(4, is_lost=True, voxels=200), lost_components=lost[:2])]
-    assert "components" not in told(*unmet({}, {"labels": large}))["labels"]
+    assert "components" not in told(*unmet({}, labels=large))[0]["labels"]
 
 
 def test_what_requirements_allow_is_counted_over_all_labels_the_worst_first():
@@ -254,25 +231,24 @@ def test_what_requirements_allow_of_a_mask(change, words):
     assert beyond == ({"not all of the foreground fits": f"foreground: {words}"} if words else {})
 
 
-def test_more_nodes_do_not_help_voxels_without_a_label_in_a_foreground(said):
+@pytest.mark.parametrize(("word", "n_remedies"), [("foreground", 0), ("mask", 1)])
+def test_more_nodes_do_not_help_voxels_without_a_label_in_a_foreground(word, n_remedies):
     air = label_of(0, 2.0, voxels=300)
-    far = with_numbers(air, mesh_volume=9.0, dice=0.1)
-    for word, rows, n_lines, n_remedies in (
-        ("foreground", [air], 1, 0),
-        ("mask", [air], 1, 1),
-        ("foreground", [air, label_of(2, 2.0)], 2, 1),
-        ("foreground", [far], 1, 0),
-        ("mask", [far], 1, 1),
-    ):
-        told(*unmet({}, {"labels": rows}, word))
-        text = said()
-        assert text.count("\n") == n_lines
-        assert text.count("allow more nodes") == n_remedies
-        assert text.count("0 (voxels without a label, enclosed or bright)") == (
-            word == "foreground"
-        )
-    told(*unmet({"labels": "..."}, {"labels": [with_numbers(air, dice=0.0)]}, "foreground"))
-    assert said().endswith("of 200 voxels or more, lies in a cell with that label\n")
+    near = with_numbers(air, mesh_volume=9.0, dice=0.1)
+    for rows in ([air], [near], [air, label_of(2, 2.0)]):
+        if word == "mask" and len(rows) == 2:
+            continue  # both in one line
+        _, text = told(*unmet({}, word, labels=rows))
+        assert text.count("\n") == len(rows)
+        assert text.count("allow more nodes") == n_remedies + len(rows) - 1
+        words = "0 (voxels without a label, enclosed or bright)"
+        assert text.count(words) == (word == "foreground")
+
+
+def test_no_remedy_for_a_lost_foreground():
+    lost = [with_numbers(label_of(0, 2.0, voxels=300), dice=0.0)]
+    _, text = told(*unmet({"labels": "..."}, "foreground", labels=lost))
+    assert text.endswith("of 200 voxels or more, lies in a cell with that label\n")
 
 
 def ended(E=0.5, E_D=0.5):
@@ -325,88 +301,97 @@ def started_only():
         ),
     ],
 )
-def test_what_is_hardly_meant(said, result, mode, nodes, measured, words):
-    told(*of_result(result, "fast", mode, 100, nodes, measured))
-    text = said()
+def test_what_is_hardly_meant(result, mode, nodes, measured, words):
+    _, text = told(*of_result(result, "fast", mode, 100, nodes, measured))
     assert words in text
-    assert text.count("\n") == (1 if words else 0)
+    assert text.count("\n") == bool(words)
 
 
-def test_thin_walls_are_the_reason_of_an_initial_mesh_that_is_far_too_large(said):
-    many = ended()._replace(
-        initial=tetopt.Mesh(np.vstack([MESH.points, np.zeros((497, 2))]), MESH.cells)
-    )
-    reason = "(the initial mesh has 500, to keep thin walls of the mask)"
-    for n_nodes, nodes, measured, is_told in (
+@pytest.mark.parametrize(
+    ("n_nodes", "nodes", "measured", "is_told"),
+    [
         (200, 100, {"mask": NEAR}, True),
         (200, 100, {}, False),
         (400, 350, {"mask": NEAR}, False),
         (80, 100, {"mask": NEAR}, False),
-    ):
-        told(*of_result(many, "fast", "graded", n_nodes, nodes, measured))
-        assert said().startswith(f"{n_nodes} nodes instead of {nodes}{f' {reason}' * is_told}; ")
+    ],
+)
+def test_thin_walls_are_the_reason_of_a_large_initial_mesh(n_nodes, nodes, measured, is_told):
+    many = tetopt.Mesh(np.vstack([MESH.points, np.zeros((497, 2))]), MESH.cells)
+    result = ended()._replace(initial=many)
+    _, text = told(*of_result(result, "fast", "graded", n_nodes, nodes, measured))
+    reason = " (the initial mesh has 500, to keep thin walls of the mask)" * is_told
+    assert text.startswith(f"{n_nodes} nodes instead of {nodes}{reason}; ")
 
 
-def test_remedies_of_a_missed_number_of_nodes_are_those_that_apply(said):
+def test_remedies_of_a_missed_number_of_nodes_are_those_that_apply():
     for k_D, has_sizes, nodes, words in (
         (0.0, True, 120, "use more iterations or a `k_D` above 0 or smaller sizes"),
         (0.85, True, 80, "use more iterations or larger sizes"),
         (0.0, False, 80, "use more iterations or a `k_D` above 0"),
     ):
-        told(*of_result(ended(), "fast", "graded", 100, nodes, {}, k_D, has_sizes))
-        assert said() == f"100 nodes instead of {nodes}; {words}\n"
+        _, text = told(*of_result(ended(), "fast", "graded", 100, nodes, {}, k_D, has_sizes))
+        assert text == f"100 nodes instead of {nodes}; {words}\n"
 
 
-@pytest.mark.parametrize(("words", "has_sizes"), [([], False), (["--edge-max", "40"], True)])
-def test_only_requested_sizes_are_a_remedy(tmp_path, capsys, words, has_sizes):
+@pytest.mark.parametrize("words", ["", "--edge-max 40"])
+def test_only_requested_sizes_are_a_remedy(here, words):
     """Order 2 has sizes of its own, which nobody asked for."""
-    tetopt.save_image(tmp_path / "a.nii.gz", tetopt.load_phantom("sphere").image(voxel_mm=4))
-    few = ["--nodes", "400", "--order", "2", "--iterations", "1"]
-    assert exit_code("mesh", tmp_path / "a.nii.gz", "-o", tmp_path / "a.vtu", *few, *words) == 0
-    err = capsys.readouterr().err
+    tetopt.save_image("a.nii.gz", tetopt.load_phantom("sphere").image(voxel_mm=4))
+    few = "mesh a.nii.gz -o a.vtu --nodes 400 --order 2 --iterations 1"
+    err = run_command(f"{few} {words}").err
     assert "nodes instead of 400; use more iterations" in err
-    assert (" sizes" in err) == has_sizes
+    assert (" sizes" in err) == bool(words)
 
 
-def test_nodes_that_do_not_suffice_are_called_the_least(said):
+@pytest.mark.parametrize(
+    ("edge_size", "word", "is_more"), [(None, "at least", True), (6.0, "about", False)]
+)
+def test_nodes_that_do_not_suffice_are_called_the_least(edge_size, word, is_more):
     """More nodes make all other cells smaller, so that sizes take more; not if other cells have
     a size.
     """
     data = np.zeros((24, 24, 24))
     data[4:20, 4:20, 4:20], data[10:13, 4:20, 4:20] = 1.0, 2.0
     what = tetopt.content(tetopt.Image(data), tetopt.Image(data))
-    for edge_size, is_least in ((None, True), (6.0, False)):
-        made = sizes_by_label(Sizes(cells_across=1, edge_size=edge_size), what, 100)
-        again = sizes_by_label(Sizes(cells_across=1, edge_size=edge_size), what, made.nodes)
-        assert (again.scale > 1.0) == is_least
+    sizes, events = Sizes(cells_across=1, edge_size=edge_size), []
+    made = sizes_by_label(sizes, what, 100)
+    assert (sizes_by_label(sizes, what, made.nodes).scale > 1.0) == is_more
+    with listen_with(events.append):
         tell_label_sizes(made)
-        assert (
-            f"sizes by label require {'at least' if is_least else 'about'} {made.nodes} nodes"
-            in said()
-        )
+    assert f"sizes by label require {word} {made.nodes} nodes" in events[0].text
 
 
-def test_cells_between_thick_slices_are_no_reason_for_fewer_nodes(said):
-    told(*of_empty(ended(), True, 1, np.ones(3), is_masked=True))
-    assert "nearest voxel's value, which is harmless unless moduli come from the image\n" in said()
+def test_cells_between_thick_slices_are_no_reason_for_fewer_nodes():
+    _, text = told(*of_empty(ended(), True, 1, np.ones(3), is_masked=True))
+    assert "nearest voxel's value, which is harmless unless moduli come from the image\n" in text
     for slices, words in ((1.5, "; reduce `nodes`"), (5.5, "slices are 5.5 mm apart")):
-        told(*of_empty(ended(), True, 1, np.array([1.0, 1.0, slices])))
-        text = said()
+        _, text = told(*of_empty(ended(), True, 1, np.array([1.0, 1.0, slices])))
         assert "1 of 1 cells contain no voxel centre" in text
         assert words in text
         assert ("reduce `nodes`" in text) == (slices < 2.0)
 
 
-def test_limits_and_targets_that_edges_miss(said):
-    edges = EdgeRatios(1.2, 0.05, 0.0, (), [])
-    told(*of_sizes(Sizes(longest=24.0, smallest=2.0), 2.0, 24.0, edges))
-    assert said() == ""
-    told(*of_sizes(Sizes(longest=24.0), 1.0, 28.8, None))
-    assert "the longest edge is 28.8 mm, 20% over `edge_max` 24" in said()
-    told(*of_sizes(Sizes(smallest=2.0), 1.5, 28.8, None))
-    assert "the shortest edge is 1.5 mm, 25% under `size_min` 2" in said()
-    told(*of_sizes(Sizes(edge_size=5.0), 1.5, 28.8, edges._replace(above=0.4)))
-    assert "40% of the edges are longer than 1.41 times their target size" in said()
+@pytest.mark.parametrize(
+    ("limits", "shortest", "longest", "above", "words"),
+    [
+        ({"longest": 24.0, "smallest": 2.0}, 2.0, 24.0, 0.05, ""),
+        ({"longest": 24.0}, 1.0, 28.8, None, "the longest edge is 28.8 mm, 20% over `edge_max` 24"),
+        ({"smallest": 2.0}, 1.5, 28.8, None, "the shortest edge is 1.5 mm, 25% under `size_min` 2"),
+        (
+            {"edge_size": 5.0},
+            1.5,
+            28.8,
+            0.4,
+            "40% of the edges are longer than 1.41 times their target size",
+        ),
+    ],
+)
+def test_limits_and_targets_that_edges_miss(limits, shortest, longest, above, words):
+    edges = None if above is None else EdgeRatios(1.2, above, 0.0, (), [])
+    _, text = told(*of_sizes(Sizes(**limits), shortest, longest, edges))
+    assert words in text
+    assert bool(text) == bool(words)
 
 
 def test_nodes_between_many_labels():
@@ -415,50 +400,24 @@ def test_nodes_between_many_labels():
     assert crowded_nodes(fan, np.array([5, 4, 3, 2, 2, 2])) == 0
 
 
-def test_every_cell_without_a_voxel_is_told(tmp_path, capsys):
+def test_every_cell_without_a_voxel_is_told(here):
     rng = np.random.default_rng(3)
-    path = tmp_path / "noise.nii.gz"
-    tetopt.save_image(path, tetopt.Image(rng.normal(size=(20, 20))))
-    command = [
-        "mesh",
-        path,
-        "--uniform",
-        "--nodes",
-        "200",
-        "-o",
-        tmp_path / "a.vtu",
-        "--json",
-        tmp_path / "a.json",
-    ]
-    assert exit_code(*command) == 0
-    out, err = capsys.readouterr()
-    numbers = numbers_in(tmp_path / "a.json")
-    n_empty = int((tetopt.load_mesh(tmp_path / "a.vtu").cell_data["n_voxels"] == 0).sum())
+    tetopt.save_image("noise.nii.gz", tetopt.Image(rng.normal(size=(20, 20))))
+    tetopt.save_image("halves.nii.gz", tetopt.Image(np.indices((20, 20))[0] // 10 + 1.0))
+    command = "mesh noise.nii.gz --nodes 200 -o a.vtu --json a.json --force"
+    out, err = run_command(f"{command} --uniform")
+    numbers = numbers_in("a.json")
+    n_empty = (tetopt.load_mesh("a.vtu").cell_data["n_voxels"] == 0).sum()
     assert numbers["cells_without_voxel"] == n_empty > 0
-    row = next(line for line in out.splitlines() if line.startswith("cells without a voxel centre"))
+    (row,) = re.findall("^cells without a voxel centre.*", out, re.MULTILINE)
     assert row.split()[-1] == str(n_empty)
     assert numbers["violated"] == {}
     assert "nearest voxel's value; reduce --nodes" in " ".join(err.split())
-    halves = tmp_path / "halves.nii.gz"
-    tetopt.save_image(halves, tetopt.Image(np.indices((20, 20))[0] // 10 + 1.0))
-    assert exit_code(*command, "--labels", halves, "--force") == 0
-    err = capsys.readouterr().err
-    assert "contain no voxel centre" in err
-    assert "reduce" not in err  # interfaces make such cells, and labels need nodes
-    sizes = [
-        "mesh",
-        path,
-        "--edge-size",
-        "1.6",
-        "--nodes",
-        "200",
-        "--iterations",
-        "2",
-        "-o",
-        tmp_path / "b.vtu",
-    ]
-    assert exit_code(*sizes) == 0
-    err = capsys.readouterr().err
-    assert "sizes require about 3" in err
-    assert "contain no voxel centre" in err
-    assert "reduce" not in err
+    for words in (
+        "--uniform --labels halves.nii.gz",  # interfaces make such cells, and labels need nodes
+        "--edge-size 1.6 --iterations 2",
+    ):
+        err = run_command(f"{command} {words}").err
+        assert ("sizes require about 3" in err) == ("edge" in words)
+        assert "contain no voxel centre" in err
+        assert "reduce" not in err

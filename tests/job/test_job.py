@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import assert_refuses
 
 import tetopt
 from tetopt import InputError, Job
-from tetopt.cli.app import main
 from tetopt.job.options import JobOptions, RunOptions, given_options, kinds_of, option_of
 from tetopt.job.texts import option_words
 
@@ -90,22 +90,17 @@ def test_numbers_of_numpy_are_texts_that_are_read_back_to_the_last_bit():
     assert [float(each) for each in job.weights.split(",")] == [2.0, 2 / 3]
 
 
-def test_a_job_opens_no_file_and_its_plan_refuses_missing_ones(tmp_path, capsys):
-    files = {"images": "a.nii.gz", "labels": "l.nii.gz", "output": tmp_path / "a.vtu"}
-    missing = {"young": tmp_path / "missing.csv", "label_size": tmp_path / "missing.toml"}
+def test_a_job_opens_no_file_and_its_plan_refuses_missing_ones(here):
+    files = {"images": "a.nii.gz", "labels": "l.nii.gz", "output": "a.vtu"}
+    missing = {"young": "missing.csv", "label_size": "missing.toml"}
     for name, path in missing.items():
-        job = Job(**files, **{name: str(path)})  # though there is no such file
+        job = Job(**files, **{name: path})  # though there is no such file
         for read in (tetopt.plan, tetopt.run):
-            with pytest.raises(InputError, match=f"{path.name}: no such file"):
+            with pytest.raises(InputError, match=f"{path}: no such file"):
                 read(job)
-    words = ["a.nii.gz", "--labels", "l.nii.gz", "-o", str(tmp_path / "a.vtu")]
-    for name, path in missing.items():
-        assert main(["mesh", *words, f"--{name.replace('_', '-')}", str(path)]) == 2
-        said = capsys.readouterr().err
-        assert said.startswith("tetopt: ")
-        assert f"{path.name}: no such file" in said
-        assert said.count("tetopt:") == 1
-    assert Job(**files, **{name: str(path) for name, path in missing.items()}).young is not None
+        words = "mesh a.nii.gz --labels l.nii.gz -o a.vtu"
+        assert_refuses(f"{words} --{name.replace('_', '-')} {path}", f"{path}: no such file")
+    assert Job(**files, **missing).young is not None
 
 
 def test_json_gives_the_job_back():
@@ -149,12 +144,8 @@ def test_json_that_is_no_job(text, words):
 def test_every_option_has_its_kind_and_its_help():
     for name, kind in kinds_of(JobOptions).items():
         assert option_of(kind).text.endswith("."), name
-    shared = {field.name for field in fields(RunOptions)}
-    assert (
-        shared
-        < {field.name for field in fields(JobOptions)}
-        == set(inspect.signature(Job).parameters)
-    )
+    shared, every = ({field.name for field in fields(each)} for each in (RunOptions, JobOptions))
+    assert shared < every == set(inspect.signature(Job).parameters)
     assert given_options(Job(**FILES)) == {"images": [Path("a.nii")], "output": Path("a.vtu")}
     words = option_of(kinds_of(Job)["nodes"]).text[:40]
     assert f"\nnodes : int, optional\n    {words}" in inspect.getdoc(tetopt.Job)

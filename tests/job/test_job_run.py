@@ -1,10 +1,13 @@
 """`tetopt.run` from Python: the files of the command, to the byte, and what it tells meanwhile."""
 
+import os
 import warnings
+from contextlib import chdir
+from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import exit_code, numbers_in
+from commands import exit_code, numbers_in, run_command
 from models import sample_image
 
 import tetopt
@@ -13,7 +16,7 @@ from tetopt.io.formats import FORMATS
 from tetopt.job.events import listen_with, note
 from tetopt.job.source import Source
 
-pytestmark = pytest.mark.full
+pytestmark = [pytest.mark.full, pytest.mark.usefixtures("here")]
 
 UNLIKE = ("seconds", "memory")  # in run.json and in its rows, from run to run
 
@@ -33,23 +36,16 @@ def inputs(tmp_path_factory):
         "p": sample_image(2).data,
     }
     for name, data in values.items():
-        tetopt.save_image(
-            folder / f"{name}.nii.gz",
-            tetopt.Image(1.0 * data, image.affine if data.ndim == 3 else None),
-        )
-    assert (
-        exit_code(
-            "mesh", folder / "a.nii.gz", "-o", folder / "s.vtu", "--nodes", 60, "--iterations", 1
-        )
-        == 0
-    )
+        affine = image.affine if data.ndim == 3 else None
+        tetopt.save_image(f"{folder}/{name}.nii.gz", tetopt.Image(1.0 * data, affine))
+    run_command(f"mesh {folder}/a.nii.gz -o {folder}/s.vtu --nodes 60 --iterations 1")
     return folder
 
 
 KINDS = {
-    "image": ("a.nii.gz", {}),
+    "image": ("a.nii.gz", {"figures": "f"}),
     "mask": ("a.nii.gz", {"mask": "m.nii.gz", "keep_components": True}),
-    "labels": ("a.nii.gz", {"labels": "l.nii.gz", "free_volumes": True}),
+    "labels": ("a.nii.gz", {"labels": "l.nii.gz", "free_volumes": True, "figures": "f"}),
     "contrasts": (["a.nii.gz", "b.nii.gz"], {"weights": [1.0, 0.5]}),
     "order 2": ("a.nii.gz", {"order": 2, "nodes": 300}),
     "start": ("a.nii.gz", {"start": "s.vtu", "nodes": None}),
@@ -58,7 +54,6 @@ KINDS = {
     "target error": ("a.nii.gz", {"target_error": 0.5, "nodes": None}),
 }
 FILES = {"mask", "labels", "start"}  # options that are files
-DRAWN = ("image", "labels")  # of the kinds; pictures take longer than all else
 LONG = ("order 2", "target error")  # several runs each
 OF_FORMAT = {
     ".inp": {"young": "1+0.01*h", "loads": "compress:5%"},
@@ -80,7 +75,7 @@ def words_of(options):
             )
 
 
-def both(inputs, folder, monkeypatch, images, options, name="x.vtu", is_drawn=False):
+def both(inputs, images, options, name="x.vtu"):
     """The exit code of the command, and the result of the same run from Python, each in a folder
     of its own.
     """
@@ -88,16 +83,15 @@ def both(inputs, folder, monkeypatch, images, options, name="x.vtu", is_drawn=Fa
     options = {"nodes": 60, "iterations": 2} | {
         key: inputs / value if key in FILES else value for key, value in options.items()
     }
-    for place in ("command", "python"):
-        (folder / place).mkdir()
-    monkeypatch.chdir(folder / "command")
-    options |= {"figures": "f"} if is_drawn else {}
-    code = exit_code("mesh", *paths, "-o", name, "--json", "r.json", *words_of(options))
-    monkeypatch.chdir(folder / "python")
     events = []
-    result = tetopt.run(
-        tetopt.Job(images=paths, output=name, json_path="r.json", **options), on=events.append
-    )
+    for place in ("command", "python"):
+        Path(place).mkdir()
+        with chdir(place):
+            if place == "command":
+                code = exit_code("mesh", *paths, "-o", name, "--json r.json", *words_of(options))
+            else:
+                job = tetopt.Job(images=paths, output=name, json_path="r.json", **options)
+                result = tetopt.run(job, on=events.append)
     return code, result, events
 
 
@@ -116,9 +110,9 @@ def alike(value):
     return value
 
 
-def assert_equal_files(folder):
+def assert_equal_files():
     """Those of both, but for what differs from run to run."""
-    command, python = (files_in(folder / place) for place in ("command", "python"))
+    command, python = (files_in(Path(place)) for place in ("command", "python"))
     assert list(command) == list(python)
     assert len(command) >= 2
     for name in command:
@@ -133,11 +127,11 @@ def assert_equal_files(folder):
 @pytest.mark.parametrize(
     "kind", [pytest.param(kind, marks=[pytest.mark.deep] if kind in LONG else []) for kind in KINDS]
 )
-def test_a_run_leaves_the_files_of_the_command(inputs, tmp_path, monkeypatch, kind):
-    code, result, events = both(inputs, tmp_path, monkeypatch, *KINDS[kind], is_drawn=kind in DRAWN)
-    assert_equal_files(tmp_path)
+def test_a_run_leaves_the_files_of_the_command(inputs, kind):
+    code, result, events = both(inputs, *KINDS[kind])
+    assert_equal_files()
     assert code == bool(result.violated)
-    numbers = numbers_in(tmp_path / "python" / "r.json")
+    numbers = numbers_in("python/r.json")
     assert numbers["size"]["n_cells"] == len(result.mesh.cells)
     assert set(numbers) == set(result.numbers)
     stages = [event.data.name for event in events if event.kind == "started"]
@@ -151,22 +145,18 @@ def test_a_run_leaves_the_files_of_the_command(inputs, tmp_path, monkeypatch, ki
 
 
 @pytest.mark.parametrize("suffix", sorted(set(FORMATS) - {".vtu"}))
-def test_a_run_writes_every_format_as_the_command_does(inputs, tmp_path, monkeypatch, suffix):
-    options = {"iterations": 0, **OF_FORMAT.get(suffix, {})}
-    both(inputs, tmp_path, monkeypatch, "a.nii.gz", options, f"x{suffix}")
-    assert_equal_files(tmp_path)
+def test_a_run_writes_every_format_as_the_command_does(inputs, suffix):
+    both(inputs, "a.nii.gz", {"iterations": 0, **OF_FORMAT.get(suffix, {})}, f"x{suffix}")
+    assert_equal_files()
 
 
-def test_without_a_listener_warnings_are_pythons_and_within_one_they_are_its_events(
-    inputs, tmp_path
-):
-    job = tetopt.Job(
-        images=inputs / "a.nii.gz",
-        output=tmp_path / "w.vtu",
-        nodes=60,
-        iterations=1,
-        min_dihedral=65,
-    )
+def job_of(inputs, **options):
+    """A job of the image, to x.vtu."""
+    return tetopt.Job(**{"images": inputs / "a.nii.gz", "output": "x.vtu", "nodes": 60} | options)
+
+
+def test_without_a_listener_warnings_are_pythons_and_within_one_they_are_its_events(inputs):
+    job = job_of(inputs, iterations=1, min_dihedral=65)
     with pytest.warns(UserWarning, match="requirement violated: min_dihedral: "):
         assert "min_dihedral" in tetopt.run(job).violated
     events = []
@@ -177,70 +167,53 @@ def test_without_a_listener_warnings_are_pythons_and_within_one_they_are_its_eve
     assert [event.text for event in events] == ["one", "two"]
 
 
-def test_an_input_is_no_output_and_a_refused_run_leaves_no_folder(inputs, tmp_path):
-    job = tetopt.Job(images=inputs / "a.nii.gz", output=tmp_path / "x.vtu", nodes=60, iterations=0)
-    tetopt.run(job)
-    before = (tmp_path / "x.vtu").read_bytes()
+def test_an_input_is_no_output_and_a_refused_run_leaves_no_folder(inputs):
+    tetopt.run(job_of(inputs, iterations=0))
+    before = Path("x.vtu").read_bytes()
     with pytest.raises(tetopt.InputError, match="is also an input"):
-        tetopt.run(
-            tetopt.Job(
-                images=inputs / "a.nii.gz",
-                start=tmp_path / "x.vtu",
-                output=tmp_path / "x.vtu",
-                force=True,
-            )
-        )
-    assert (tmp_path / "x.vtu").read_bytes() == before
+        tetopt.run(job_of(inputs, start="x.vtu", nodes=None, force=True))
+    assert Path("x.vtu").read_bytes() == before
     with pytest.raises(tetopt.InputError, match="no such file"):
-        tetopt.run(
-            tetopt.Job(
-                images=tmp_path / "no.nii", output=tmp_path / "y.vtu", figures=tmp_path / "pictures"
-            )
-        )
-    assert not (tmp_path / "pictures").exists()
+        tetopt.run(job_of(inputs, images="no.nii", output="y.vtu", figures="pictures"))
+    assert os.listdir() == ["x.vtu"]
 
 
-def test_the_library_prints_nothing(inputs, tmp_path, capfd):
-    job = tetopt.Job(images=inputs / "a.nii.gz", output=tmp_path / "x.vtu", nodes=60, iterations=1)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        tetopt.run(job)
+def test_the_library_prints_nothing(inputs, capfd):
+    with warnings.catch_warnings(action="ignore"):
+        tetopt.run(job_of(inputs, iterations=1))
     assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize("suffix", [".vtu", ".inp", ".feb"])
-def test_a_run_cut_short_writes_its_mesh_before_anything_else(tmp_path, monkeypatch, suffix):
+def test_a_run_cut_short_writes_its_mesh_before_anything_else(monkeypatch, suffix):
     """Before cells are lifted and measured, which takes minutes for many; FEBio takes no mesh
     without moduli.
     """
     phantom = tetopt.load_phantom("sphere")
-    tetopt.save_image(tmp_path / "a.nii", phantom.image(voxel_mm=4))
-    tetopt.save_image(tmp_path / "l.nii", phantom.label_image(voxel_mm=4))
-    asks, seen, mend, fields = [], [], Run.mend, Source.fields
+    tetopt.save_image("a.nii", phantom.image(voxel_mm=4))
+    tetopt.save_image("l.nii", phantom.label_image(voxel_mm=4))
+    place = Path("out.vtu" if suffix == ".feb" else f"out{suffix}")
+    asks, seen = [], []
 
     def stop():
         asks.append(True)
         return len(asks) > 3
 
-    def looked():
-        if len(asks) <= 3:  # as kernels are prepared, and the initial mesh is tried
-            return
-        place = tmp_path / ("out.vtu" if suffix == ".feb" else f"out{suffix}")
-        seen.append(tetopt.load_mesh(place) if place.suffix == ".vtu" else place.stat().st_size)
+    def looking(call):
+        def look(*arguments):
+            if len(asks) > 3:  # not as kernels are prepared, and the initial mesh is tried
+                seen.append(tetopt.load_mesh(place) if suffix != ".inp" else place.stat().st_size)
+            return call(*arguments)
 
-    monkeypatch.setattr(Run, "mend", lambda *a: looked() or mend(*a))
-    monkeypatch.setattr(Source, "fields", lambda *a: looked() or fields(*a))
-    job = tetopt.Job(
-        images=tmp_path / "a.nii",
-        labels=tmp_path / "l.nii",
-        output=tmp_path / f"out{suffix}",
-        nodes=300,
-        young="3",
-        nu="0.3",
-    )
+        return look
+
+    monkeypatch.setattr(Run, "mend", looking(Run.mend))
+    monkeypatch.setattr(Source, "fields", looking(Source.fields))
+    options = {"nodes": 300, "young": "3", "nu": "0.3"}
+    job = tetopt.Job(images="a.nii", labels="l.nii", output=f"out{suffix}", **options)
     result = tetopt.run(job, lambda event: None, stop=stop)
     assert (result.numbers["ended"], len(seen) >= 2) == ("stopped", True)
     if suffix != ".inp":
         assert set(np.unique(seen[0].cell_data["label"])) == {0, 1}
         assert len(seen[-1].mesh.cells) == len(result.mesh.cells)
-    assert sorted(each.name for each in tmp_path.iterdir()) == ["a.nii", "l.nii", f"out{suffix}"]
+    assert sorted(os.listdir()) == ["a.nii", "l.nii", f"out{suffix}"]

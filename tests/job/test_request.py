@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import typer
-from commands import exit_code, mesh_words, numbers_in
+from commands import assert_done, numbers_in
 
 import tetopt
 from tetopt import InputError, Job
@@ -104,56 +104,46 @@ def test_defaults_are_not_given():
 
 
 @pytest.fixture
-def request_of(tmp_path):
+def request_of(here):
     """A function from other values of options to what is then requested, of a mesh of an image
     with a mask.
     """
     for name in ("a.nii", "m.nii", "young.csv"):
-        (tmp_path / name).write_text("intensity,young\n0,1\n100,5\n")
+        Path(name).write_text("intensity,young\n0,1\n100,5\n")
 
-    def request(folder=tmp_path, suffix=".vtu", **others):
-        options = {"mask": folder / "m.nii", "nodes": 50, **others}
-        return job_request(
-            Job(images=[folder / "a.nii"], output=folder / f"any{suffix}", **options)
-        )
+    def request(folder=here, suffix=".vtu", **others):
+        options = {"images": folder / "a.nii", "output": folder / f"any{suffix}", "nodes": 50}
+        return job_request(Job(**options | {"mask": folder / "m.nii"} | others))
 
     return request
 
 
-def test_a_request_states_what_was_given(request_of, tmp_path):
-    request = request_of(young=str(tmp_path / "young.csv"), nu="0.3")
+def test_a_request_states_what_was_given(request_of):
+    request = request_of(young="young.csv", nu="0.3")
     assert request["options"] == {"nodes": 50, "nu": "0.3", "format": ".vtu"}
     assert [name for name, _ in request["files"]["images"]] == ["a.nii"]
     assert sorted(request["files"]) == ["images", "mask", "young"]
     assert request["tetopt"] == tetopt.__version__
 
 
-def test_a_request_changes_with_what_decides_the_mesh(request_of, tmp_path):
+def test_a_request_changes_with_what_decides_the_mesh(request_of):
     first = request_of()["sha256"]
-    assert request_of()["sha256"] == first
-    assert request_of(threads=1)["sha256"] == first
+    assert request_of()["sha256"] == request_of(threads=1)["sha256"] == first
     others = [request_of(iterations=3), request_of(suffix=".inp"), request_of(mask=None)]
-    (tmp_path / "m.nii").write_text("another")
+    Path("m.nii").write_text("another")
     others.append(request_of())
     assert len({first, *(each["sha256"] for each in others)}) == 5
 
 
-def test_a_table_of_labels_is_part_of_a_request_by_what_it_says(request_of, tmp_path):
-    sizes, groups = tmp_path / "sizes.csv", tmp_path / "groups.csv"
-    asked = {"labels": tmp_path / "m.nii", "label_size": str(sizes), "merge": str(groups)}
+def test_a_table_of_labels_is_part_of_a_request_by_what_it_says(request_of):
     sums = set()
     for size, group in (("1,2", "a,1"), ("1,2.5", "a,1"), ("1,2.5", "bone,1")):
-        sizes.write_text(size)
-        groups.write_text(group)
-        sums.add(request_of(**asked)["sha256"])
+        Path("sizes.csv").write_text(size)
+        Path("groups.csv").write_text(group)
+        request = request_of(labels="m.nii", label_size="sizes.csv", merge="groups.csv")
+        sums.add(request["sha256"])
     assert len(sums) == 3
-    assert sorted(request_of(**asked)["files"]) == [
-        "images",
-        "label-size",
-        "labels",
-        "mask",
-        "merge",
-    ]
+    assert sorted(request["files"]) == ["images", "label-size", "labels", "mask", "merge"]
 
 
 def test_sizes_of_labels_in_a_file(tmp_path):
@@ -179,35 +169,31 @@ def test_sizes_of_labels_in_a_file(tmp_path):
             label_sizes_of(str(file), table)
 
 
-def test_a_volume_of_a_file_is_part_of_a_request(request_of, tmp_path):
-    first, second = (request_of(mask=tmp_path / f"m.nii:{volume}") for volume in (0, 1))
-    (name, checksum), (other, same) = (each["files"]["mask"][0] for each in (first, second))
-    assert (name, other) == ("m.nii:0", "m.nii:1")
-    assert checksum == same == request_of()["files"]["mask"][0][1]
+def test_a_volume_of_a_file_is_part_of_a_request(request_of):
+    first, second = (request_of(mask=f"m.nii:{volume}") for volume in (0, 1))
+    files = [each["files"]["mask"][0] for each in (first, second, request_of())]
+    assert [name for name, _ in files] == ["m.nii:0", "m.nii:1", "m.nii"]
+    assert len({checksum for _, checksum in files}) == 1
     assert first["sha256"] != second["sha256"]
 
 
-def test_a_request_does_not_know_folders(request_of, tmp_path):
-    other = tmp_path / "elsewhere"
+def test_a_request_does_not_know_folders(request_of, here):
+    other = here / "elsewhere"
     other.mkdir()
     for name in ("a.nii", "m.nii"):
-        (other / name).write_bytes((tmp_path / name).read_bytes())
+        (other / name).write_bytes(Path(name).read_bytes())
     assert request_of(folder=other) == request_of()
 
 
-def test_run_json_states_the_request(tmp_path):
+def test_run_json_states_the_request(here):
     """It is the one that the options come to, so that whoever has them knows whether the mesh is
     that one.
     """
-    assert exit_code("phantom", "sphere", "-o", tmp_path / "sphere.nii.gz", "--voxel-mm", "5") == 0
-    words = mesh_words(
-        tmp_path / "sphere.nii.gz", tmp_path, "--nodes", "60", "--iterations", "1", "--threads", "1"
-    )
-    assert exit_code(*words) == 0
-    job = Job(
-        images=[tmp_path / "sphere.nii.gz"], nodes=60, iterations=1, output=tmp_path / "b.vtu"
-    )
-    assert numbers_in(tmp_path / "a.json")["request"] == job_request(job)
+    assert_done("phantom sphere -o sphere.nii.gz --voxel-mm 5")
+    words = "mesh sphere.nii.gz -o a.vtu --json a.json --nodes 60 --iterations 1 --threads 1"
+    assert_done(words)
+    job = Job(images="sphere.nii.gz", nodes=60, iterations=1, output="b.vtu")
+    assert numbers_in("a.json")["request"] == job_request(job)
 
 
 def test_options_of_a_row_replace_those_of_all():
@@ -250,24 +236,20 @@ def test_options_of_a_row_that_cannot_be(texts, words):
         with_options(RunOptions(), texts)
 
 
-def test_a_folder_is_read_once_for_its_checksum_and_files_beside_a_header_count(
-    tmp_path, monkeypatch
-):
+def test_a_folder_is_read_once_for_its_checksum_and_files_beside_a_header_count(here, monkeypatch):
     reads = []
     monkeypatch.setattr(
         "tetopt.job.request.sha256", lambda path: reads.append(path) or sha256(path)
     )
-    (tmp_path / "a.zarr").mkdir()
-    (tmp_path / "a.zarr" / "0").write_bytes(b"voxels")
-    assert (
-        checksum(tmp_path / "a.zarr")
-        == checksum(tmp_path / "a.zarr")
-        == sha256(tmp_path / "a.zarr")
+    folder, header, data = Path("a.zarr"), Path("b.mhd"), Path("b.raw")
+    folder.mkdir()
+    (folder / "0").write_bytes(b"voxels")
+    assert checksum(folder) == checksum(folder) == sha256(folder)
+    assert len(reads) == 1
+    header.write_text(
+        "NDims = 3\nDimSize = 1 1 1\nElementType = MET_UCHAR\nElementDataFile = b.raw\n"
     )
-    assert reads == [tmp_path / "a.zarr"]
-    header = "NDims = 3\nDimSize = 1 1 1\nElementType = MET_UCHAR\nElementDataFile = b.raw\n"
-    (tmp_path / "b.mhd").write_text(header)
-    (tmp_path / "b.raw").write_bytes(b"1")
-    first = checksum(tmp_path / "b.mhd")
-    (tmp_path / "b.raw").write_bytes(b"22")
-    assert checksum(tmp_path / "b.mhd") == sha256(tmp_path / "b.mhd") != first
+    data.write_bytes(b"1")
+    first = checksum(header)
+    data.write_bytes(b"22")
+    assert checksum(header) == sha256(header) != first
