@@ -114,7 +114,7 @@ def label_contacts(
     >>> result = tetopt.mesh_image(tetopt.content(labels, labels), 300)
     >>> for each in tetopt.label_contacts(labels, result.mesh, result.labels):
     ...     print(each.labels, f"{each.ratio:.2f}")
-    (0, 1) 1.03
+    (0, 1) 1.04
     """
     labels = check_labels("labels", labels)
     of_cell = check_cell_labels(of_cell, mesh)
