@@ -6,11 +6,12 @@ import naive
 import numpy as np
 import pytest
 import pyvista
-from meshes import random_affine, random_rotation
+from meshes import both_dimensions, random_affine, random_rotation
 from numpy.testing import assert_allclose, assert_array_equal
+from shapes import distance
 
 import tetopt
-from tetopt.geometry.simplex import centroids, orient_cells, volumes
+from tetopt.geometry.simplex import centroids, orient_cells
 from tetopt.measure.fidelity import (
     MOST_POINTS,
     FacetSurface,
@@ -22,6 +23,7 @@ from tetopt.measure.fidelity import (
     label_fidelity,
     mask_fidelity,
     painted_voxels,
+    surface_areas,
     surface_distances,
 )
 
@@ -44,10 +46,10 @@ def slabs(n, affine=None):
     return image, mesh, image.to_index(centroids(mesh.points, mesh.cells))[:, 0]
 
 
-def shift_affine(rng, n, spacing):
-    """Voxels of unequal size, rotated, flipped and moved."""
+def moved_affine(rng, n):
+    """Voxels of 1.5, .5 and 3 mm, rotated, flipped and moved."""
     affine = np.eye(n + 1)
-    affine[:n, :n] = random_rotation(rng, n) @ np.diag(spacing[:n])
+    affine[:n, :n] = random_rotation(rng, n) @ np.diag([1.5, 0.5, -3.0][:n])
     affine[:n, n] = rng.uniform(-100.0, 100.0, n)
     return affine
 
@@ -68,97 +70,86 @@ def ball(n, radius, centre):
 
 def ball_field(n, size, radius, centre):
     """1 inside, 0 outside, linear over four voxels across the sphere, on which it is 1/2."""
-    r = np.sqrt(((np.indices((size,) * n).T - centre) ** 2).sum(axis=-1)).T
-    return np.clip((radius - r) / 4.0 + 0.5, 0.0, 1.0)
+    return np.clip((radius - distance((size,) * n, *[centre] * n)) / 4.0 + 0.5, 0.0, 1.0)
 
 
 # Cells' labels
 
 
-@pytest.mark.parametrize("n", [2, 3])
+@both_dimensions
 def test_cell_labels_against_twin(n):
     """Counted voxel by voxel, on a mesh that leaves voxels out and has cells without voxels, and
     with many ties.
     """
     rng = np.random.default_rng(n)
     labels = tetopt.Image(rng.choice([0, 2, 7], (9, 8, 7)[:n]), random_affine(rng, n))
-    whole = tetopt.lattice_mesh(labels, blocks=((5, 4, 4) if n == 3 else (6, 5))[:n])
+    whole = tetopt.lattice_mesh(labels, blocks=(5, 4, 4) if n == 3 else (6, 5))
     mesh = tetopt.Mesh(whole.points, whole.cells[len(whole.cells) // 4 :])
-    owner = tetopt.cell_of_voxel(labels, mesh)
-    of_cell = cell_labels(labels, mesh)
+    owner, of_cell = tetopt.cell_of_voxel(labels, mesh), cell_labels(labels, mesh)
+    nearest = np.rint(labels.to_index(centroids(mesh.points, mesh.cells))).astype(int)
     n_ties = n_empty = 0
-    for cell in range(len(mesh.cells)):
+    for cell, label in enumerate(of_cell):
         count = Counter(labels.data[owner == cell].astype(int).tolist())
-        if count:
-            most = [label for label, c in count.items() if c == max(count.values())]
-            n_ties += len(most) > 1
-            expected = min(most)
-        else:
-            n_empty += 1
-            expected = labels.data[
-                tuple(
-                    np.rint(labels.to_index(mesh.points[mesh.cells[cell]].mean(axis=0))).astype(int)
-                )
-            ]
-        assert of_cell[cell] == expected
+        most = [each for each, c in count.items() if c == max(count.values())]
+        n_ties += len(most) > 1
+        n_empty += not most
+        assert label == (min(most) if most else labels.data[tuple(nearest[cell])])
     assert of_cell.dtype == np.int64
-    assert n_ties > 3
-    assert n_empty > 3
+    assert min(n_ties, n_empty) > 3
+    assert (owner < 0).any()
     shown = painted_voxels(owner, of_cell, -1)
-    assert (shown == -1).any()
-    for voxel in np.ndindex(labels.shape):
-        assert shown[voxel] == (-1 if owner[voxel] < 0 else of_cell[owner[voxel]])
+    assert_array_equal(shown, np.where(owner < 0, -1, of_cell[owner]))
 
 
 # Surfaces
 
 
-@pytest.mark.parametrize("n", [2, 3])
-def test_half_level_of_a_plane(n):
+@both_dimensions
+@pytest.mark.parametrize(
+    ("level", "place"),
+    [
+        (lambda labels: labels == 1, 3.5),
+        (lambda labels: np.indices(labels.shape)[0] / 8.0 + 0.0625, 3.5),
+        (lambda labels: labels * 0.8, 3.625),
+    ],
+)
+def test_half_level_of_a_plane(n, level, place):
     """It runs from face to face of the box, has no part on them, and lies where the field is
     1/2.
     """
     image, _, _ = slabs(n, random_affine(np.random.default_rng(n), n))
-    flat = np.eye(n + 1)
-    for level, place in (
-        (image.data == 1, 3.5),
-        (np.indices(image.shape)[0] / 8.0 + 0.0625, 3.5),
-        (image.data * 0.8, 3.625),
-    ):
-        points, facets = half_level_surface(level, flat)
-        assert facets.shape[1] == n
-        assert_allclose(points[:, 0], place, atol=1e-5)
-        assert_array_equal(points[:, 1:].min(axis=0), -0.5)
-        assert_array_equal(points[:, 1:].max(axis=0), 7.5)
-        edges = points[facets[:, 1:]] - points[facets[:, :1]]
-        area = np.linalg.norm(
-            edges[:, 0] if n == 2 else np.cross(edges[:, 0], edges[:, 1]) / 2, axis=-1
-        ).sum()
-        assert area == pytest.approx(8.0 ** (n - 1), rel=1e-6)
-        in_world = half_level_surface(level, image.affine)
-        assert_allclose(image.to_index(in_world.points), points, atol=1e-9)
-        assert_array_equal(in_world.facets, facets)
+    surface = half_level_surface(level(image.data), np.eye(n + 1))
+    points = surface.points
+    assert surface.facets.shape[1] == n
+    assert_allclose(points[:, 0], place, atol=1e-5)
+    assert_array_equal(points[:, 1:].min(axis=0), -0.5)
+    assert_array_equal(points[:, 1:].max(axis=0), 7.5)
+    assert surface_areas(surface).sum() == pytest.approx(8.0 ** (n - 1), rel=1e-6)
+    in_world = half_level_surface(level(image.data), image.affine)
+    assert_allclose(image.to_index(in_world.points), points, atol=1e-9)
+    assert_array_equal(in_world.facets, surface.facets)
 
 
-@pytest.mark.parametrize("n", [2, 3])
+@both_dimensions
 @pytest.mark.parametrize("value", [0.0, 1.0])
 def test_no_half_level(n, value):
-    points, facets = half_level_surface(np.full((3,) * n, value), np.eye(n + 1))
-    assert points.shape == (0, n)
-    assert facets.shape == (0, n)
+    surface = half_level_surface(np.full((3,) * n, value), np.eye(n + 1))
+    assert surface.points.shape == surface.facets.shape == (0, n)
 
 
 def test_euler_characteristic():
-    assert euler_characteristic(pyvista.Icosphere(nsub=1).regular_faces) == 2
     torus = np.zeros((9, 9, 5), dtype=bool)
-    torus[1:8, 1:8, 1:4] = True
-    torus[3:6, 3:6] = False
-    assert euler_characteristic(half_level_surface(torus, np.eye(4)).facets) == 0
-    assert euler_characteristic(np.array([[0, 1], [1, 2], [2, 0], [3, 4]])) == 0 + 1
-    assert euler_characteristic(np.empty((0, 3), dtype=np.int64)) == 0
+    torus[1:8, 1:8, 1:4], torus[3:6, 3:6] = True, False
+    for facets, expected in (
+        (pyvista.Icosphere(nsub=1).regular_faces, 2),
+        (half_level_surface(torus, np.eye(4)).facets, 0),
+        (np.array([[0, 1], [1, 2], [2, 0], [3, 4]]), 0 + 1),
+        (np.empty((0, 3), dtype=np.int64), 0),
+    ):
+        assert euler_characteristic(facets) == expected
 
 
-@pytest.mark.parametrize("n", [2, 3])
+@both_dimensions
 def test_distances_against_twin(n):
     """Large, small and flat facets; points near and far."""
     rng = np.random.default_rng(n)
@@ -176,7 +167,7 @@ def test_distances_against_twin(n):
     assert_allclose(distances, expected, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("n", [2, 3])
+@both_dimensions
 def test_points_are_spread_evenly(n):
     """Each facet has its fraction of the points to within two, uniformly dense by their mean and
     covariance.
@@ -185,22 +176,17 @@ def test_points_are_spread_evenly(n):
     surface = FacetSurface(corners.reshape(-1, n), np.arange(3 * n).reshape(3, n))
     points = evenly_spread(surface, 3000)
     apart = np.array(
-        [
-            surface_distances(points, FacetSurface(surface.points, surface.facets[k : k + 1]))
-            for k in range(3)
-        ]
+        [surface_distances(points, surface._replace(facets=row[None])) for row in surface.facets]
     )
     assert apart.min(axis=0).max() < 1e-9
-    edges = corners[:, 1:] - corners[:, :1]
-    areas = np.linalg.norm(edges[:, 0] if n == 2 else np.cross(edges[:, 0], edges[:, 1]), axis=-1)
-    counts = np.bincount(apart.argmin(axis=0), minlength=3)
-    assert np.abs(counts - 3000 * areas / areas.sum()).max() < 2.0
-    for k in range(3):
-        inside = points[apart.argmin(axis=0) == k]
-        assert_allclose(inside.mean(axis=0), corners[k].mean(axis=0), atol=0.02)
+    own, areas = apart.argmin(axis=0), surface_areas(surface)
+    assert np.abs(np.bincount(own, minlength=3) - 3000 * areas / areas.sum()).max() < 2.0
+    for k, of_facet in enumerate(corners):
+        inside, middle = points[own == k], of_facet.mean(axis=0)
+        assert_allclose(inside.mean(axis=0), middle, atol=0.02)
         # of a uniform density on a simplex
-        spread = np.cov((inside - inside.mean(axis=0)).T, bias=True)
-        offset = corners[k] - corners[k].mean(axis=0)
+        offset = of_facet - middle
+        spread = np.cov(inside.T, bias=True)
         assert_allclose(spread, offset.T @ offset / (n * (n + 1)), atol=0.03)
     assert_array_equal(points, evenly_spread(surface, 3000))
 
@@ -217,9 +203,8 @@ def test_no_side_of_a_plate_is_left_out():
 def test_no_more_points_than_allowed():
     image = slabs(3)[0]
     plane = half_level_surface(image.data == 1, image.affine)
-    there, back = _distances(
-        plane, FacetSurface(plane.points, plane.facets[: len(plane.facets) // 2]), 1e-9
-    )
+    half = plane._replace(facets=plane.facets[: len(plane.facets) // 2])
+    there, back = _distances(plane, half, 1e-9)
     assert len(there) == MOST_POINTS
     assert MOST_POINTS / 2 - 1 <= len(back) <= MOST_POINTS / 2 + 1
     assert sum(len(d) for d in _distances(plane, plane, 1e9)) == 2000
@@ -228,33 +213,39 @@ def test_no_more_points_than_allowed():
 # Labels
 
 
-@pytest.mark.parametrize("n", [2, 3])
+def assert_numbers(row, **expected):
+    """Of a label, by their names in run.json."""
+    found = row.as_json()
+    own = {name: found[name] for name in expected}
+    assert own == pytest.approx(expected, rel=1e-9, abs=1e-9, nan_ok=True)
+
+
+@both_dimensions
 @pytest.mark.parametrize("shift", [0, 1, -2])
 def test_shifted_plane(n, shift):
     """Every number by hand; the box's faces, which both surfaces end at, count for nothing."""
-    rng = np.random.default_rng(n)
-    image, mesh, x = slabs(n, shift_affine(rng, n, [1.5, 0.5, -3.0]))
+    image, mesh, x = slabs(n, moved_affine(np.random.default_rng(n), n))
     of_cell = (x > 3.5 + shift).astype(int)
-    layer, voxel = 8 ** (n - 1), image.voxel_volume
-    assert voxel == pytest.approx([0.75, 2.25][n - 2])
-    for row in label_fidelity(image, mesh, of_cell):
-        layers = 4 + (shift if row.label == 0 else -shift)
-        assert row.label in (0, 1)
-        assert row.extent.voxels == 4 * layer
-        assert row.extent.volume == pytest.approx(4 * layer * voxel)
-        assert row.extent.mesh_volume == pytest.approx(layers * layer * voxel)
-        assert row.extent.n_cells == (of_cell == row.label).sum()
-        assert row.overlap.dice == pytest.approx(2 * min(layers, 4) / (layers + 4))
-        assert row.distance.mean == pytest.approx(1.5 * abs(shift), abs=1e-9)
-        assert row.distance.p95 == pytest.approx(1.5 * abs(shift), abs=1e-9)
-        assert (row.pieces.components, row.pieces.mesh_components, row.extent.is_lost) == (
-            1,
-            1,
-            False,
+    layer, voxel = 8 ** (n - 1), [0.75, 2.25][n - 2]
+    rows = label_fidelity(image, mesh, of_cell)
+    assert [row.label for row in rows] == [0, 1]
+    for row, layers in zip(rows, (4 + shift, 4 - shift), strict=True):
+        assert_numbers(
+            row,
+            voxels=4 * layer,
+            volume=4 * layer * voxel,
+            mesh_volume=layers * layer * voxel,
+            n_cells=(of_cell == row.label).sum(),
+            dice=2 * min(layers, 4) / (layers + 4),
+            distance_mean=1.5 * abs(shift),
+            distance_p95=1.5 * abs(shift),
+            components=1,
+            mesh_components=1,
         )
+        assert not row.extent.is_lost
 
 
-@pytest.mark.parametrize("n", [2, 3])
+@both_dimensions
 def test_distances_are_pooled_by_area(n):
     """A stripe with two sides of which the mesh has one: of three equal areas one is 4 voxels
     away.
@@ -273,25 +264,11 @@ def test_lost_label():
     labels[4, 4, 4] = 1
     image = tetopt.Image(labels)
     background, speck = label_fidelity(image, blocky(image, (1, 1, 1)))
-    assert speck.extent.is_lost
-    assert (
-        speck.extent.n_cells,
-        speck.extent.mesh_volume,
-        speck.overlap.dice,
-        speck.extent.voxels,
-        speck.pieces.components,
-    ) == (
-        0,
-        0.0,
-        0.0,
-        1,
-        1,
-    )
-    assert speck.pieces.mesh_components == 0
-    assert np.isnan(speck.distance.mean)
-    assert np.isnan(speck.distance.p95)
-    assert not background.extent.is_lost
-    assert background.overlap.dice == 2 * 511 / (511 + 512)
+    assert (background.extent.is_lost, speck.extent.is_lost) == (False, True)
+    nothing = dict.fromkeys(("n_cells", "mesh_volume", "dice", "mesh_components"), 0)
+    none = dict.fromkeys(("distance_mean", "distance_p95"), np.nan)
+    assert_numbers(speck, voxels=1, components=1, **nothing, **none)
+    assert_numbers(background, dice=2 * 511 / (511 + 512))
 
 
 def test_cells_without_a_voxel():
@@ -332,7 +309,7 @@ def test_outside_of_the_mesh_is_background():
     assert label_fidelity(image, mesh, np.ones(len(mesh.cells)))[0].extent.is_lost
 
 
-@pytest.mark.parametrize("n", [2, 3])
+@both_dimensions
 def test_components(n):
     """Voxels that meet at an edge or corner only are apart; so are cells."""
     labels = np.zeros((6,) * n)
@@ -371,12 +348,12 @@ def test_bad_labels():
 # Masks
 
 
-@pytest.mark.parametrize("n", [2, 3])
+@both_dimensions
 def test_mask_of_a_shifted_plane(n):
     """2 voxels of 1.5 mm; faces of the box count on neither side; the plane ends at the box, as
     a disc does.
     """
-    image, mesh, x = slabs(n, shift_affine(np.random.default_rng(n), n, [1.5, 0.5, -3.0]))
+    image, mesh, x = slabs(n, moved_affine(np.random.default_rng(n), n))
     fidelity = mask_fidelity(image, tetopt.Mesh(mesh.points, mesh.cells[x > 1.5]))
     layer = 8 ** (n - 1)
     assert fidelity.voxels == 4 * layer
@@ -388,22 +365,21 @@ def test_mask_of_a_shifted_plane(n):
     assert fidelity[12:] == (1, 1, 1, 1, ())
 
 
-@pytest.mark.parametrize("n", [2, 3])
+@both_dimensions
 def test_mask_of_a_ball(n):
     """Its half level is a sphere of radius 10 voxels; the mesh's of 11.5; in voxels of unequal
     size, sheared.
     """
-    rng = np.random.default_rng(n)
-    image = tetopt.Image(ball_field(n, 32, 10.0, 15.2), random_affine(rng, n))
+    image = tetopt.Image(ball_field(n, 32, 10.0, 15.2), random_affine(np.random.default_rng(n), n))
     points, cells = ball(n, 11.5, np.full(n, 15.2))
     points = image.to_world(points)
     mesh = tetopt.Mesh(points, orient_cells(points, cells))
     fidelity = mask_fidelity(image, mesh)
-    assert fidelity.mesh_volume == pytest.approx(volumes(points, mesh.cells).sum())
+    assert fidelity.mesh_volume == pytest.approx(mesh.cell_volumes.sum())
     assert_allclose(fidelity[4:8], 1.5, atol=0.03)
-    factors = np.linalg.svd(image.affine[:n, :n])[1]
-    assert factors[-1] * 1.5 < fidelity.distance_mean_mm < factors[0] * 1.5
-    assert factors[-1] * 1.5 < fidelity.reverse_p95_mm < factors[0] * 1.55
+    most, *_, least = 1.5 * np.linalg.svd(image.affine[:n, :n])[1]
+    assert least < fidelity.distance_mean_mm < most
+    assert least < fidelity.reverse_p95_mm < most * 1.55 / 1.5
     euler = {2: 0, 3: 2}[n]
     assert fidelity[12:] == (1, 1, euler, euler, ())
 
@@ -445,12 +421,13 @@ def test_half_counts_as_inside():
 
 def test_bad_mask():
     image, mesh, _ = slabs(2)
-    with pytest.raises(tetopt.InputError, match="values from 0 to 1, got 0 to 255"):
-        mask_fidelity(tetopt.Image(image.data * 255), mesh)
-    with pytest.raises(tetopt.InputError, match="got -1 to 0"):
-        mask_fidelity(tetopt.Image(image.data - 1), mesh)
-    with pytest.raises(tetopt.InputError, match="same dimension"):
-        mask_fidelity(image, slabs(3)[1])
+    for data, other, words in (
+        (image.data * 255, mesh, "values from 0 to 1, got 0 to 255"),
+        (image.data - 1, mesh, "got -1 to 0"),
+        (image.data, slabs(3)[1], "same dimension"),
+    ):
+        with pytest.raises(tetopt.InputError, match=words):
+            mask_fidelity(tetopt.Image(data), other)
 
 
 def test_volume_dice_does_not_depend_on_the_unit():
@@ -470,7 +447,7 @@ def test_volume_dice_does_not_depend_on_the_unit():
     assert 0.5 < dice[0][1] < 1.0
 
 
-@pytest.mark.parametrize("n", [2, 3])
+@both_dimensions
 @pytest.mark.parametrize("is_masked", [False, True])
 def test_dice_by_majority(n, is_masked):
     """Dice of the labels that most of the voxels in each cell have, whatever labels the cells
@@ -482,18 +459,13 @@ def test_dice_by_majority(n, is_masked):
     mask = tetopt.Image(rng.random(image.shape) < 0.7, image.affine) if is_masked else None
     mesh = tetopt.lattice_mesh(image, nodes=100)
     mesh = tetopt.Mesh(mesh.points, mesh.cells[: len(mesh.cells) // 2])  # the rest is outside
-    owner, inside = (
-        tetopt.cell_of_voxel(image, mesh),
-        np.ones(image.shape, bool) if mask is None else mask.data > 0,
-    )
+    owner = tetopt.cell_of_voxel(image, mesh)
+    inside = np.ones(image.shape, bool) if mask is None else mask.data > 0
     painted = np.full(image.shape, -1 if is_masked else 0)
     for cell in range(len(mesh.cells)):
         own = image.data[inside & (owner == cell)].astype(int)
         painted[owner == cell] = np.argmax(np.bincount(own)) if len(own) else 3
     for row in label_fidelity(image, mesh, np.full(len(mesh.cells), 3), mask):
         one, other = inside & (image.data == row.label), painted == row.label
-        assert (
-            row.overlap.dice_majority
-            == 2 * (one & other).sum() / (one.sum() + other.sum())
-            != row.overlap.dice
-        )
+        dice = 2 * (one & other).sum() / (one.sum() + other.sum())
+        assert row.overlap.dice_majority == dice != row.overlap.dice

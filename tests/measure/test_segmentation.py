@@ -28,15 +28,12 @@ def test_thresholds_leave_the_least_variance(classes):
         values = np.sort(rng.choice(256, 9, replace=False)).astype(float)
         values[0], values[-1] = 0.0, 255.0
         weights = rng.uniform(0.1, 5.0, 9)
-        best = min(
-            within(values, weights, values[list(cut)])
-            for cut in combinations(range(1, 9), classes - 1)
-        )
+        cuts = combinations(range(1, 9), classes - 1)
+        best = min(within(values, weights, values[list(cut)]) for cut in cuts)
         thresholds = class_thresholds(values, classes, weights)
         assert np.all(np.diff(thresholds) > 0.0)
-        assert within(values, weights, thresholds) == pytest.approx(
-            best, rel=0.03
-        )  # a bin's centre stands for its values
+        # a bin's centre stands for its values
+        assert within(values, weights, thresholds) == pytest.approx(best, rel=0.03)
 
 
 def test_clear_clusters_are_found():
@@ -49,24 +46,23 @@ def test_a_bright_voxel_leaves_the_classes_as_they_are(monkeypatch):
     """One that is a million times brighter than the rest; values of ordinary spread have the
     bins of all of them.
     """
-    rng = np.random.default_rng(0)
-    values = np.concatenate(
-        [rng.normal(10.0, 1.0, 4000), rng.normal(20.0, 1.0, 3000), rng.normal(40.0, 2.0, 3000)]
+    rng, clusters = (
+        np.random.default_rng(0),
+        ((10.0, 1.0, 4000), (20.0, 1.0, 3000), (40.0, 2.0, 3000)),
     )
+    values = np.concatenate([rng.normal(*each) for each in clusters])
     thresholds = class_thresholds(values, 3)
     assert 12.0 < thresholds[0] < 18.0
     assert 23.0 < thresholds[1] < 35.0
     for outliers in ([4e7], [-3e5, 2e6], [1e3, 1e6]):
-        np.testing.assert_allclose(
-            class_thresholds(np.append(values, outliers), 3), thresholds, atol=1.5
-        )
+        found = class_thresholds(np.append(values, outliers), 3)
+        np.testing.assert_allclose(found, thresholds, atol=1.5)
+    rare = np.append(np.zeros(10_000), [7.0])
+    assert class_thresholds(rare, 2) == pytest.approx([3.5], abs=0.01)
     monkeypatch.setattr(otsu, "FEWEST_BINS", 1)
     np.testing.assert_array_equal(class_thresholds(values, 3), thresholds)
-    with pytest.raises(tetopt.InputError, match="fill only 2 of 256 bins"):  # without narrower ones
+    with pytest.raises(tetopt.InputError, match="only 2 of 256 bins"):  # without narrower ones
         class_thresholds(np.append(values, 4e7), 3)
-    monkeypatch.undo()
-    rare = np.append(np.zeros(10_000), [7.0])
-    assert class_thresholds(rare, 2).tolist() == [pytest.approx(3.5, abs=0.01)]
 
 
 @pytest.mark.parametrize(
@@ -74,11 +70,7 @@ def test_a_bright_voxel_leaves_the_classes_as_they_are(monkeypatch):
     [
         ([1.0, 2.0], 1, "2 or more, got 1"),
         ([1.0, 2.0], 3, "3 requested, but the values fill only 2"),
-        (
-            [1.0, np.nextafter(1.0, 2.0)],
-            2,
-            "expected intensities that 256 bins can separate, got 1.0 to 1.0000000000000002",
-        ),
+        ([1.0, np.nextafter(1.0, 2.0)], 2, "256 bins can separate, got 1.0 to 1.0000000000000002"),
     ],
 )
 def test_bad_classes(values, classes, words):
@@ -109,17 +101,26 @@ def test_mesh_that_resolves_every_voxel_thresholds_it():
     np.testing.assert_array_equal(segment(image, mesh, 4).data, image.data / 10.0)
 
 
-def test_dice_by_hand():
+@pytest.mark.parametrize(
+    ("labels", "expected"),
+    [
+        ([[0, 0, 0], [0, 2, 2]], {0: 6 / 7, 1: 4 / 5}),
+        ([[0, 0, 1], [0, 1, 1]], {0: 1.0, 1: 1.0}),
+        ([[0, 0, 0], [0, 0, 0]], {0: 6 / 9, 1: 0.0}),
+    ],
+)
+def test_dice_by_hand(labels, expected):
     truth = tetopt.Image([[0, 0, 1], [0, 1, 1]])
-    labels = tetopt.Image([[0, 0, 0], [0, 2, 2]])
-    assert dice(labels, truth) == {0: pytest.approx(6 / 7), 1: pytest.approx(4 / 5)}
-    assert dice(truth, truth) == {0: 1.0, 1: 1.0}
-    assert dice(tetopt.Image(np.zeros((2, 3))), truth) == {0: pytest.approx(6 / 9), 1: 0.0}
+    assert dice(tetopt.Image(labels), truth) == pytest.approx(expected)
 
 
-def test_dice_bad_input():
-    one = tetopt.Image(np.zeros((2, 2)))
-    with pytest.raises(tetopt.InputError, match=r"the same shape, got \(2, 2\) and \(3, 2\)"):
-        dice(one, tetopt.Image(np.zeros((3, 2))))
-    with pytest.raises(tetopt.InputError, match="truth: labels must be whole numbers"):
-        dice(one, tetopt.Image(np.full((2, 2), 0.5)))
+@pytest.mark.parametrize(
+    ("truth", "words"),
+    [
+        (np.zeros((3, 2)), r"shape, got \(2, 2\) and \(3, 2\)"),
+        (np.full((2, 2), 0.5), "truth: labels must be whole numbers"),
+    ],
+)
+def test_dice_bad_input(truth, words):
+    with pytest.raises(tetopt.InputError, match=words):
+        dice(tetopt.Image(np.zeros((2, 2))), tetopt.Image(truth))

@@ -9,7 +9,8 @@ import numba
 import numpy as np
 import pytest
 import pyvista
-from label_rows import label_row, with_numbers
+from label_rows import label_row
+from meshes import both_dimensions
 from shapes import OBLIQUE
 
 import tetopt
@@ -98,7 +99,7 @@ def test_only_voxels_in_the_mask_touch():
         label_contacts(image, mesh, of_cell, tetopt.Image(np.ones((3, 3, 3))))
 
 
-@pytest.mark.parametrize("n", [2, 3])
+@both_dimensions
 def test_layers_are_cells_without_an_inner_node(n):
     image, mesh, of_cell = blocky(slabs(1, n))
     # 2-D: centres
@@ -143,7 +144,7 @@ def test_a_shell_between_facets_is_as_thick_as_it_is(size, spacing, monkeypatch)
     np.testing.assert_array_equal(thickness_between(corners, rows, spacing, 10.0), thickness)
 
 
-@pytest.mark.parametrize("n", [2, 3])
+@both_dimensions
 @pytest.mark.parametrize("size", [2, 3, 5])
 def test_voxels_and_cells_of_the_same_surfaces_are_as_thick(n, size):
     image, mesh, of_cell = blocky(slabs(size, n))
@@ -211,66 +212,42 @@ def texts(table):
     return list(zip(*(list(column.cells) for column in table.columns), strict=True))
 
 
-def test_tables_have_the_worst_five_alone():
-    rows = [
-        label_row(
-            label,
-            n_cells=9,
-            one_layer_fraction=fraction,
-            thickness_voxels=Thickness(1.0, 2.0, 3.0, 3.0),
-        )
-        for label, fraction in zip(
-            range(1, 42), np.random.default_rng(2).permutation(41) / 41.0, strict=True
-        )
-    ]
-    shown = texts(thin_table(rows, {rows[0].label: "bone [l]"}))
-    worst = sorted(rows, key=lambda row: -row.extent.one_layer_fraction)[:5]
-    assert [int(row[0].split()[0]) for row in shown] == [row.label for row in worst]
-    assert (
-        texts(
-            thin_table(
-                [with_numbers(rows[0], one_layer_fraction=1.0)._replace(label=0), *rows],
-                {rows[0].label: "bone [l]"},
-            )
-        )
-        == shown
-    )
-    assert shown[0][1:] == (
-        f"{100 * worst[0].extent.one_layer_fraction:.1f}",
-        "2.00 (1.00 to >= 3.00)",
-        "-",
-        "-",
-        "-",
-    )
-    alike = [
-        with_numbers(
-            row, one_layer_fraction=1.0, thickness_voxels=Thickness(0.0, row.label % 7, 9.0)
-        )
-        for row in rows
-    ]
-    assert [int(row[0]) for row in texts(thin_table(alike, {}))] == [7, 14, 21, 28, 35]
-    thick = with_numbers(rows[0], one_layer_fraction=1.0)
-    for row in (
-        with_numbers(thick, cells_across=2.0),
-        with_numbers(thick, thickness_voxels=Thickness(1.0, 3.0, 3.0, 3.0)),
-    ):
-        assert texts(thin_table([row, *rows], {rows[0].label: "bone [l]"})) == shown
-        assert thin_table([row], {}) is None
-    contacts = [
-        LabelContact((1, k), 100.0 + k, 50.0 + k, 0.0)._replace(ratio=2.0) for k in range(2, 42)
-    ]
+def labels_of(table):
+    return [int(row[0].split()[0]) for row in texts(table)]
+
+
+def test_a_thin_table_has_the_worst_five_alone():
+    """Neither the background nor what is two cells across, or as thick as is looked for."""
+
+    def row_of(label, fraction, thickness=(1.0, 2.0, 3.0, 3.0), **numbers):
+        numbers |= {"one_layer_fraction": fraction, "thickness_voxels": Thickness(*thickness)}
+        return label_row(label, n_cells=9, **numbers)
+
+    fractions = np.random.default_rng(2).permutation(41) / 41.0
+    rows = [row_of(label, fraction) for label, fraction in enumerate(fractions, start=1)]
+    names, worst = {1: "bone [l]"}, 1 + np.argsort(-fractions)[:5]
+    table = thin_table(rows, names)
+    assert labels_of(table) == worst.tolist()
+    shown = (f"{100 * fractions.max():.1f}", "2.00 (1.00 to >= 3.00)", "-", "-", "-")
+    assert texts(table)[0][1:] == shown
+    across, thick = row_of(1, 1.0, cells_across=2.0), row_of(1, 1.0, (1.0, 3.0, 3.0, 3.0))
+    for row in (row_of(0, 1.0), across, thick):
+        assert texts(thin_table([row, *rows], names)) == texts(table)
+    assert thin_table([across], {}) is thin_table([thick], {}) is None
+    alike = [row_of(label, 1.0, (0.0, label % 7, 9.0)) for label in range(1, 42)]
+    assert labels_of(thin_table(alike, {})) == [7, 14, 21, 28, 35]
+
+
+def test_a_contact_table_has_the_worst_five_alone():
+    contacts = [LabelContact((1, k), 100.0 + k, 50.0 + k, 2.0) for k in range(2, 42)]
     contacts += [LabelContact((2, 3), 90.0, 0.0, np.nan), LabelContact((2, 4), 149.0, 100.0, 1.49)]
     shown = texts(contact_table(contacts, {3: "fluid"}, 2))
     assert shown[0] == ("2, 3 fluid", "90.0", "0.0", "false")
     assert [row[0] for row in shown[1:]] == ["1, 2", "1, 3 fluid", "1, 4", "1, 5"]
     assert contact_table(contacts[-1:], {}, 3) is None
-    small, large = LabelContact((7, 8), 25.0, 1.0, 25.0), LabelContact((7, 9), 40.0, 10.0, 4.0)
-    shown = texts(contact_table([*contacts, small, large], {}, 2))
-    assert [row[0] for row in shown] == ["2, 3", "1, 2", "1, 3", "1, 4", "7, 9"]
-    assert texts(contact_table([small, large], {}, 2))[0][0] == "7, 9"
+    more = [LabelContact((7, 8), 25.0, 1.0, 25.0), LabelContact((7, 9), 40.0, 10.0, 4.0)]
+    pairs = [row[0] for row in texts(contact_table([*contacts, *more], {}, 2))]
+    assert pairs == ["2, 3", "1, 2", "1, 3", "1, 4", "7, 9"]
+    assert texts(contact_table(more, {}, 2))[0][0] == "7, 9"
     words = contacts_in_words(contact_totals(contacts[-2:]), 2)
-    assert words == (
-        "contact beyond 1.2 times that of the voxels: 119.0 mm, including 90.0 mm between labels "
-        "that do not touch in "
-        "the voxels"
-    )
+    assert "1.2 times that of the voxels: 119.0 mm, including 90.0 mm between labels" in words
