@@ -64,32 +64,24 @@ CASES = [(n, name) for n in (2, 3) for name in unusual(2)]
 @pytest.mark.parametrize(("n", "name"), CASES)
 def test_a_voxel_is_the_first_cell_s_that_holds_it(n, name):
     image, mesh = image_of(n), unusual(n)[name]
-    alone = np.array(
-        [
-            tetopt.cell_of_voxel(image, Mesh(mesh.points[cell], np.arange(n + 1)[None])) == 0
-            for cell in mesh.cells
-        ]
-    )
-    first = np.where(alone.any(axis=0), alone.argmax(axis=0), -1)
+    parts = [Mesh(mesh.points[cell], np.arange(n + 1)[None]) for cell in mesh.cells]
+    alone = np.array([tetopt.cell_of_voxel(image, part) == 0 for part in parts])
+    count = alone.sum(axis=0)
+    first = np.where(count > 0, alone.argmax(axis=0), -1)
     np.testing.assert_array_equal(tetopt.cell_of_voxel(image, mesh), first)
     moments, (low, high) = cell_moments_and_ranges(image, mesh)
-    np.testing.assert_array_equal(moments.n_voxels, alone.reshape(len(alone), -1).sum(axis=1))
+    np.testing.assert_array_equal(moments.n_voxels, alone.sum(axis=tuple(range(1, n + 1))))
     for cell in np.flatnonzero(moments.n_voxels):
-        assert (low[cell], high[cell]) == (
-            image.data[alone[cell]].min(),
-            image.data[alone[cell]].max(),
-        )
+        h = image.data[alone[cell]]
+        assert (low[cell], high[cell]) == (h.min(), h.max())
 
     overlap = overlap_of(image, mesh)
-    twice = alone.sum(axis=0) > 1
-    assert (overlap is not None) == twice.any()
-    assert (name in ("far", "part", "beside")) == (overlap is None)
+    assert (overlap is None) == (count <= 1).all() == (name in ("far", "part", "beside"))
     if overlap is not None:
         one, other = overlap.cells
         assert one < other
-        assert alone[one][overlap.voxel]
-        assert alone[other][overlap.voxel]
-        assert overlap.n_voxels == twice.sum()
+        assert alone[[one, other]][(slice(None), *overlap.voxel)].all()
+        assert overlap.n_voxels == (count > 1).sum()
         assert f"cells {one} and {other} both contain voxel {list(overlap.voxel)}" in str(overlap)
 
 
@@ -118,6 +110,11 @@ def errors_on(image, mesh):
     return compare(exact, mesh, np.zeros(mesh.points.shape), 1.0, labels_of(image).data)
 
 
+def of_label(function):
+    """A function of labels, a mesh, and other labels of its cells."""
+    return lambda image, mesh: function(labels_of(image), mesh, np.arange(len(mesh.cells)) % 2)
+
+
 WITH_IMAGE = {
     "E_D": tetopt.E_D,
     "cell_fields": lambda image, mesh: tetopt.cell_fields(mesh, image),
@@ -129,13 +126,9 @@ WITH_IMAGE = {
     "cell_moments": tetopt.cell_moments,
     "cell_of_voxel": tetopt.cell_of_voxel,
     "check_mesh": lambda image, mesh: tetopt.check_mesh(mesh, image),
-    "label_contacts": lambda image, mesh: tetopt.label_contacts(
-        labels_of(image), mesh, np.arange(len(mesh.cells)) % 2
-    ),
+    "label_contacts": of_label(tetopt.label_contacts),
     "label_fidelity": lambda image, mesh: tetopt.label_fidelity(labels_of(image), mesh),
-    "label_interfaces": lambda image, mesh: tetopt.label_interfaces(
-        labels_of(image), mesh, np.arange(len(mesh.cells)) % 2
-    ),
+    "label_interfaces": of_label(tetopt.label_interfaces),
     "mask_fidelity": lambda image, mesh: tetopt.mask_fidelity(labels_of(image), mesh),
     "mesh_image": lambda image, mesh: tetopt.mesh_image(image, start=mesh, iterations=1),
     "build_model": lambda image, mesh: tetopt.build_model(mesh, image, young=3.0),
@@ -156,7 +149,7 @@ MORE = {
     "masked": lambda image, mesh: tetopt.optimize(
         tetopt.content(image, mask=labels_of(image)), mesh, iterations=1
     ),
-    "cell_young": lambda image, mesh: cell_young(image, mesh),
+    "cell_young": cell_young,
     "node_young": node_young,
     "element_young": lambda image, mesh: element_young(image, mesh, average="gauss", order=2),
     "cell_values": lambda image, mesh: cell_values(image, mesh, lambda h: h - 50.0),

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import psutil
 import pytest
-from commands import exit_code, mesh_words, numbers_in
+from commands import assert_refuses, numbers_in, run_command
 from models import sample_image
 
 import tetopt
@@ -73,12 +73,11 @@ def test_the_machine_and_its_groups_limit_memory(system):
     assert budget.available_bytes() == GIB + GIB // 2
     system("proc/self/cgroup", "3:cpu,memory:/docker/abc\n")
     assert budget.available_bytes() == 8 * GIB
-    system("group/memory/memory.limit_in_bytes", f"{2 * GIB}\n")
     system("group/memory/memory.usage_in_bytes", f"{3 * GIB}\n")
     system("group/memory/memory.stat", "total_inactive_file 0\n")
-    assert budget.available_bytes() == 0
-    system("group/memory/memory.limit_in_bytes", f"{(1 << 63) - 4096}\n")
-    assert budget.available_bytes() == 8 * GIB
+    for limit, available in ((2 * GIB, 0), ((1 << 63) - 4096, 8 * GIB)):
+        system("group/memory/memory.limit_in_bytes", f"{limit}\n")
+        assert budget.available_bytes() == available
 
 
 def test_memory_is_known_here():
@@ -87,28 +86,22 @@ def test_memory_is_known_here():
 
 
 def test_words_have_units():
-    assert budget.memory_words(2.5e9) == "2.5 GB"
-    assert budget.memory_words(1.26e8) == "0.126 GB"
-    assert budget.memory_words(7.5e6) == "7.5 MB"
+    for size, words in ((2.5e9, "2.5 GB"), (1.26e8, "0.126 GB"), (7.5e6, "7.5 MB")):
+        assert budget.memory_words(size) == words
 
 
-def test_a_limit_counts_what_there_is(monkeypatch):
+@pytest.mark.parametrize(
+    ("n_bytes", "limit", "words"),
+    [(1000, None, "of memory, but only 0.001 MB is free"), (600, 1000, "in total, but only")],
+)
+def test_a_limit_counts_what_there_is(monkeypatch, n_bytes, limit, words):
     monkeypatch.setattr(budget, "available_bytes", lambda: 1000)
     monkeypatch.setattr(budget, "resident_bytes", lambda: 400)
-    budget.check_memory(1000, "a", "b")
-    with pytest.raises(
-        tetopt.InputError,
-        match=r"^a: needs about 0\.001 MB of memory, but only 0\.001 MB is free; b$",
-    ):
-        budget.check_memory(1001, "a", "b")
-    budget.check_memory(600, "a", "b", limit=1000)
-    with pytest.raises(
-        tetopt.InputError,
-        match=r"^a: needs about 0\.001 MB of memory in total, but only 0\.001 MB is allowed; b$",
-    ):
-        budget.check_memory(601, "a", "b", limit=1000)
-    assert not budget.MemoryLimit(1000, 600).is_reached()
-    assert budget.MemoryLimit(1000, 601).is_reached()
+    budget.check_memory(n_bytes, "a", "b", limit=limit)
+    with pytest.raises(tetopt.InputError, match=f"^a: needs about 0.001 MB .*{words}.*; b$"):
+        budget.check_memory(n_bytes + 1, "a", "b", limit=limit)
+    for n_used, is_over in ((600, False), (601, True)):
+        assert budget.MemoryLimit(1000, n_used).is_reached() == is_over
 
 
 IMAGE = tetopt.Image(
@@ -175,25 +168,18 @@ def test_a_whole_process_holds_what_it_reads():
 
 
 @pytest.mark.full
-def test_a_run_ends_before_the_limit_with_the_mesh_reached(tmp_path, monkeypatch, capsys):
+def test_a_run_ends_before_the_limit_with_the_mesh_reached(here, monkeypatch):
     """`--max-gb`: the image alone is refused at once, else what is reached is written, and said
     why.
     """
-    tetopt.save_image(tmp_path / "a.nii.gz", sample_image(3))
-    words = mesh_words(
-        tmp_path / "a.nii.gz", tmp_path, "--nodes", "60", "--iterations", "2", "--force"
-    )
-    assert exit_code(*words, "--max-gb", "0.001") == 2
-    assert (
-        "GB of memory in total, but only 1 MB is allowed; mesh a part of it (--crop)"
-        in capsys.readouterr().err.replace("\n", " ")
-    )
-    assert not (tmp_path / "a.vtu").exists()
+    tetopt.save_image("a.nii.gz", sample_image(3))
+    words = "mesh a.nii.gz -o a.vtu --json a.json --nodes 60 --iterations 2 --force --max-gb"
+    only = "GB of memory in total, but only 1 MB is allowed; mesh a part of it (--crop)"
+    assert_refuses(f"{words} 0.001", only)
     for value in ("0", "-1", "nan"):
-        assert exit_code(*words, "--max-gb", value) == 2
-        assert "--max-gb: expected more than 0" in capsys.readouterr().err
-    assert exit_code(*words, "--max-gb", "100") == 0
-    numbers = numbers_in(tmp_path / "a.json")
+        assert_refuses(f"{words} {value}", "--max-gb: expected more than 0")
+    run_command(f"{words} 100")
+    numbers = numbers_in("a.json")
     assert numbers["ended"] in ("iterations", "converged")
     assert numbers["options"]["max_gb"] == 100.0
     assert 0 < numbers["memory"]["peak_bytes"]
@@ -201,21 +187,26 @@ def test_a_run_ends_before_the_limit_with_the_mesh_reached(tmp_path, monkeypatch
     now = budget.resident_bytes
     monkeypatch.setattr("tetopt.job.mesh_stage.check_memory_of", lambda *_: None)
     monkeypatch.setattr(budget.MemoryLimit, "is_reached", lambda self: now() > self.n_bytes)
-    capsys.readouterr()
-    exit_code(*words, "--max-gb", "0.001")
-    numbers = numbers_in(tmp_path / "a.json")
-    assert numbers["ended"] == "max_gb"
-    assert "memory limit reached: the current mesh is kept" in capsys.readouterr().err
-    tetopt.check_mesh(tetopt.load_mesh(tmp_path / "a.vtu").mesh)
+    said = run_command(f"{words} 0.001", code=None).err
+    assert "memory limit reached: the current mesh is kept" in said
+    assert numbers_in("a.json")["ended"] == "max_gb"
+    assert tetopt.check_mesh(tetopt.load_mesh("a.vtu").mesh) == []
 
 
 # What is said meanwhile, where there is no terminal.
 
 
-def test_lines_are_rare_and_the_first_is_said_at_once(monkeypatch):
+@pytest.fixture
+def log(monkeypatch):
+    """The lines that are printed, and a clock, s."""
     lines, clock = [], [0.0]
     monkeypatch.setattr(cli_run.log, "print", lines.append)
     monkeypatch.setattr(cli_run.time, "perf_counter", lambda: clock[0])
+    return lines, clock
+
+
+def test_lines_are_rare_and_the_first_is_said_at_once(monkeypatch, log):
+    lines, clock = log
     at_once, later = cli_run.rare_lines(is_first_said=True), cli_run.rare_lines()
     for second in range(26):
         clock[0] = float(second)
@@ -228,13 +219,11 @@ def test_lines_are_rare_and_the_first_is_said_at_once(monkeypatch):
     assert len(lines) == 5
 
 
-def test_compiling_and_long_iterations_are_told(monkeypatch):
+def test_compiling_and_long_iterations_are_told(log):
     """Before anything is compiled there is a line; and iterations, E, seconds and memory are
     told as they go.
     """
-    lines, clock = [], [0.0]
-    monkeypatch.setattr(cli_run.log, "print", lines.append)
-    monkeypatch.setattr(cli_run.time, "perf_counter", lambda: clock[0])
+    lines, clock = log
 
     def make(say):
         say("compiling the kernels, 1 of 57")
@@ -278,28 +267,27 @@ def test_the_time_left_is_told_from_the_third_iteration_on():
     there is none.
     """
     assert left_words(records(1.0, 9.0, 15.0), 10, None) == ""
-    history = records(1.0, 9.0, 15.0, 19.0)
-    assert left_words(history, 10, None) == ", about 35 s left"
-    assert left_words(history, 10, 25.0) == ", about 6 s left"
-    assert left_words(history, 10, 18.0) == ", about 0 s left"
-    assert left_words(history, 103, None) == ", about 8 min left"
-    assert left_words(history, 3, None) == ""
+    for most, seconds, words in (
+        (10, None, ", about 35 s left"),
+        (10, 25.0, ", about 6 s left"),
+        (10, 18.0, ", about 0 s left"),
+        (103, None, ", about 8 min left"),
+        (3, None, ""),
+    ):
+        assert left_words(records(1.0, 9.0, 15.0, 19.0), most, seconds) == words
 
 
-def test_the_log_tells_nodes_memory_and_time(tmp_path, capsys):
+def test_the_log_tells_nodes_memory_and_time(here):
     """The nodes of sizes and the memory, as in run.json, come before the first iteration."""
-    tetopt.save_image(tmp_path / "a.nii.gz", sample_image(3))
-    words = mesh_words(tmp_path / "a.nii.gz", tmp_path, "--edge-size", "9", "--iterations", "5")
-    assert exit_code(*words) == 0
-    said = capsys.readouterr().err.replace("\n", " ")
-    before, _, after = said.partition("iteration   0/5")
-    numbers = numbers_in(tmp_path / "a.json")
+    tetopt.save_image("a.nii.gz", sample_image(3))
+    words = "mesh a.nii.gz -o a.vtu --json a.json --edge-size 9 --iterations 5"
+    before, *lines = re.split(r"iteration +\d+/5", run_command(words).err.replace("\n", " "))
+    numbers = numbers_in("a.json")
     assert f"sizes require about {numbers['nodes_of_sizes']} nodes" in before
     bound = numbers["memory"]["predicted_bytes"]
     stated = float(re.search(r"about (\S+) GB of memory", before)[1])
     assert stated == pytest.approx(bound / 1e9, rel=0.05)
     assert numbers["memory"]["peak_bytes"] < 1.2 * bound
-    lines = re.split(r"iteration +\d+/5", after)
     is_told = ["s left" in line for line in lines]
     assert is_told == [False, False, False, True, True, False][: len(lines)]
 

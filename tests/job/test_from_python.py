@@ -4,10 +4,11 @@ nothing printed.
 
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import exit_code, numbers_in
+from commands import assert_done, exit_code, numbers_in
 
 import tetopt
 from tetopt import InputError
@@ -21,70 +22,74 @@ from tetopt.system.files import save_json
 
 
 @pytest.fixture
-def place(tmp_path):
-    """A folder with an image, labels, and a mesh of them."""
-    phantom = tetopt.load_phantom("sphere")
-    image, labels = phantom.image(voxel_mm=6), phantom.label_image(voxel_mm=6)
-    tetopt.save_image(tmp_path / "image.nii.gz", image)
+def phantom():
+    """An image of 6 mm and its labels."""
+    sphere = tetopt.load_phantom("sphere")
+    return sphere.image(voxel_mm=6), sphere.label_image(voxel_mm=6)
+
+
+@pytest.fixture
+def files(here, phantom):
+    """The image, and a mesh of it with labels."""
+    image, labels = phantom
+    tetopt.save_image("image.nii.gz", image)
     mesh = tetopt.lattice_mesh(image, nodes=200)
-    tetopt.save_mesh(
-        tmp_path / "a.vtu",
-        mesh,
-        {"label": tetopt.cell_labels(labels, mesh), **tetopt.cell_fields(mesh, image)},
-    )
-    return tmp_path
+    fields = {"label": tetopt.cell_labels(labels, mesh), **tetopt.cell_fields(mesh, image)}
+    tetopt.save_mesh("a.vtu", mesh, fields)
 
 
-def test_python_has_the_numbers_of_the_commands(place, capfd):
-    mesh, image = place / "a.vtu", place / "image.nii.gz"
+MESH, IMAGE, OUT = Path("a.vtu"), Path("image.nii.gz"), Path("b.inp")
+
+
+@pytest.mark.usefixtures("files")
+def test_python_has_the_numbers_of_the_commands(capfd):
     load = {"young": "0=1,1=5", "loads": ["compress:5%"]}
+    solver, part = SolverOptions(**load), LabelledPart()
     with listen_with(lambda event: None):
-        numbers = [
-            judge(mesh, image).numbers,
-            solve_file(mesh, model=ModelOptions(**load), part=LabelledPart()).numbers,
-            convert_file(
-                mesh, place / "b.inp", solver=SolverOptions(**load), part=LabelledPart()
-            ).numbers,
-            write_surface(mesh, place / "b.stl", SurfacePart(label="1")).numbers,
+        results = [
+            judge(MESH, IMAGE),
+            solve_file(MESH, model=ModelOptions(**load), part=part),
+            convert_file(MESH, OUT, solver=solver, part=part),
+            write_surface(MESH, Path("b.stl"), SurfacePart(label="1")),
         ]
     assert capfd.readouterr() == ("", "")
-    first = (place / "b.inp").read_bytes(), (place / "b.stl").read_bytes()
-    model = ("--young", load["young"], "--load", "compress:5%")
-    commands = [
-        ("quality", mesh, "--image", image),
-        ("fem", mesh, *model),
-        ("convert", mesh, place / "b.inp", *model),
-        ("surface", mesh, "-o", place / "b.stl", "--label", "1"),
-    ]
-    for words, ours in zip(commands, numbers, strict=True):
-        assert exit_code(*words, "--force", "--json", place / "command.json") == 0
-        save_json(place / "python.json", ours)
-        assert numbers_in(place / "python.json") == numbers_in(place / "command.json")
-    assert ((place / "b.inp").read_bytes(), (place / "b.stl").read_bytes()) == first
+    first = [Path(name).read_bytes() for name in ("b.inp", "b.stl")]
+    model = "--young 0=1,1=5 --load compress:5%"
+    commands = (
+        "quality a.vtu --image image.nii.gz",
+        f"fem a.vtu {model}",
+        f"convert a.vtu b.inp {model}",
+        "surface a.vtu -o b.stl --label 1",
+    )
+    for words, result in zip(commands, results, strict=True):
+        assert_done(f"{words} --force --json command.json")
+        save_json("python.json", result.numbers)
+        assert numbers_in("python.json") == numbers_in("command.json")
+    assert [Path(name).read_bytes() for name in ("b.inp", "b.stl")] == first
 
 
-def test_refusals_name_arguments(place):
-    mesh = place / "a.vtu"
-    with pytest.raises(InputError, match=r"^`labels`: needs `image`"):
-        judge(mesh, labels=place / "image.nii.gz")
-    with pytest.raises(InputError, match=r"moduli: pass `young`"):
-        solve_file(mesh, model=ModelOptions(), part=LabelledPart())
-    with pytest.raises(InputError, match=r"^`mask`: needs `image`"):
-        convert_file(mesh, place / "b.inp", solver=SolverOptions(), part=LabelledPart(mask=mesh))
-    with pytest.raises(InputError, match=r"give exactly one of `below`, `label`, `cell_set`"):
-        write_surface(mesh, place / "b.stl", SurfacePart())
+@pytest.mark.usefixtures("files")
+def test_refusals_name_arguments():
+    solver, part = SolverOptions(), LabelledPart(mask=MESH)
+    for call, words in (
+        (lambda: judge(MESH, labels=IMAGE), "^`labels`: needs `image`"),
+        (lambda: solve_file(MESH, model=ModelOptions(), part=LabelledPart()), "pass `young`"),
+        (lambda: convert_file(MESH, OUT, solver=solver, part=part), "^`mask`: needs `image`"),
+        (lambda: write_surface(MESH, OUT, SurfacePart()), "one of `below`, `label`, `cell_set`"),
+    ):
+        with pytest.raises(InputError, match=words):
+            call()
 
 
-def test_a_violated_requirement_is_told(place):
+def test_a_violated_requirement_is_told(here):
     """As by `tetopt quality`, whose exit code is 1 then."""
-    cells = np.array([[0, 1, 2, 3], [0, 1, 2, 4]])
-    points = np.array([[0, 0, 0], [30, 0, 0], [0, 30, 0], [5, 5, 20], [6, 6, 30]])
-    tetopt.save_mesh(place / "overlapping.vtu", tetopt.Mesh(points, cells))
+    points = [[0, 0, 0], [30, 0, 0], [0, 30, 0], [5, 5, 20], [6, 6, 30]]
+    tetopt.save_mesh("overlapping.vtu", tetopt.Mesh(points, [[0, 1, 2, 3], [0, 1, 2, 4]]))
     events = []
     with listen_with(events.append):
-        wrong = judge(place / "overlapping.vtu", check=True).tell()
+        wrong = judge(Path("overlapping.vtu"), check=True).tell()
     assert wrong == [event.text for event in events if event.kind == "violated"]
-    assert wrong[0].startswith(str(place / "overlapping.vtu"))
+    assert wrong[0].startswith("overlapping.vtu")
 
 
 @pytest.mark.deep
@@ -109,25 +114,20 @@ def test_a_pool_of_new_processes_works_after_a_run(tmp_path):
 
 
 @pytest.mark.parametrize("given", [(), ("labels",), ("labels", "mask")])
-def test_an_image_is_meshed_as_by_the_command(tmp_path, given):
+def test_an_image_is_meshed_as_by_the_command(here, phantom, given):
     """With its defaults: the same mesh and labels, to the last bit."""
-    phantom = tetopt.load_phantom("sphere")
-    image, labels = phantom.image(voxel_mm=6), phantom.label_image(voxel_mm=6)
-    near = np.linalg.norm(np.indices(image.shape).T - (np.array(image.shape) - 1) / 2, axis=-1).T
-    files = {
-        "image": image,
-        "labels": labels,
-        "mask": tetopt.Image(1.0 * (near < 5.2), image.affine),
-    }
+    image, labels = phantom
+    index = np.moveaxis(np.indices(image.shape), 0, -1)
+    near = np.linalg.norm(index - (np.array(image.shape) - 1) / 2, axis=-1) < 5.2
+    files = {"image": image, "labels": labels, "mask": tetopt.Image(1.0 * near, image.affine)}
     for name, each in files.items():
-        tetopt.save_image(tmp_path / f"{name}.nii.gz", each)
-    words = [word for name in given for word in (f"--{name}", tmp_path / f"{name}.nii.gz")]
-    code = exit_code("mesh", tmp_path / "image.nii.gz", "-o", tmp_path / "a.vtu", *words)
-    result = tetopt.mesh_image(
-        tetopt.load_image(tmp_path / "image.nii.gz"), **{name: files[name] for name in given}
-    )
+        tetopt.save_image(f"{name}.nii.gz", each)
+    words = [f"--{name} {name}.nii.gz" for name in given]
+    code = exit_code("mesh image.nii.gz -o a.vtu", *words)
+    options = {name: files[name] for name in given}
+    result = tetopt.mesh_image(tetopt.load_image("image.nii.gz"), **options)
     assert (code == 1) == bool(result.violated)
-    written = tetopt.load_mesh(tmp_path / "a.vtu")
+    written = tetopt.load_mesh("a.vtu")
     np.testing.assert_array_equal(result.mesh.points, written.mesh.points)
     np.testing.assert_array_equal(result.mesh.cells, written.mesh.cells)
     if given:
@@ -136,25 +136,23 @@ def test_an_image_is_meshed_as_by_the_command(tmp_path, given):
             tetopt.mesh_image(tetopt.content(image, labels), labels=labels)
 
 
-def test_a_result_comes_with_its_mask_and_labels(place):
+def test_a_result_comes_with_its_mask_and_labels(here, phantom):
     """To the model that its content and labels give; of a plain image, with curved cells of
     order 2.
     """
-    phantom = tetopt.load_phantom("sphere")
-    image, labels = phantom.image(voxel_mm=6), phantom.label_image(voxel_mm=6)
+    image, labels = phantom
     mask = tetopt.Image(1.0 * (np.indices(image.shape)[0] < 8), image.affine)
     result = tetopt.mesh_image(image, 200, labels=labels, mask=mask, iterations=2, order=2)
-    content = tetopt.content(image, labels, mask)
+    content, mapped = tetopt.content(image, labels, mask), {"young": "1 + h", "bins": 4}
     data = tetopt.cell_fields(result.mesh, content) | {"label": result.labels}
-    model = tetopt.build_model(result, young="1 + h", bins=4)
-    other = tetopt.build_model(result.mesh, content, young="1 + h", bins=4, cell_data=data, order=2)
+    model = tetopt.build_model(result, **mapped)
+    other = tetopt.build_model(result.mesh, content, **mapped, cell_data=data, order=2)
     assert model.order == 2
-    for name in ("a.vtu", "b.vtu"):
-        tetopt.save_model(place / name, model if name == "a.vtu" else other)
-    assert (place / "a.vtu").read_bytes() == (place / "b.vtu").read_bytes()
-    assert not np.array_equal(
-        model.cell_data["mean"], tetopt.cell_fields(result.mesh, image)["mean"]
-    )
+    tetopt.save_model("a.vtu", model)
+    tetopt.save_model("b.vtu", other)
+    assert Path("a.vtu").read_bytes() == Path("b.vtu").read_bytes()
+    means = tetopt.cell_fields(result.mesh, image)["mean"]
+    assert not np.array_equal(model.cell_data["mean"], means)
     straight = tetopt.mesh_image(image, 300, iterations=0, order=2)
     assert (straight.mesh.midpoints, tetopt.build_model(straight).order) == (None, 2)
     with pytest.raises(InputError, match="a result of `mesh_image` without an image"):
