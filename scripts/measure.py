@@ -168,6 +168,7 @@ class Measurement(NamedTuple):
 
 
 COMPARED = "-o compared --repeats 1"
+WILD = "compared/pytetwild.vtu"  # its mesh
 CGAL = "--pipeline 'cgal=$PYTHON $CGAL_LABELS {labels} -o {output} --size {size}'"
 MEASUREMENTS = {
     "mni152": Measurement(
@@ -202,9 +203,10 @@ MEASUREMENTS = {
     ),
     "improved": Measurement(
         (
-            "tetopt baseline $CT -o wild.vtu --nodes 5000 --force",
-            "tetopt mesh $CT -o better.vtu --start wild.vtu --json better.json --force",
-            "tetopt mesh $CT -o closer.vtu --start wild.vtu --k-d 0.2 --json closer.json --force",
+            f"tetopt compare $CT {COMPARED} --nodes 5000 --pipelines pytetwild "
+            "--reference-dofs 1000",
+            f"tetopt mesh $CT -o better.vtu --start {WILD} --json better.json --force",
+            f"tetopt mesh $CT -o closer.vtu --start {WILD} --k-d 0.2 --json closer.json --force",
         ),
         runs,
     ),
