@@ -227,7 +227,7 @@ def test_compiling_and_long_iterations_are_told(log):
 
     def make(say):
         say("compiling the kernels, 1 of 57")
-        assert lines == ["compiling the kernels, 1 of 57 (first run only), 0 s"]
+        assert lines == ["compiling the kernels, 1 of 57 (stored for later runs), 0 s"]
 
     rows = [
         IterationRecord(number, 1.0 - 0.1 * number, 2.0, 1.0, 0.1, False, 48, 504, 3.0)
@@ -301,4 +301,4 @@ def test_warm_up_tells_how_compiling_goes(monkeypatch, capsys):
     monkeypatch.setattr(warm_up, "link", link)
     with pytest.raises(InterruptedError):
         warm_up.warm_up_command()
-    assert "compiling the kernels, 1 of 2 (first run only)" in capsys.readouterr().err
+    assert "compiling the kernels, 1 of 2 (stored for later runs)" in capsys.readouterr().err

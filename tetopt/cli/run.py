@@ -105,7 +105,7 @@ def compiling(title: str) -> Iterator[Callable[[str], None]]:
 
         def progress(words: str) -> None:
             status.update(f"{words} ...")
-            say(f"{words} (first run only), {time.perf_counter() - begin:.0f} s")
+            say(f"{words} (stored for later runs), {time.perf_counter() - begin:.0f} s")
 
         yield progress
 
