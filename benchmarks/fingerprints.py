@@ -25,6 +25,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+from llvmlite.binding import get_host_cpu_name
 from paper.tissue import mni_tissue
 
 import tetopt
@@ -91,7 +92,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (tetopt.InputError, OSError) as error:
         print(f"fingerprints: {error}", file=sys.stderr)
         return 2
-    save_json(output, {"machine": platform.platform(), "versions": versions(), "runs": rows})
+    save_json(output, {"machine": machine(), "versions": versions(), "runs": rows})
     differing = [name for name, row in rows.items() if earlier.get(name, row) != row]
     missing = [name for name in rows if earlier and name not in earlier]
     for name in differing:
@@ -103,6 +104,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             f"{options.against}"
         )
     return 1 if differing or missing else 0
+
+
+def machine() -> str:
+    """What last digits may depend on, beside versions: the system and the kind of processor."""
+    return f"{platform.platform()} {get_host_cpu_name()}"
 
 
 def fingerprints(folder: Path, names: Sequence[str]) -> Iterator[tuple[str, dict[str, str]]]:

@@ -121,12 +121,15 @@ def test_a_plain_mesh_is_still_the_same(tmp_path):
     """
     stated = ROOT / "tests" / "fingerprints.json"
     earlier = json.loads(stated.read_text())
-    kind = platform.platform().partition(platform.machine())[1:]
+    module = script("fingerprints")
+    kinds = {
+        text.partition(platform.machine())[2] for text in (earlier["machine"], module.machine())
+    }
     now = versions() | {"tetopt": earlier["versions"]["tetopt"]}
-    if not earlier["machine"].endswith("".join(kind)) or now != earlier["versions"]:
+    if len(kinds) > 1 or now != earlier["versions"]:
         pytest.skip("fingerprints of another machine, or of other libraries")
     words = ["-o", str(tmp_path / "now.json"), "--against", str(stated), "--only", "oblique"]
-    assert script("fingerprints").main(words) == 0
+    assert module.main(words) == 0
 
 
 def test_choose_sizes(tmp_path, monkeypatch, capsys):
