@@ -21,6 +21,7 @@ from queue import SimpleQueue
 ROOT = Path(__file__).resolve().parents[2]
 COPIES = ROOT / ".mutants"  # of always the same places: numba's cache goes by paths
 PYTEST = ["-m", "pytest", "-x", "-q", "-n0", "-p", "no:cacheprovider"]
+MOST_SECONDS = 900.0  # of a selection of tests, on a busy machine
 SHOWN_SECONDS = 60.0  # a longer run is a selection of tests to narrow
 
 free_copies: SimpleQueue[Path] = SimpleQueue()
@@ -50,13 +51,17 @@ def run_tests(copy: Path, words: list[str], is_plain: bool) -> tuple[int, float]
     }
     if is_plain:
         environment["NUMBA_DISABLE_JIT"] = "1"
-    run = subprocess.run(
-        [sys.executable, *PYTEST, "-m", "not slow", *words],
-        cwd=copy,
-        env=environment,
-        capture_output=True,
-        text=True,
-    )
+    try:
+        run = subprocess.run(
+            [sys.executable, *PYTEST, "-m", "not slow", *words],
+            cwd=copy,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=MOST_SECONDS,
+        )
+    except subprocess.TimeoutExpired:  # tests that run without end fail
+        return 1, MOST_SECONDS
     if run.returncode not in (0, 1):  # 2 to 5: no tests, or they could not be collected
         raise SystemExit(f"{words}: pytest exited with {run.returncode}\n{run.stdout[-2000:]}")
     return run.returncode, time.monotonic() - begin
