@@ -130,6 +130,7 @@ def test_the_wait_for_a_start_is_said(monkeypatch):
     assert "reading and preparing the image" in begun
     assert "building the initial mesh, " in begun
     assert "building the initial mesh" not in rest
+    assert "preparing the optimisation, " in rest
 
 
 def test_an_organ_is_compressed_between_its_own_top_and_bottom():

@@ -70,7 +70,7 @@ class Display:
         return is_ended()
 
     def _start(self, stage: Stage, text: str) -> None:
-        if stage.name in ("read", "start"):
+        if stage.name in ("read", "start", "write"):
             self._shown.enter_context(waiting(text))
         elif stage.name == "kernels":
             say = self._shown.enter_context(compiling(text))
@@ -185,12 +185,17 @@ def _bar(
                 task, completed=row.iteration, energies=words(row) + left()
             )
     else:
+        with contextlib.ExitStack() as between:
+            between.enter_context(waiting("preparing the optimisation"))
 
-        def tell(row: IterationRecord) -> None:
-            begin = f"iteration {row.iteration:3d}/{iterations}  {words(row)}"
-            log.print(f"{begin}  {row.n_cells} cells  {_spent(row.seconds)}{left()}")
+            def tell(row: IterationRecord) -> None:
+                between.close()
+                begin = f"iteration {row.iteration:3d}/{iterations}  {words(row)}"
+                log.print(f"{begin}  {row.n_cells} cells  {_spent(row.seconds)}{left()}")
+                if row.iteration == iterations:
+                    between.enter_context(waiting("lifting flat cells and judging the mesh"))
 
-        yield tell
+            yield tell
 
 
 @contextlib.contextmanager
