@@ -262,9 +262,17 @@ def test_a_mesh_is_written_by_its_suffix(suffix, tmp_path):
     assert path.read_bytes().startswith(heads[suffix.lower()])
 
 
-@pytest.mark.parametrize("name", ["a", "a.vtu.gz"])
-def test_a_suffix_of_no_format_is_refused(name, here):
-    with refusal(r"unknown suffix; known suffixes are \.vtu .*, \.inp"):
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("a", r"unknown suffix; known suffixes are \.vtu .*, \.inp"),
+        ("a.vtu.gz", r"unknown suffix; known suffixes are \.vtu .*, \.inp"),
+        ("a.stl", r"a\.stl: .*tetopt surface --boundary"),
+        ("a.PLY", r"a\.PLY: .*tetopt surface --boundary"),
+    ],
+)
+def test_a_suffix_of_no_format_is_refused(name, words, here):
+    with refusal(words):
         save_mesh(name, sample_model().mesh)
     assert list(here.iterdir()) == []
 

@@ -337,6 +337,13 @@ def test_bad_cell_labels(of_cell, words):
         label_fidelity(image, mesh, of_cell)
 
 
+def test_extents_of_other_labels():
+    image, mesh, _ = slabs(2)
+    rows = [row._replace(label=5 * row.label) for row in label_fidelity(image, mesh)]
+    with pytest.raises(tetopt.InputError, match="label 5 is not in"):
+        label_fidelity(image, mesh, extents=rows)
+
+
 def test_bad_labels():
     image = tetopt.Image(np.full((4, 2), 0.5))
     mesh = tetopt.lattice_mesh(image, blocks=(2, 1))

@@ -19,6 +19,7 @@ from tetopt.io.febio import febio
 from tetopt.io.gmsh import gmsh22, gmsh41
 from tetopt.io.medit import medit
 from tetopt.io.mfem import mfem
+from tetopt.io.surfaces import SURFACE_SUFFIXES
 from tetopt.io.text import file_name, legacy_name, names_apart, plain, short_name
 from tetopt.io.vtk import VTK_SUFFIXES, vtk, vtu
 from tetopt.io.xdmf import xdmf
@@ -146,7 +147,10 @@ def format_of(path: Path) -> Format:
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
         known = ", ".join(f"{name} ({kind.what})" for name, kind in FORMATS.items())
-        raise InputError(f"{path}: unknown suffix; known suffixes are {known}")
+        what = f"{path}: unknown suffix; known suffixes are {known}"
+        if suffix in SURFACE_SUFFIXES:
+            what = f"{path}: no mesh's file, but a surface's; tetopt surface --boundary writes it"
+        raise InputError(what)
     return FORMATS[suffix]
 
 

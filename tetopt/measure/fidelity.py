@@ -494,7 +494,8 @@ def label_fidelity(
     owner : (s_0, ..., s_{n-1}) array of int, optional
         Cell of each voxel, -1 outside the mesh, if known.
     extents : sequence of LabelFidelity, optional
-        Rows with volumes and components, if known, as those of `MeshingResult.extents`.
+        Rows with volumes and components, if known: the `MeshingResult.extents` of these labels and
+        this mesh.
 
     Returns
     -------
@@ -531,6 +532,8 @@ def label_fidelity(
     one_layer = one_layer_fractions(mesh, of_cell, facets(mesh.cells))
     n_empty = _count_empty_cells(voxels, of_cell, len(values))
     boxes, rows = scipy.ndimage.find_objects(true + 1), []
+    if other := {known.label for known in extents}.difference(values.tolist()):
+        raise InputError(f"extents: label {min(other)} is not in `labels`; measure them again")
     for known in extents or label_extents(voxels, mesh, of_cell):
         row = int(np.searchsorted(values, known.label))
         far = distances(row, boxes[row])
