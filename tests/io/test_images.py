@@ -439,7 +439,11 @@ REFUSED = [
         for suffix in ("nii", "nii.gz", "mgz", "nrrd", "png")
     ),
     *(
-        (name, gzip.compress(WHOLE), f"this is a gzip file; rename it to {re.escape(better)}$")
+        (
+            name,
+            gzip.compress(WHOLE, mtime=0),
+            f"this is a gzip file; rename it to {re.escape(better)}$",
+        )
         for name, better in (
             ("b.c.nii", "b.c.nii.gz"),
             ("b.mgh", "b.mgz"),
@@ -448,7 +452,7 @@ REFUSED = [
     ),
     ("a.nii.gz", WHOLE, r"not a gzip file; .* remove \.gz"),
     *(
-        ("a.nii.gz", gzip.compress(nifti(NOISE))[:kept], f"{DAMAGED}; copy it again")
+        ("a.nii.gz", gzip.compress(nifti(NOISE), mtime=0)[:kept], f"{DAMAGED}; copy it again")
         for kept in (-9, 2000, 20)
     ),
     *(("a.nii", WHOLE[:kept], f"{DAMAGED}; copy it again") for kept in (-1, -100, 352)),
