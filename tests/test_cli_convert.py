@@ -538,7 +538,7 @@ convert mesh.vtu a.inp --set x=above:3
 convert mesh.vtu a.feb
     needs a material; give a modulus mapping (--young)
 convert mesh.vtu a.stl
-    known suffixes are .vtu (VTK, ParaView),
+    a.stl: no mesh's file, but a surface's; tetopt surface --boundary writes it
 convert mesh.vtu a.inp --mask m.nii.gz
     --mask: needs --image
 mesh a.nii.gz -o b.vtu --start mesh.vtu --nodes 100

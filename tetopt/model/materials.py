@@ -80,7 +80,18 @@ class Materials(NamedTuple):
     density: Floats | None = None
 
     def fields(self) -> Arrays:
-        """Return the moduli, ratios, materials from 1 and densities of cells, by fields' names."""
+        """Values of each cell, as files have them.
+
+        Returns
+        -------
+        dict of (M,) arrays
+            `young`, `nu`, `material`, counted from 1, and, if known, `density`.
+
+        Examples
+        --------
+        >>> sorted(materials(3.0, 0.45, 10).fields())
+        ['material', 'nu', 'young']
+        """
         fields: Arrays = {"young": self.young[self.of_cell], "nu": self.nu[self.of_cell]}
         fields["material"] = self.of_cell + 1
         if self.density is not None:
