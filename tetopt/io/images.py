@@ -345,7 +345,7 @@ def crop_image(image: Image, bounds: Bounds) -> Image:
 
     Examples
     --------
-    >>> small = cropped(Image(np.zeros((40, 50))), [(10, 30), (None, None)])
+    >>> small = crop_image(Image(np.zeros((40, 50))), [(10, 30), (None, None)])
     >>> small.shape, small.to_world([0, 0])
     ((20, 50), array([10.,  0.]))
     """
