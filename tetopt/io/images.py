@@ -19,7 +19,7 @@ import nibabel
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.errors import InputError, Remark, warn
+from tetopt.errors import InputError, Remark, prefix_errors, warn
 from tetopt.image import Image
 from tetopt.io.nifti import NIFTI
 from tetopt.io.read_dicom import DICOM
@@ -556,8 +556,8 @@ def errors_named(path: Path) -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        words = one_line(error)
-        raise InputError(words if words.startswith(str(path)) else f"{path}: {words}") from error
+        with prefix_errors(path):
+            raise InputError(one_line(error)) from error
     except OSError as error:
         words = f"cannot be opened ({error.strerror or error})"
         if isinstance(error, FileNotFoundError):
