@@ -494,7 +494,7 @@ def label_fidelity(
     owner : (s_0, ..., s_{n-1}) array of int, optional
         Cell of each voxel, -1 outside the mesh, if known.
     extents : sequence of LabelFidelity, optional
-        Rows with volumes and components, if known: the `MeshingResult.extents` of these labels and
+        Volumes, components and Dice, if known: the `MeshingResult.extents` of these labels and
         this mesh.
 
     Returns
@@ -530,7 +530,6 @@ def label_fidelity(
     overlaps = _label_overlaps(labels, mesh, voxels, of_cell)
     distances = _label_distances(labels, mesh, true, of_cell, outside)
     one_layer = one_layer_fractions(mesh, of_cell, facets(mesh.cells))
-    n_empty = _count_empty_cells(voxels, of_cell, len(values))
     boxes, rows = scipy.ndimage.find_objects(true + 1), []
     if other := {known.label for known in extents}.difference(values.tolist()):
         raise InputError(f"extents: label {min(other)} is not in `labels`; measure them again")
@@ -539,10 +538,8 @@ def label_fidelity(
         far = distances(row, boxes[row])
         rows.append(
             known._replace(
-                extent=known.extent._replace(
-                    n_empty_cells=int(n_empty[row]), one_layer_fraction=one_layer.get(row, np.nan)
-                ),
-                overlap=LabelOverlap(
+                extent=known.extent._replace(one_layer_fraction=one_layer.get(row, np.nan)),
+                overlap=known.overlap._replace(
                     **{name: column[row].item() for name, column in overlaps.items()}
                 ),
                 distance=LabelDistance(
@@ -563,10 +560,9 @@ def label_extents(voxels: OwnedVoxels, mesh: Mesh, row_of_cell: Ints) -> list[La
     n_cells = np.bincount(row_of_cell, minlength=n_labels)
     mesh_volume = np.bincount(row_of_cell, mesh.cell_volumes, n_labels)
     volume = n_true * abs(np.linalg.det(voxels.affine[:-1, :-1]))
-    n_empty, dice = (
-        _count_empty_cells(voxels, row_of_cell, n_labels),
-        _voxel_dice(true, painted, n_true),
-    )
+    n_owned = np.bincount(voxels.owner[voxels.owner >= 0], minlength=len(row_of_cell))
+    n_empty = np.bincount(row_of_cell[n_owned == 0], minlength=n_labels)
+    dice = _voxel_dice(true, painted, n_true)
     measured = []
     for row, box in enumerate(scipy.ndimage.find_objects(true + 1)):
         if box is None:
@@ -597,16 +593,10 @@ def label_extents(voxels: OwnedVoxels, mesh: Mesh, row_of_cell: Ints) -> list[La
     return measured
 
 
-def _count_empty_cells(voxels: OwnedVoxels, row_of_cell: Ints, n_labels: int) -> Ints:
-    """Numbers of cells without a voxel, by label."""
-    n_owned = np.bincount(voxels.owner[voxels.owner >= 0], minlength=len(row_of_cell))
-    return np.bincount(row_of_cell[n_owned == 0], minlength=n_labels)
-
-
 def _label_overlaps(
     labels: Image, mesh: Mesh, voxels: OwnedVoxels, of_cell: Ints
 ) -> dict[str, NDArray]:
-    """Overlaps of all labels, by the names of `LabelOverlap`."""
+    """Overlaps of all labels but for Dice, by the names of `LabelOverlap`."""
     true, owner, outside = voxels.rows, voxels.owner, voxels.outside
     n_labels = int(max(true.max(), of_cell.max())) + 1
     n_true = _voxel_counts(true, n_labels)
@@ -619,7 +609,6 @@ def _label_overlaps(
     total = n_true * labels.voxel_volume + (size + is_outside * size_beyond)
     of_most = _most_frequent(true, owner, of_cell)
     return {
-        "dice": _voxel_dice(true, painted_voxels(owner, of_cell, outside), n_true),
         "volume_dice": 2.0 * both / np.where(total > 0.0, total, 1.0),
         "dice_majority": _voxel_dice(true, painted_voxels(owner, of_most, outside), n_true),
     }
