@@ -28,10 +28,10 @@ from tetopt.study.compare_figures import (
     timing_figure,
 )
 from tetopt.study.compare_page import save_compare_page
-from tetopt.study.compare_report import as_json
 from tetopt.study.compare_table import columns_of, number_text, rows_of
 from tetopt.study.options import CompareOptions
 from tetopt.study.pipelines import PIPELINES
+from tetopt.system.files import as_json
 
 
 def filled(random, record, **given):

@@ -29,7 +29,7 @@ from tetopt.study.compare_figures import (
     timing_figure,
 )
 from tetopt.study.compare_page import save_compare_page
-from tetopt.study.compare_report import ORDER_WORDS, ImageSource, LabelSource, Report, as_json
+from tetopt.study.compare_report import ORDER_WORDS, ImageSource, LabelSource, Report
 from tetopt.study.options import CompareOptions
 from tetopt.study.program import pipelines_with
 from tetopt.system.files import check_outputs, results_folder, save_json
@@ -101,7 +101,7 @@ def compare_image(
         how = "; ".join(f"{each.title}: {each.failure}" for each in report.pipelines)
         raise InputError(f"compare: all pipelines failed, so there is no report: {how}")
     note("writing report, meshes, pictures and page")
-    save_json(paths["report.json"], as_json(report))
+    save_json(paths["report.json"], report)
     meshes = {
         _mesh_name(name, order): each for order, of in made.items() for name, each in of.items()
     }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from tetopt.engine.loop import UNIFORM_ITERATIONS, UNIFORM_K_D
 from tetopt.fem.reference import Errors, OwnError
@@ -12,10 +12,8 @@ from tetopt.model.averages import DEFAULT_AVERAGE
 from tetopt.study.isosurfaces import OTSU_CLASSES
 from tetopt.study.pipelines import PIPELINES
 from tetopt.study.program import Program
+from tetopt.system.arrays import Json
 
-# The file is flatter than the records: the keys of these fields' values are among those of the
-# record itself.
-INLINE_FIELDS = ("measurement", "source", "by_nu")
 ORDER_WORDS = {1: "linear", 2: "quadratic"}
 MESH_WORDS = {1: "", 2: ", quadratic"}  # after the title of a pipeline, by order
 
@@ -109,6 +107,11 @@ class PipelineRun(NamedTuple):
     peak_bytes: int
     measurement: Measurement
 
+    def as_json(self) -> Json:
+        """Return the row of `report.json`, which has the measures among its own numbers."""
+        *own, measured = self._asdict().items()
+        return dict(own) | measured[1]._asdict()
+
 
 class PipelineResult(NamedTuple):
     """All runs of a pipeline."""
@@ -132,6 +135,11 @@ class ImageFacts(NamedTuple):
     spacing_mm: list[float]
     variance: float
 
+    def as_json(self) -> Json:
+        """Return the object of `report.json`, which has the source among its own facts."""
+        source, *own = self._asdict().items()
+        return source[1]._asdict() | dict(own)
+
 
 class ReferenceEnergy(NamedTuple):
     """The reference's result for one Poisson's ratio."""
@@ -148,6 +156,11 @@ class ReferenceGrid(NamedTuple):
     n_dofs: int
     note: str
     by_nu: dict[str, ReferenceEnergy]
+
+    def as_json(self) -> Json:
+        """Return the object of `report.json`, which has the results by nu among its own facts."""
+        *own, by_nu = self._asdict().items()
+        return dict(own) | by_nu[1]
 
 
 class Report(NamedTuple):
@@ -175,20 +188,3 @@ class Report(NamedTuple):
             for order, results in of_order.items()
             for each in results
         ]
-
-
-def as_json(value: Any) -> Any:
-    """Convert a record to objects and lists, for `tetopt.system.files.save_json`."""
-    if hasattr(value, "as_json"):
-        value = value.as_json()
-    if isinstance(value, dict):
-        return {key: as_json(item) for key, item in value.items()}
-    if hasattr(value, "_asdict"):
-        row: dict[str, Any] = {}
-        for name, item in value._asdict().items():
-            if name in INLINE_FIELDS:
-                row |= as_json(item) or {}
-            else:
-                row[name] = as_json(item)
-        return row
-    return [as_json(item) for item in value] if isinstance(value, list | tuple) else value

@@ -356,7 +356,7 @@ def save_json(path: Path, value: Any) -> None:
     """Write `value` as JSON, whole or not at all; may contain numpy numbers and arrays,
     NamedTuples and paths.
     """
-    save_text(path, json.dumps(_plain(value), indent=1, allow_nan=False) + "\n")
+    save_text(path, json.dumps(as_json(value), indent=1, allow_nan=False) + "\n")
 
 
 def kept_places(path: Path) -> Iterator[Path]:
@@ -444,22 +444,22 @@ def _reason(error: OSError, folder: Path, n_bytes: int | None) -> str:
     return reason
 
 
-def _plain(value: Any) -> Any:
-    """Convert `value` to JSON's own types; numbers that are not finite become null, as JSON
-    cannot express them.
+def as_json(value: Any) -> Any:
+    """Convert `value` to JSON's own types, records by their method `as_json` or by their fields;
+    numbers that are not finite become null, as JSON cannot express them.
     """
     if hasattr(value, "as_json"):
         value = value.as_json()
     if hasattr(value, "_asdict"):
-        return {key: _plain(item) for key, item in value._asdict().items()}
+        return {key: as_json(item) for key, item in value._asdict().items()}
     if isinstance(value, dict):
-        return {_plain(str(key)): _plain(item) for key, item in value.items()}
+        return {as_json(str(key)): as_json(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [as_json(item) for item in value]
     if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
+        return as_json(value.tolist())
     if isinstance(value, np.generic):
-        return _plain(value.item())
+        return as_json(value.item())
     if isinstance(value, float) and not np.isfinite(value):
         return None
     if isinstance(value, str | Path):
