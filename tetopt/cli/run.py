@@ -35,7 +35,7 @@ class Display:
         self._is_writing = False
         self._tell: Callable[[Event], None] = lambda event: None
         self._begin = 0.0
-        self._n_rows = 0  # iterations so far; 0 if there are none
+        self._running = 0  # number of the iteration; 0 if none runs
         self._say = rare_lines()
 
     def end_stage(self) -> None:
@@ -65,8 +65,10 @@ class Display:
         """Return whether a signal has requested the end; within an iteration, print its progress
         from time to time.
         """
-        if self._n_rows:
-            self._say(f"  in iteration {self._n_rows}, {_spent(time.perf_counter() - self._begin)}")
+        if self._running:
+            self._say(
+                f"  in iteration {self._running}, {_spent(time.perf_counter() - self._begin)}"
+            )
         return is_ended()
 
     def _start(self, stage: Stage, text: str) -> None:
@@ -77,11 +79,12 @@ class Display:
             self._tell = lambda event: say(event.text)
         elif stage.name == "optimise":
             self._begin_keeping()
-            self._begin, self._n_rows, self._say = time.perf_counter(), 0, rare_lines()
+            self._begin, self._running, self._say = time.perf_counter(), 0, rare_lines()
             show = self._shown.enter_context(_bar(stage.number or 0, stage.most_seconds))
 
             def recorded(event: Event) -> None:
-                self._n_rows += 1
+                number = event.data.iteration + 1
+                self._running = number if number <= (stage.number or 0) else 0
                 show(event.data)
 
             self._tell = recorded
@@ -90,7 +93,7 @@ class Display:
                 self._begin_keeping()
             self._tell = self._shown.enter_context(_tasks_bar(text, stage.number or 0))
         if stage.name in ("optimised", "write"):
-            self._n_rows = 0
+            self._running = 0
         self._is_writing = stage.name == "write"
 
 
