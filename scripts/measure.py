@@ -39,7 +39,8 @@ ROOT = Path(__file__).parents[1]
 DATA = ROOT / "docs" / "measured" / "measured.json"
 PAGES = ROOT / "docs" / "measured"
 TEMPLATES = ROOT / "scripts" / "templates"
-README = "README.md"  # also the name of the template of its part between MARKS
+# documents of which a template of the same name makes the part between MARKS
+DOCUMENTS = (ROOT / "README.md", ROOT / "docs" / "understand" / "order.md")
 LOG = "log.txt"  # in the folder of a measurement: what its commands print
 MARKS = ("<!-- from make measured -->", "<!-- end of make measured -->")
 PROGRAMS = {
@@ -385,7 +386,14 @@ def commit() -> str:
     """The commit that is measured, with `+` where files differ from it, other than those that
     this script writes.
     """
-    git, written = ["git", "-C", str(ROOT)], (":!docs/measured", ":!docs/pictures", ":!README.md")
+    git, written = (
+        ["git", "-C", str(ROOT)],
+        (
+            ":!docs/measured",
+            ":!docs/pictures",
+            *(f":!{path.relative_to(ROOT)}" for path in DOCUMENTS),
+        ),
+    )
     name = subprocess.run(
         [*git, "rev-parse", "--short", "HEAD"], check=True, capture_output=True, text=True
     ).stdout
@@ -419,7 +427,7 @@ def rounded(value: Any) -> Any:
 
 
 def pages() -> dict[Path, str]:
-    """Text of each page, and of the README, from the templates and `DATA`."""
+    """Text of each page, and of `DOCUMENTS`, from the templates and `DATA`."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(TEMPLATES),
         undefined=jinja2.StrictUndefined,
@@ -435,16 +443,15 @@ def pages() -> dict[Path, str]:
         "head": head,
         "line": line,
     }
+    documents = {path.name: path for path in DOCUMENTS}
     texts = {}
     for template in sorted(TEMPLATES.glob("*.md")):
         text = environment.get_template(template.name).render()
-        if template.name == README:
-            before, rest = (ROOT / README).read_text(encoding="utf-8").split(MARKS[0])
-            texts[ROOT / README] = (
-                f"{before}{MARKS[0]}\n\n{text}\n{MARKS[1]}{rest.split(MARKS[1])[1]}"
-            )
-        else:
-            texts[PAGES / template.name] = text
+        path = documents.get(template.name, PAGES / template.name)
+        if path in DOCUMENTS:
+            before, rest = path.read_text(encoding="utf-8").split(MARKS[0])
+            text = f"{before}{MARKS[0]}\n\n{text}\n{MARKS[1]}{rest.split(MARKS[1])[1]}"
+        texts[path] = text
     return texts
 
 

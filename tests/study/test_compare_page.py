@@ -375,6 +375,7 @@ def whole(tmp_path_factory):
 
 
 @pytest.mark.full
+@pytest.mark.drawn
 def test_nothing_points_outside(whole):
     page = whole[0].read_text(encoding="utf-8")
     assert not re.search(
