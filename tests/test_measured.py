@@ -19,6 +19,7 @@ QUOTING = (
     "README.md",
     "docs/compare/index.md",
     "docs/understand/limits.md",
+    "docs/understand/numbers.md",
     "docs/understand/order.md",
     "docs/howto/improve.md",
 )
