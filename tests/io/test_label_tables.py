@@ -4,11 +4,13 @@ refused.
 
 import json
 
+import nibabel
+import numpy as np
 import pytest
 from refusals import assert_refused, refusal
 
 from tetopt.contents.labels import hex_colour
-from tetopt.io.label_tables import NO_TABLE, LabelTable, load_label_table
+from tetopt.io.label_tables import NO_TABLE, LabelTable, load_label_table, own_label_table
 from tetopt.model.file import table_in
 from tetopt.model.label_names import label_words, labels_named, table_of_labels, table_words
 from tetopt.model.sets import MOST_LETTERS, SET_NAME, interface_names, label_set_names
@@ -23,6 +25,20 @@ FREESURFER = """#$Id: FreeSurferColorLUT.txt $
 
 # below are colours of others
 1002 ctx-lh-caudalanteriorcingulate         125 100 160 0
+"""
+FREESURFER_8 = """0   Unknown          0   0   0   0
+819 Left-HypoThal-noMB           0  80   0 0 2
+822 Right-Fornix                27 187 253 0 3
+"""
+MRTRIX = """# Lookup table
+0    ???         Unknown                    0   0   0   0
+1    L.BSTS      ctx-lh-bankssts            25  100 40  255
+74   R.RACG      ctx-rh-rostral             80  20  140 255
+"""
+FSL = """<?xml version="1.0" encoding="ISO-8859-1"?>
+<atlas version="1.0"><header><name>Atlas</name><type>{}</type></header>
+<data><label index="0" x="48" y="94" z="35">Frontal Pole</label>
+<label index="48" x="25" y="70" z="32">Occipital</label></data></atlas>
 """
 SNAP = """################################################
 # ITK-SnAP Label Description File
@@ -93,6 +109,34 @@ def table_of(tmp_path, text, name="table.txt", encoding="utf-8"):
         ("1 left lung 3 10 20 30 0\n", {1: "left lung 3"}, {1: (10, 20, 30)}),
         ("index,label\n1,spleen\n", {1: "spleen"}, {}),  # nilearn's columns
         ("labels,structures\n1,spleen\n", {1: "spleen"}, {}),  # SynthSeg's
+        (
+            FREESURFER_8,
+            {0: "Unknown", 819: "Left-HypoThal-noMB", 822: "Right-Fornix"},
+            {819: (0, 80, 0), 822: (27, 187, 253)},
+        ),
+        ("1 rib 1 10 20 30 0\n2 rib 2 40 50 60 0\n", {1: "rib 1", 2: "rib 2"}, {2: (40, 50, 60)}),
+        ("1\tleft lung\t0.5\t1.0\t0\t1\n", {1: "left lung"}, {1: (127.5, 255, 0)}),
+        ('1,"kidney, left",255,0,0\n', {1: "kidney, left"}, {1: (255, 0, 0)}),
+        (MRTRIX, {0: "Unknown", 1: "ctx-lh-bankssts", 74: "ctx-rh-rostral"}, {74: (80, 20, 140)}),
+        (
+            "1 left kidney 1 2 3 0\n2 right kidney 4 5 6 0\n",
+            {1: "left kidney", 2: "right kidney"},
+            {2: (4, 5, 6)},
+        ),
+        ("1 left lung\n20  rib 3\n", {1: "left lung", 20: "rib 3"}, {}),
+        ('1,spleen\n2, "liver"\n', {1: "spleen", 2: "liver"}, {}),
+        ("1\tspleen\n2\tleft lung\n", {1: "spleen", 2: "left lung"}, {}),
+        ("1;spleen\n2;left lung\n", {1: "spleen", 2: "left lung"}, {}),
+        ('{"labels": {"background": 0, "liver": 819}}', {0: "background", 819: "liver"}, {}),
+        ('{"labels": {"0": "background", "819": "liver"}}', {0: "background", 819: "liver"}, {}),
+        (FSL.format("Probabilistic"), {1: "Frontal Pole", 49: "Occipital"}, {}),
+        (FSL.format("Label"), {0: "Frontal Pole", 48: "Occipital"}, {}),
+        (
+            FSL.format("Label").replace("index", 'value="7" index', 1),
+            {7: "Frontal Pole", 48: "Occipital"},
+            {},
+        ),
+        ("index\tname\tcolor\n1\tspleen\tff8000\n", {1: "spleen"}, {1: (255, 128, 0)}),
         # twice the same is one
         ("1 spleen 1 2 3 0\n1 spleen 1 2 3 0\n", {1: "spleen"}, {1: (1, 2, 3)}),
     ],
@@ -127,7 +171,16 @@ def test_a_background_without_a_colour_has_none(tmp_path):
         ("", "found no lines"),
         ("# only a comment\n\n", "found no lines"),
         ("spleen\n", r'line 1: expected a label table .* got "spleen"'),
-        ("1,spleen\n", r'line 1: expected a label table .* a row of column names with "label"'),
+        ("1,spleen,Milz\n", r"line 1: expected a label table .* column names"),
+        ("1 spleen 12 13\n", r"line 1: expected a label table"),
+        ("1\tspleen\tGM\n", r"line 1: expected a label table"),
+        ("1 spleen\n2 liver 1 2 3 0\n", "line 2: expected a label and its name"),
+        ('{"labels": {"tumour": [1, 2], "core": 2}}', "nnU-Net.* regions"),
+        ('{"labels": {"liver": "x"}}', 'one label for "liver"'),
+        ('{"labels": [1]}', "found none"),
+        ("{", "JSON"),
+        ("<atlas><label>a</label></atlas>", "index"),
+        ("<atlas", "FSL"),
         ("label,colour\n1,#ffffff\n", "a row of column names"),
         ("label,name\n1,spleen\n\n2\n", 'line 4: expected 2 columns, as in the first row, got "2"'),
         (
@@ -146,10 +199,6 @@ def test_a_background_without_a_colour_has_none(tmp_path):
         ("0 a 0 0 0 0\n1 spleen 256 0 0 0\n", "line 2: expected red, green and blue from 0 to 255"),
         ("0 a 0 0 0 0\n1 spleen\n", 'line 2: expected label, name, red, .* got "1 spleen"'),
         ('0 0 0 0 0 0 0 "a"\n1 spleen 1 2 3 0\n', "line 2: expected label, red, .* as in ITK-SNAP"),
-        (
-            "label,name\n1,spleen\n2,liver\n1,stomach\n",
-            'line 4: label 1 is "stomach", but "spleen" on line 2; list each label only once',
-        ),
         ("1 (none) 1 2 3 0\n", "expected names of labels, found none"),
         (
             "label,name\n1,a\n2147483648,b\n",
@@ -162,6 +211,60 @@ def test_what_is_refused(tmp_path, text, match):
     with refusal(match) as caught:
         table_of(tmp_path, text)
     assert str(caught.value).startswith(str(tmp_path / "table.txt"))
+
+
+def test_a_label_with_two_names_has_none(tmp_path):
+    with pytest.warns(UserWarning, match='1, "spleen" .line 2. and "stomach" .line 4.'):
+        table = table_of(tmp_path, "label,name\n1,spleen\n2,liver\n1,stomach\n")
+    assert table.names == {2: "liver"}
+
+
+CARET = (
+    '<CaretExtension><VolumeInformation Index="0"><LabelTable><Label Key="819" Red="0.5" '
+    'Green="0.2" Blue="0.1" Alpha="1"><![CDATA[hypothalamus]]></Label></LabelTable>'
+    "</VolumeInformation></CaretExtension>"
+)
+
+
+@pytest.mark.parametrize("name", ["l.nii.gz", "l.nii", "l.img"])
+@pytest.mark.parametrize("code", [0, 30])
+def test_names_in_the_header_of_a_nifti(here, name, code):
+    kind = nibabel.Nifti1Pair if name == "l.img" else nibabel.Nifti1Image
+    file = kind(np.zeros((2, 3, 4), "u1"), np.eye(4))
+    nibabel.save(file, "none.nii")
+    file.header.extensions.append(nibabel.nifti1.Nifti1Extension(code, CARET.encode()))
+    nibabel.save(file, name)
+    table = load_label_table(name)
+    assert table == LabelTable({819: "hypothalamus"}, {819: (0.5, 0.2, 0.1)})
+    assert own_label_table(here / "none.nii") == NO_TABLE
+    assert_refused("none.nii", "found none", load_label_table)
+
+
+@pytest.mark.parametrize(
+    "text", [CARET.replace("Key", "Kee"), "<CaretExtension><</CaretExtension>"]
+)
+def test_a_header_without_readable_names_is_no_obstacle(here, text):
+    file = nibabel.Nifti1Image(np.zeros((2, 3, 4), "u1"), np.eye(4))
+    file.header.extensions.append(nibabel.nifti1.Nifti1Extension(0, text.encode()))
+    nibabel.save(file, "bad.nii")
+    with pytest.warns(UserWarning, match="bad.nii.*ignored"):
+        assert own_label_table(here / "bad.nii") == NO_TABLE
+
+
+@pytest.mark.parametrize(
+    ("name", "label", "of_label"),
+    [
+        ("totalsegmentator", 92, "rib_left_1"),
+        ("totalsegmentator_v1", 92, "sacrum"),
+        ("totalsegmentator_mr", 20, "intervertebral_discs"),
+        ("aseg", 2035, "ctx-rh-insula"),
+        ("simnibs", 5, "Scalp"),
+    ],
+)
+def test_tables_of_programs(here, name, label, of_label):
+    assert load_label_table(name).names[label] == of_label
+    (here / name).write_text("1 own\n")
+    assert load_label_table(name).names == {1: "own"}
 
 
 def test_other_files(here):

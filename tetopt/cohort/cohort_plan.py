@@ -26,6 +26,7 @@ from tetopt.cohort.subjects import (
 )
 from tetopt.errors import InputError
 from tetopt.io.formats import BUILT_IN
+from tetopt.io.label_tables import is_preset_table
 from tetopt.job.events import note
 from tetopt.job.option_values import file_and_volume, tissue_files
 from tetopt.job.options import JobOptions, RunOptions, given_options
@@ -151,7 +152,9 @@ def _missing(job: JobOptions) -> Iterator[str]:
     whole = {
         name: path
         for name in FILE_OPTIONS
-        if (path := getattr(job, name)) is not None and name != "tissues"
+        if (path := getattr(job, name)) is not None
+        and name != "tissues"
+        and not is_preset_table(path)
     }
     named += [*whole.items(), *(("tissues", path) for path in tissue_files(job.tissues))]
     for number, (name, path) in enumerate(named):

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tetopt.errors import InputError
+from tetopt.io.label_tables import is_preset_table
 from tetopt.model.mappings import FILES_IN_TEXTS, named_file
 from tetopt.system.files import save_text
 from tetopt.system.incoming import text_of
@@ -183,7 +184,10 @@ def with_files(options: dict[str, str], function: Callable[[str], Path | str]) -
     for name, text in options.items():
         if name in FILE_OPTIONS:
             files = text.split(",") if name == "tissues" else [text]
-            changed[name] = ",".join(str(function(file.strip())) for file in files)
+            changed[name] = ",".join(
+                file if is_preset_table(Path(file)) else str(function(file.strip()))
+                for file in files
+            )
         elif name in FILES_IN_TEXTS and named_file(text) is not None:
             changed[name] = str(function(text))
     return options | changed

@@ -1,41 +1,58 @@
-"""Label tables with names and colours: FreeSurfer, ITK-SNAP, 3D Slicer, BIDS, or any CSV,
-recognised by content.
+"""Tables of labels' names and colours, recognised by content.
 
-- FreeSurfer (FreeSurferColorLUT.txt) and 3D Slicer (.ctbl, .txt): label, name, red, green, blue,
-  opacity, 0 to 255.
+- FreeSurfer (FreeSurferColorLUT.txt, also with tissue types) and 3D Slicer (.ctbl, .txt): label,
+  name, red, green, blue, opacity, 0 to 255, or 0 to 1 with decimals.
+- MRtrix: label, abbreviation, name, red, green, blue, opacity.
 - ITK-SNAP: label, red, green, blue, opacity (0 to 1), two switches, and the name in quotation
   marks.
-- 3D Slicer's segmentations (.seg.nrrd) and DICOM's (SEG): the names and colours of their segments.
+- Two columns: label and name, separated by blanks, tabs, commas or semicolons.
 - BIDS (`*_dseg.tsv`), 3D Slicer's .csv, and other tables with column names in the first row,
   separated by tabs, commas or semicolons: columns for the label, the name, and optionally the
   colour, as "#rrggbb" or as three numbers.
+- nnU-Net's dataset.json: names by label, or labels by name.
+- FSL's atlas files (.xml): a label's number is its `value`, or else its `index`, plus 1 for a
+  probabilistic atlas, as in the atlas's maxprob images.
+- Segmentations with names of their own: 3D Slicer's (.seg.nrrd), DICOM's (SEG), and NIfTI with
+  names in a header extension, as of TotalSegmentator and Connectome Workbench.
+- The name of a program, for the table that it always uses (label_tables.toml).
 
-Lines that are empty or begin with # are skipped. Opacities are ignored.
+Lines that are empty or begin with # are skipped. Opacities are ignored. A label with two names has
+none.
 """
 
 from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
+from xml.etree import ElementTree
 
 from tetopt.contents.labels import LARGEST_LABEL, hex_colour
-from tetopt.errors import InputError, prefix_errors
+from tetopt.errors import InputError, Note, prefix_errors, warn
 from tetopt.io.itk_headers import NRRD_SUFFIXES, read_header
+from tetopt.io.nifti import NIFTI, label_text
 from tetopt.io.read_dicom import dicom_file, read_segments_table
 from tetopt.io.segments import segments_of, segments_table
 from tetopt.io.text import plain
 from tetopt.model.label_names import NO_TABLE, LabelTable
-from tetopt.system.incoming import irregular, text_of
+from tetopt.system.arrays import Json
+from tetopt.system.incoming import irregular, json_of, regular_file, text_of, toml_of
 
 __all__ = ["NO_TABLE", "LabelTable", "load_label_table"]
 
 SNAP_LINE = re.compile(
     r'\s*(\d{1,10})\s+(\d+)\s+(\d+)\s+(\d+)\s+([\d.eE+-]+)\s+([01])\s+([01])\s+"(.*)"\s*'
 )
-LUT_LINE = re.compile(r"\s*(\d{1,10})\s+(\S.*?)\s+(\d+)\s+(\d+)\s+(\d+)(?:\s+([\d.]+))?\s*")
+# A name has no separator, and does not end in two numbers, which would be further columns.
+PAIR_LINE = re.compile(
+    r'\s*(\d{1,10})(?:\s*[,;\t]\s*|\s+)(?!.*\s[\d.]+\s+[\d.]+\s*$)"?([^,;\t"]*[^,;\t"\s])"?\s*'
+)
+# A label, a name that may have blanks, and all numbers after it.
+LUT_LINE = re.compile(r"\s*(\d{1,10})[\s,;]+(\S.{0,1000}?)((?:[\s,;]+-?\d+(?:\.\d*)?){3,9})\s*")
+MOST_TISSUES = 9  # FreeSurfer's tissue types are below
 # Names of columns, in lower case without blanks; the first one present is used.
 LABEL_COLUMNS = ("labelvalue", "index", "id", "value", "labelid", "label", "labels")
 NAME_COLUMNS = (
@@ -53,26 +70,24 @@ NO_NAMES = ("", "(none)", "n/a")  # missing names in 3D Slicer and BIDS
 
 
 class LabelEntry(NamedTuple):
-    """A label in a line of the file."""
+    """A label in the file."""
 
-    line: int  # from 1
+    where: str  # its line, or what else finds it
     label: int
     name: str
-    colour: tuple[float, float, float] | None
+    colour: tuple[float, float, float] | None = None
 
 
 def load_label_table(path: str | Path) -> LabelTable:
     """Load names and colours of labels from a file.
 
-    Colour tables of FreeSurfer and 3D Slicer, label descriptions of ITK-SNAP, BIDS's `*_dseg.tsv`
-    and any CSV with column names in the first row are recognised by their content;
-    `tetopt.io.label_tables` lists the columns. So are segmentations with names of their own: 3D
-    Slicer's (.seg.nrrd) and DICOM's.
+    `tetopt.io.label_tables` lists the formats, which are recognised by content.
 
     Parameters
     ----------
     path : str or Path
-        A text file, or a segmentation.
+        A text file, a segmentation, or the name of a program: "totalsegmentator",
+        "totalsegmentator_v1", "totalsegmentator_mr", "aseg" (FreeSurfer, SynthSeg) or "simnibs".
 
     Returns
     -------
@@ -82,8 +97,12 @@ def load_label_table(path: str | Path) -> LabelTable:
     Raises
     ------
     InputError
-        The file does not exist or has another format; a line differs from the others; a label has
-        two names or two colours.
+        The file does not exist or has another format; a line differs from the others.
+
+    Warns
+    -----
+    UserWarning
+        A label has two names, and gets none.
 
     Examples
     --------
@@ -95,37 +114,52 @@ def load_label_table(path: str | Path) -> LabelTable:
     {1: 'liver', 2: 'spleen'}
     """
     path = Path(path)
+    if is_preset_table(path):
+        return LabelTable({int(label): name for label, name in _presets()[str(path)].items()}, {})
     if (table := own_label_table(path)).names:
         return table
-    if path.name.lower().endswith(NRRD_SUFFIXES) or dicom_file(path) is not None:
-        raise InputError(f"{path}: expected names of segments in this file, found none")
+    if path.name.lower().endswith((*NRRD_SUFFIXES, *NIFTI.suffixes)) or dicom_file(path):
+        raise InputError(f"{path}: expected names of labels or segments in its header, found none")
     text = text_of(path, "table of labels' names")
-    lines = [(number, line.strip(" ")) for number, line in enumerate(text.split("\n"), 1)]
-    lines = [(number, line) for number, line in lines if line.strip() and not line.startswith("#")]
-    if not lines:
-        raise InputError(f"{path}: expected a label and its name on each line, found no lines")
-    table = LabelTable({}, {})
-    of_label: dict[int, LabelEntry] = {}
-    for entry in _entries(path, lines):
-        if entry.label > LARGEST_LABEL:
-            raise InputError(
-                f"{path}, line {entry.line}: expected a label up to {LARGEST_LABEL}, got "
-                f"{entry.label}; correct it"
-            )
-        first = of_label.setdefault(entry.label, entry)
-        if first._replace(line=entry.line) != entry:
-            raise InputError(
-                f'{path}, line {entry.line}: label {entry.label} is "{entry.name}", but '
-                f'"{first.name}" on line '
-                f"{first.line}; list each label only once"
-            )
-        if entry.name not in NO_NAMES:
-            table.names[entry.label] = entry.name
-        if entry.colour is not None:
-            table.colours[entry.label] = entry.colour
+    parse = {"<": _of_xml, "{": _of_json}.get(text.lstrip()[:1], _of_text)
+    table = _table_of(path, parse(path, text))
     if not table.names:
         raise InputError(f"{path}: expected names of labels, found none")
     return table
+
+
+def is_preset_table(path: Path) -> bool:
+    """Return whether a path is no file but the name of a program with a fixed table of labels."""
+    return str(path) in _presets() and not path.exists()
+
+
+@cache
+def _presets() -> dict[str, Json]:
+    return toml_of(Path(__file__).with_suffix(".toml"), "table of presets")
+
+
+def _table_of(path: Path, entries: Iterable[LabelEntry]) -> LabelTable:
+    """Return the names and colours of entries; a label with two names has none."""
+    table = LabelTable({}, {})
+    first: dict[int, LabelEntry] = {}
+    doubled = {}
+    for entry in entries:
+        if entry.label > LARGEST_LABEL:
+            raise InputError(
+                f"{path}, {entry.where}: expected a label up to {LARGEST_LABEL}, got "
+                f"{entry.label}; correct it"
+            )
+        former = first.setdefault(entry.label, entry)
+        if former.name != entry.name:
+            words = (f'"{each.name}" ({each.where})' for each in (former, entry))
+            doubled[entry.label] = f"{entry.label}, {' and '.join(words)}"
+        if entry.name not in NO_NAMES:
+            table.names[entry.label] = entry.name
+        if entry.colour is not None:
+            table.colours.setdefault(entry.label, entry.colour)
+    if doubled:
+        warn(f"{path}: labels with two names get none: {'; '.join(doubled.values())}")
+    return table._replace(names={k: v for k, v in table.names.items() if k not in doubled})
 
 
 def own_label_table(path: Path) -> LabelTable:
@@ -140,38 +174,121 @@ def own_label_table(path: Path) -> LabelTable:
     with prefix_errors(path):
         if (file := dicom_file(path)) is not None:
             return read_segments_table(file)
-        if not path.name.lower().endswith(NRRD_SUFFIXES) or irregular(path) is not None:
+        name = path.name.lower()
+        if name.endswith(NIFTI.suffixes) and not path.is_dir():
+            text = label_text(regular_file(path, "image"))
+            try:
+                return _table_of(path, _of_xml(path, text)) if text else NO_TABLE
+            except InputError as error:
+                warn(f"{error}; names of labels in its header are ignored")
+                return NO_TABLE
+        if not name.endswith(NRRD_SUFFIXES) or irregular(path) is not None:
             return NO_TABLE
         return segments_table(segments_of(read_header(path).texts))
 
 
-def _entries(path: Path, lines: list[tuple[int, str]]) -> Iterator[LabelEntry]:
+def _of_json(path: Path, text: str) -> Iterator[LabelEntry]:
+    """Yield the labels of nnU-Net's dataset.json: {"1": "liver"} or {"liver": 1}."""
+    try:
+        words = json_of(text)
+    except ValueError as error:
+        raise InputError(f"{path}: expected JSON, got {error}") from error
+    labels = words.get("labels", words)
+    for key, value in labels.items() if isinstance(labels, dict) else ():
+        is_number = re.fullmatch(r"\d{1,10}", key) and isinstance(value, str)
+        label, name = (key, value) if is_number else (value, key)
+        if isinstance(label, bool) or re.fullmatch(r"\d{1,10}", str(label)) is None:
+            raise InputError(
+                f'{path}: expected one label for "{name}", as in nnU-Net\'s dataset.json, got '
+                f"{label}; regions have no names: give a table with the labels of the file"
+            )
+        yield LabelEntry(f'"{key}"', int(label), _one_line(name))
+
+
+def _of_xml(path: Path, text: str) -> Iterator[LabelEntry]:
+    """Yield the labels of FSL's atlas files, or of a CaretExtension."""
+    try:
+        root = ElementTree.fromstring(text)
+        kind = (root.findtext("header/type") or "").strip().lower()
+        is_shifted = kind.startswith("prob")
+        for each in root.iter():
+            if each.tag.lower() != "label":
+                continue
+            name = _one_line("".join(each.itertext()))
+            number = each.get("Key") or each.get("value")
+            label = int(number or each.attrib["index"]) + (is_shifted and not number)
+            tones = [each.get(tone, "") for tone in ("Red", "Green", "Blue")]
+            colour = _colour(path, name, tones, 1.0) if "" not in tones else None
+            yield LabelEntry(f'"{name}"', label, name, colour)
+    except (ElementTree.ParseError, KeyError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(
+            f"{path}: expected labels with numbers, as in FSL's atlas files, got {error}"
+        ) from error
+    if is_shifted:
+        warn(f"{path}: a probabilistic atlas: labels are index + 1, as in its maxprob images", Note)
+
+
+def _of_text(path: Path, text: str) -> Iterator[LabelEntry]:
     """Yield the labels of the lines, all in the format of the first line."""
+    lines = [(number, line.strip(" ")) for number, line in enumerate(text.split("\n"), 1)]
+    lines = [(number, line) for number, line in lines if line.strip() and not line.startswith("#")]
+    if not lines:
+        raise InputError(f"{path}: expected a label and its name on each line, found no lines")
     first = lines[0][1]
     if SNAP_LINE.fullmatch(first):
-        yield from _match_lines(
-            path, lines, SNAP_LINE, 'label, red, green, blue, opacity, 1, 1, "name", as in ITK-SNAP'
-        )
+        words = 'label, red, green, blue, opacity, 1, 1, "name", as in ITK-SNAP'
+        for where, (label, *tones, _, _, _, name) in _match_lines(path, lines, SNAP_LINE, words):
+            colour = _colour(path, where, tones, 255.0)
+            yield LabelEntry(where, int(label), _one_line(name), colour)
+    elif PAIR_LINE.fullmatch(first):
+        for where, (label, name) in _match_lines(path, lines, PAIR_LINE, "a label and its name"):
+            yield LabelEntry(where, int(label), _one_line(name))
     elif LUT_LINE.fullmatch(first):
         words = "label, name, red, green, blue, opacity, as in FreeSurfer and 3D Slicer"
-        yield from _match_lines(path, lines, LUT_LINE, words)
+        yield from _of_colours(path, list(_match_lines(path, lines, LUT_LINE, words)))
     else:
         yield from _of_columns(path, lines)
 
 
 def _match_lines(
     path: Path, lines: list[tuple[int, str]], pattern: re.Pattern[str], form: str
-) -> Iterator[LabelEntry]:
+) -> Iterator[tuple[str, tuple[str, ...]]]:
     for number, line in lines:
         if (match := pattern.fullmatch(line)) is None:
             raise InputError(f'{path}, line {number}: expected {form}, got "{line}"')
-        parts = match.groups()
-        tones, name = (
-            (parts[1:4], parts[7]) if pattern is SNAP_LINE else (parts[2:5], parts[1].strip('"'))
-        )
-        yield LabelEntry(
-            number, int(parts[0]), _one_line(name), _colour(path, number, tones, 255.0)
-        )
+        yield f"line {number}", match.groups()
+
+
+def _of_colours(path: Path, lines: list[tuple[str, tuple[str, ...]]]) -> Iterator[LabelEntry]:
+    """Yield the labels of lines with a label, a name and numbers: a colour, and what programs add
+    to it.
+    """
+    rows = [
+        (where, label, name.split(), re.split(r"[\s,;]+", numbers.strip(" \t,;")))
+        for where, (label, name, numbers) in lines
+    ]
+    long = [(*words, *map(float, numbers)) for *_, words, numbers in rows if len(numbers) > 4]
+    # The fifth number is a tissue type, unless names end in numbers, such as "rib 3".
+    has_types = (
+        all(len(row) == 6 and row[4] in (0.0, 255.0) for row in long)
+        and len({row[0] for row in long}) == len(long)
+        and 0.0 < max((row[-1] for row in long), default=0.0) <= MOST_TISSUES
+    )
+    # Names of two words seldom differ in both, as abbreviations and names do.
+    pairs = [words for *_, words, numbers in rows if (len(words), len(numbers)) == (2, 4)]
+    has_short = 1 < len(rows) == len(pairs) and all(
+        len(set(each)) == len(rows) for each in zip(*pairs, strict=True)
+    )
+    if has_short:
+        warn(f"{path}: read as MRtrix's: label, abbreviation, name, colour", Note)
+    whole = 1.0 if any("." in number for *_, numbers in rows for number in numbers[:3]) else 255.0
+    for where, label, words, numbers in rows:
+        n_kept = 0 if has_types else max(len(numbers) - 4, 0)
+        name = " ".join(words[has_short:] + numbers[:n_kept]).strip('"')
+        colour = _colour(path, where, numbers[n_kept:][:3], whole)
+        yield LabelEntry(where, int(label), _one_line(name), colour)
 
 
 def _of_columns(path: Path, lines: list[tuple[int, str]]) -> Iterator[LabelEntry]:
@@ -185,7 +302,7 @@ def _of_columns(path: Path, lines: list[tuple[int, str]]) -> Iterator[LabelEntry
     if label is None or name is None:
         raise InputError(
             f"{path}, line {lines[0][0]}: expected a label table of FreeSurfer, ITK-SNAP or 3D "
-            "Slicer, or a row of "
+            "Slicer, a label and its name on each line, or a row of "
             f'column names with "label" (or "index") and "name", got "{head[:60]}"'
         )
     tones = next((each for each in RGB_COLUMNS if all(part in columns for part in each)), ())
@@ -206,14 +323,15 @@ def _of_columns(path: Path, lines: list[tuple[int, str]]) -> Iterator[LabelEntry
             )
         colour = None
         if tones and any(cells.get(part, "") not in NO_NAMES for part in tones):
-            colour = _colour(path, number, [cells.get(part, "") for part in tones], whole)
+            tones_here = [cells.get(part, "") for part in tones]
+            colour = _colour(path, f"line {number}", tones_here, whole)
         elif code is not None and (text := cells.get(code, "")) not in NO_NAMES:
-            colour = hex_colour(text)
+            colour = hex_colour(f"#{text.removeprefix('#')}")
             if colour is None:
                 raise InputError(
                     f'{path}, line {number}: expected a colour as #rrggbb, got "{text}"'
                 )
-        yield LabelEntry(number, int(float(cells[label])), _one_line(cells[name]), colour)
+        yield LabelEntry(f"line {number}", int(float(cells[label])), _one_line(cells[name]), colour)
 
 
 def _cells(path: Path, number: int, line: str, separator: str) -> list[str]:
@@ -228,7 +346,7 @@ def _one_line(name: str) -> str:
 
 
 def _colour(
-    path: Path, line: int, texts: list[str] | tuple[str, ...], whole: float
+    path: Path, where: str, texts: Sequence[str], whole: float
 ) -> tuple[float, float, float]:
     """Parse a colour of three numbers from 0 to `whole`."""
     try:
@@ -237,7 +355,7 @@ def _colour(
         red = green = blue = -1.0
     if not all(0.0 <= part <= 1.0 for part in (red, green, blue)):
         raise InputError(
-            f"{path}, line {line}: expected red, green and blue from 0 to {whole:g}, got "
+            f"{path}, {where}: expected red, green and blue from 0 to {whole:g}, got "
             f"{', '.join(texts)}"
         )
     return red, green, blue

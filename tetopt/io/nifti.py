@@ -61,6 +61,7 @@ PLANES_BYTES = 2**28  # of a file, read at a time for a crop of it
 MGH_FLAG = slice(28, 30)  # the bytes of an MGH header that are 0 if it has no sizes and directions
 CIFTI_INTENTS = range(3000, 3100)  # of NIfTI-2 files without a grid of voxels
 PACKED_SUFFIXES = (".gz", ".mgz")
+CARET = re.compile(rb"<CaretExtension.*?</CaretExtension>", re.DOTALL)  # names of labels
 PAIR = re.compile(r"(.*)\.(hdr|img)(\.gz)?", re.IGNORECASE | re.DOTALL)
 HEADER_KINDS: dict[str, tuple[Any, ...]] = {
     ".nii": (nibabel.Nifti1Header, nibabel.Nifti2Header),
@@ -97,6 +98,19 @@ def read_nibabel(path: Path, request: Request) -> Voxels:
 def nibabel_shape(path: Path) -> Shape:
     """Return the lengths of all axes in the header."""
     return _shape_of(_header_of(_files_of(path)[0])[0])
+
+
+def label_text(path: Path) -> str:
+    """Return the XML of names of labels in a header's extensions, whatever their codes; empty
+    without any.
+    """
+    file, other = _files_of(path)
+    header, _ = _header_of(file)
+    if isinstance(header, MGHHeader):
+        return ""
+    size = EXTENSION_BYTES if file != other else int(header["vox_offset"])
+    match = CARET.search(_begin_of(file, size))
+    return "" if match is None else match[0].decode("utf-8", "replace")
 
 
 def _shape_of(header: Any) -> Shape:
@@ -169,15 +183,20 @@ def _note_nibabel() -> Iterator[None]:
         imageglobals.logger.removeFilter(keep)
 
 
-@_note_nibabel()
-def _header_of(path: Path) -> tuple[Any, bytes]:
-    """Return nibabel's header, checked and repaired, and the first bytes of the file."""
+def _begin_of(path: Path, n_bytes: int) -> bytes:
+    """Return the first bytes of a file, unpacked."""
     try:
         is_packed = path.name.lower().endswith(PACKED_SUFFIXES)
         with gzip.open(path) if is_packed else path.open("rb") as stream:
-            head = stream.read(NIFTI_HEAD_BYTES)
+            return stream.read(n_bytes)
     except FILE_ERRORS as error:
         raise _of_gzip(error) from error
+
+
+@_note_nibabel()
+def _header_of(path: Path) -> tuple[Any, bytes]:
+    """Return nibabel's header, checked and repaired, and the first bytes of the file."""
+    head = _begin_of(path, NIFTI_HEAD_BYTES)
     suffix = path.name.lower().removesuffix(".gz")[-4:]
     try:
         for kind in HEADER_KINDS[suffix]:

@@ -26,11 +26,11 @@ from tetopt.contents.probabilities import resample_tissue
 from tetopt.errors import InputError, Remark, prefix_errors
 from tetopt.image import Image
 from tetopt.io.images import load_image, parse_crop, parse_slice, part_of, reader_of
-from tetopt.io.label_tables import load_label_table
 from tetopt.io.read_dicom import frame_of_reference
 from tetopt.io.stacks import parse_spacing
 from tetopt.io.text import list_names
 from tetopt.job.events import note, warning
+from tetopt.job.mesh_file import label_table
 from tetopt.job.option_values import file_and_volume
 from tetopt.job.options import BoxPart, ImagePart, MaskedPart, SourceOptions
 from tetopt.model.file import MeshFile, count_of_other_voxels, own_mask
@@ -249,10 +249,7 @@ def read_mask(
     if words is None:
         return {(path, resample_mask): mask}
     mask = check_labels(str(path), mask, is_map=True)
-    table = names_of
-    if table is None and str(path).lower().endswith((".seg.nrrd", ".dcm")):
-        table = path
-    names = {} if table is None else load_label_table(table).names
+    names = label_table(names_of, labels_path=path).names
     present = np.unique(mask.data).astype(np.int64)
     chosen = list[int]()
     for word in words.split(","):

@@ -64,9 +64,10 @@ LabelNamesOption = Annotated[
     Path | None,
     Option(
         "TABLE",
-        "Names and colours of labels, kept in the mesh's file: FreeSurfer, ITK-SNAP, 3D Slicer "
-        "(also .seg.nrrd), "
-        "DICOM SEG, BIDS dseg.tsv, or CSV (default: those in the file of labels).",
+        "Names and colours of labels, kept in the mesh's file: a table of FreeSurfer, ITK-SNAP, "
+        "3D Slicer, MRtrix, BIDS, nnU-Net or FSL, or CSV; a segmentation with names of its own; or "
+        "totalsegmentator, totalsegmentator_v1, totalsegmentator_mr, aseg, simnibs (default: those "
+        "in the file of labels).",
     ),
 ]
 SpaceOption = Annotated[str, Option("ras|lps", "Coordinate convention of the file.")]

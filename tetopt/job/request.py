@@ -13,6 +13,7 @@ from typing import Any
 
 import tetopt
 from tetopt.io.images import sha256, status_checksum
+from tetopt.io.label_tables import is_preset_table
 from tetopt.job.option_values import file_and_volume, tissue_files
 from tetopt.job.options import (
     JobOptions,
@@ -70,7 +71,9 @@ def _files(name: str, value: Any) -> list[Path]:
     if name == "tissues":
         return tissue_files(value)
     return [
-        each for each in (value if isinstance(value, list) else [value]) if isinstance(each, Path)
+        each
+        for each in (value if isinstance(value, list) else [value])
+        if isinstance(each, Path) and not is_preset_table(each)
     ]
 
 
