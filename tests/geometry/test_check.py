@@ -4,9 +4,12 @@ import re
 
 import numpy as np
 import pytest
+from models import sample_image
+from refusals import refusal
 
 import tetopt
 from tetopt import Image, Mesh, check_mesh, lattice_mesh
+from tetopt.contents.content import content
 from tetopt.geometry.check import check_unfolded
 from tetopt.measure.fidelity import cell_labels
 from tetopt.start.carve import part_of
@@ -68,6 +71,41 @@ def test_beyond_the_box():
     assert check_mesh(out, IMAGE, is_filled=False) == [words]
     assert words in check_mesh(out, IMAGE)
     assert check_mesh(out) == []
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda image, mesh: tetopt.mesh_image(image, start=mesh, iterations=0),
+        lambda image, mesh: tetopt.optimize(image, mesh, iterations=1),
+        lambda image, mesh: tetopt.build_model(mesh, image, young="h+1"),
+        lambda image, mesh: tetopt.build_model(mesh, content(image), young=3.0),
+        lambda image, mesh: tetopt.cell_fields(mesh, image),
+        lambda image, mesh: tetopt.cell_labels(Image(1.0 * (image.data > 0), image.affine), mesh),
+        lambda image, mesh: tetopt.field_on_image(mesh, mesh.points, image),
+    ],
+)
+def test_a_mesh_elsewhere_is_no_mesh_of_an_image(use, n):
+    image = sample_image(n)
+    mesh = tetopt.lattice_mesh(image, nodes=40)
+    with refusal("same world coordinates"):
+        use(image, Mesh(mesh.points + 1e3, mesh.cells))
+    with refusal(f"{n}-D"):
+        use(sample_image(5 - n), mesh)
+
+
+def test_a_mesh_partly_elsewhere_violates_the_box_and_is_warned_of():
+    """Where `check_mesh` says no, a run that begins with the mesh does, too."""
+    image = sample_image()
+    mesh = tetopt.lattice_mesh(image, nodes=40)
+    half = Mesh(mesh.points + 0.5 * np.ptp(mesh.points, axis=0) * [1, 0, 0], mesh.cells)
+    words = r"\d% of the nodes lie outside"
+    with pytest.warns(UserWarning, match=words):
+        result = tetopt.mesh_image(image, start=half, iterations=1, k_D=0.1)
+    assert list(result.violated) == ["box"]
+    assert any("beyond" in line for line in check_mesh(result.mesh, image, is_filled=False))
+    with pytest.warns(UserWarning, match=words):
+        tetopt.build_model(half, image, young=2.0)
 
 
 def cubes(labels):

@@ -16,7 +16,7 @@ from unittest import mock
 import numpy as np
 
 # Functions of `os` that change what is in folders; the first argument is a path or an open file.
-STEPS = "open fsync replace rename unlink remove chmod chown mkdir rmdir"
+STEPS = "open fsync link replace rename unlink remove chmod chown mkdir rmdir"
 ALLOCATIONS = "empty zeros ones full empty_like zeros_like arange concatenate column_stack"
 
 

@@ -1,5 +1,6 @@
 """`tetopt.run` from Python: the files of the command, to the byte, and what it tells meanwhile."""
 
+import errno
 import os
 import warnings
 from contextlib import chdir
@@ -217,3 +218,50 @@ def test_a_run_cut_short_writes_its_mesh_before_anything_else(monkeypatch, suffi
         assert set(np.unique(seen[0].cell_data["label"])) == {0, 1}
         assert len(seen[-1].mesh.cells) == len(result.mesh.cells)
     assert sorted(os.listdir()) == ["a.nii", "l.nii", f"out{suffix}"]
+
+
+@pytest.mark.parametrize("suffix", [".vtu", ".inp"])
+@pytest.mark.parametrize("is_short", [True, False])
+def test_files_that_appear_during_a_run_stay_and_the_run_is_beside_them(suffix, is_short):
+    """Mesh, numbers and pictures; also of a run that keeps its mesh early, and of two runs."""
+    tetopt.save_image("a.nii", sample_image(3))
+    outputs = {"output": f"a{suffix}", "json_path": "a.json", "figures": "f"}
+    job = tetopt.Job(images="a.nii", nodes=60, iterations=2, **outputs)
+    names = [f"a{suffix}", "a.json", "f/slice.png"]
+    asks = []
+
+    def appear(event):
+        if event.kind == "started" and event.data.name == "optimise":
+            for name in names:
+                Path(name).write_text("other")
+
+    with pytest.raises(tetopt.InputError, match="appeared") as told:
+        tetopt.run(job, appear, stop=lambda: is_short and (asks.append(1) or len(asks) > 3))
+    assert [Path(name).read_text() for name in names] == ["other"] * 3
+    others = [f"a_1{suffix}", "a_1.json", "f/slice_1.png"]
+    assert all(name in str(told.value) for name in others)
+    assert numbers_in("a_1.json")["ended"] == ("stopped" if is_short else "iterations")
+    assert b"other" not in [Path(name).read_bytes() for name in others]
+    assert {name for name in os.listdir() if name[0] == "a"} == {"a.nii", *names[:2], *others[:2]}
+
+
+def test_a_full_disk_leaves_the_first_copy_of_the_mesh_and_one_line_says_where(monkeypatch):
+    """It has the labels of its cells; what needs more room does not replace it."""
+    phantom = tetopt.load_phantom("sphere")
+    tetopt.save_image("a.nii", phantom.image(voxel_mm=8))
+    tetopt.save_image("l.nii", phantom.label_image(voxel_mm=8))
+    write, sizes, told = Path.write_bytes, [], []
+
+    def full(path, data):
+        sizes.append(len(data))
+        if len(sizes) > 1:  # than the first copy needs
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return write(path, data)
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    job = tetopt.Job(images="a.nii", labels="l.nii", output="a.vtu", nodes=100, iterations=1)
+    with pytest.raises(tetopt.InputError, match=r"is in a_optimised_1\.vtu"):
+        tetopt.run(job, lambda event: told.append(event.text))
+    loaded = tetopt.load_mesh("a_optimised_1.vtu")
+    assert set(np.unique(loaded.cell_data["label"])) == {0, 1}
+    assert not any("cannot be saved" in text for text in told)

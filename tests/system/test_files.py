@@ -19,8 +19,11 @@ from attacks import content
 from tetopt.errors import InputError
 from tetopt.system.files import (
     check_output,
+    check_places,
     check_space,
+    folder_written_whole,
     name_files,
+    output_place,
     outputs_of_command,
     results_folder,
     save_bytes,
@@ -159,6 +162,47 @@ def test_a_new_output_appears_and_may_be_written_again(tmp_path):
             assert path.read_bytes() == text
     assert outputs.written == [path]  # told once
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("has_links", [True, False])
+@pytest.mark.parametrize("name", ["a.vtu", "a.b.vtu", "m" * 251 + ".vtu"])
+def test_a_file_that_appears_stays_and_the_output_is_beside_it(
+    tmp_path, monkeypatch, has_links, name
+):
+    """Also where files have one name only; and what is written again replaces the output."""
+    if not has_links:
+        monkeypatch.setattr(os, "link", failing(errno.EPERM, "Operation not permitted"))
+    path = tmp_path / name
+    with outputs_of_command() as outputs:
+        check_output(path, VTU)
+        path.write_bytes(b"other")
+        for text in (b"new", b"newer"):
+            save_bytes(path, text)
+        beside = output_place(path)
+        with pytest.raises(InputError, match="appeared") as told:
+            check_places(outputs)
+    assert (beside != path, beside.suffix, str(beside) in str(told.value)) == (True, ".vtu", True)
+    assert content(tmp_path) == {name: b"other", beside.name: b"newer"}
+    assert outputs.written == [beside]
+    with outputs_of_command() as outputs:
+        check_output(path, VTU, force=True)
+        save_bytes(path, b"forced")
+        check_places(outputs)
+    assert path.read_bytes() == b"forced"
+
+
+def test_a_folder_that_appears_stays_too(tmp_path):
+    path = tmp_path / "a.zarr"
+    with outputs_of_command():
+        check_output(path, (".zarr",), is_ours=Path.is_dir)
+        path.mkdir()
+        (path / "x").write_bytes(b"other")
+        with folder_written_whole(path) as folder:
+            (folder / "x").write_bytes(b"new")
+        assert output_place(path) == tmp_path / "a_1.zarr"
+    assert (path / "x").read_bytes() == b"other"
+    assert (tmp_path / "a_1.zarr" / "x").read_bytes() == b"new"
+    assert len(os.listdir(tmp_path)) == 2
 
 
 def test_no_output_is_an_input_or_another_output(tmp_path, monkeypatch):

@@ -29,7 +29,7 @@ from tetopt.cli.console import (
 from tetopt.cli.ending import INTERRUPTED_CODE, signal_code, signals_heard, tell_end
 from tetopt.errors import InputError, error_words
 from tetopt.job.events import listen_with
-from tetopt.system.files import Outputs, outputs_of_command
+from tetopt.system.files import Outputs, check_places, outputs_of_command
 from tetopt.system.interpreter import THREADS_NAME
 
 # Commands in the order of the help, with the modules that define NAME_command; only the running
@@ -154,6 +154,7 @@ def _run(arguments: list[str], outputs: Outputs) -> int:
     """
     try:
         code = _app(arguments)(args=arguments, obj=arguments, standalone_mode=False) or 0
+        check_places(outputs)
         return tell_end() if code in (INTERRUPTED_CODE, signal_code()) else code
     except (InputError, OSError, MemoryError) as error:
         show_error(error_words(error), arguments)

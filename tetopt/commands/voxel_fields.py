@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tetopt.commands.conversion import with_results
 from tetopt.contents.labels import is_label_map
-from tetopt.errors import InputError
+from tetopt.errors import InputError, prefix_errors
 from tetopt.image import Image
 from tetopt.io.images import OUTPUT_SUFFIXES, save_image, save_voxels
 from tetopt.job.aligned import read_companion
@@ -20,7 +20,7 @@ from tetopt.model.fields import half_turned_fields
 from tetopt.model.file import MeshFile, words_of_other_box
 from tetopt.model.on_image import At, field_on_image, warped_image
 from tetopt.report.summary import versions
-from tetopt.system.arrays import Bools, Json
+from tetopt.system.arrays import Json
 
 
 def is_image_name(path: Path) -> bool:
@@ -80,9 +80,9 @@ def write_on_image(
         has_axes = turned is not values  # of a vector or tensor in RAS+
         values = turned if space == "lps" else values
         outside = np.nan if options.outside is None else options.outside
-        on_voxels = field_on_image(loaded.mesh, values, image, at=at)
+        with prefix_errors(f"{mesh} and {path}"):
+            on_voxels = field_on_image(loaded.mesh, values, image, at=at)
         inside = np.isfinite(on_voxels.reshape(*image.shape, -1)[..., 0])
-        _check_any(inside, f"{mesh} and {path}")
         on_voxels[~inside] = outside
         save_voxels(output, on_voxels, image)
         words = name
@@ -104,7 +104,6 @@ def write_on_image(
         moved = warped_image(
             loaded.mesh, values, other, image, is_nearest=options.nearest, outside=outside
         )
-        _check_any(inside, f"{mesh} and {path}")
         save_image(output, moved)
         on_voxels = moved.data.astype(np.float64)
         words += ", nearest voxels" if options.nearest else ", linear between voxels"
@@ -195,10 +194,3 @@ def _field_of(
             f"`warp`: expected a displacement of nodes, but {name} in {mesh} is {kind}"
         )
     return name, values, at
-
-
-def _check_any(inside: Bools, what: str) -> None:
-    if not inside.any():
-        raise InputError(
-            f"{what}: no voxel centre is inside the mesh; do both use the same world coordinates?"
-        )

@@ -53,6 +53,7 @@ from tetopt.engine.sliding import _fill_offsets, fill_offsets
 from tetopt.engine.smooth import _attract, attract, blocks, sweep
 from tetopt.engine.state import angle_limit_of, content_energies, state_of, with_min_dihedral
 from tetopt.errors import InputError
+from tetopt.geometry.check import outside_fraction
 from tetopt.geometry.manifold import OUTSIDE_LABEL
 from tetopt.geometry.simplex import regular_edge, volumes
 from tetopt.image import Image, transform_vectors
@@ -194,6 +195,7 @@ def optimize(
     begin = time.perf_counter()
     is_over = deadline(begin, max_seconds, stop)
     content = plain(image)
+    outside_fraction(mesh, content.given)
     sizes = (Sizes() if sizes is None else sizes).prepared(content.image.ndim)
     run = Run(content, mesh, k_D, shape_power, boundary, is_graded=nodes is not None)
     min_dihedral = min_dihedral if run.n == 3 else 0.0

@@ -52,6 +52,7 @@ from tetopt.engine.loop import (
 )
 from tetopt.engine.paper import optimize_paper
 from tetopt.errors import InputError
+from tetopt.geometry.check import check_place
 from tetopt.geometry.quadratic import node_count
 from tetopt.image import Image
 from tetopt.measure.judge import (
@@ -229,6 +230,8 @@ def mesh_image(
             )
         image = make_content(image, labels, mask)
     image = plain(image)
+    if start is not None:
+        check_place(start, image.given)
     aim = Aim(nodes, target_error, sizes, order, mode, start, spacing, kind, nodes_max)
     result = search_mesh(image, aim, k_D=k_D, iterations=iterations, **options)
     return result._replace(content=image, order=order)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tetopt.errors import InputError
+from tetopt.errors import InputError, warn
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides, facets_on_sides
 from tetopt.geometry.manifold import OUTSIDE_LABEL, pinches
 from tetopt.geometry.quadratic import (
@@ -24,6 +24,10 @@ from tetopt.system.arrays import Bools, Floats, Ints
 if TYPE_CHECKING:
     from tetopt.image import Image
     from tetopt.mesh import Mesh
+
+OUTSIDE_VOXELS = 1.0  # beyond the image's box, from which a node lies outside
+# how far nodes of a file with few digits may lie beyond the box of a mesh that need not fill it
+BEYOND_VOXELS = 1e-3
 
 
 def check_mesh(
@@ -281,10 +285,41 @@ def beyond_box(mesh: Mesh, image: Image) -> Floats:
     return np.asarray(np.maximum(low - index, index - high).max(axis=1))
 
 
+def outside_fraction(mesh: Mesh, image: Image) -> float:
+    """Return the fraction of a mesh's nodes more than a voxel outside the image's box.
+
+    Raises
+    ------
+    InputError
+        Mesh and image of different dimension, or in different places: no node lies in the box.
+    """
+    if mesh.ndim != image.ndim:
+        raise InputError(f"expected a {image.ndim}-D mesh like the image, got a {mesh.ndim}-D mesh")
+    outside = float((beyond_box(mesh, image) > OUTSIDE_VOXELS).mean())
+    if outside == 1.0:
+        raise InputError(
+            "the mesh lies outside the image: no node lies in the image's box; do both use the "
+            "same world coordinates (mm, RAS+)?"
+        )
+    return outside
+
+
+def check_place(mesh: Mesh, image: Image) -> None:
+    """Raise InputError for a mesh outside the image, as `outside_fraction`; warn of one partly
+    outside.
+    """
+    if (outside := outside_fraction(mesh, image)) > 0.0:
+        warn(
+            f"{outside:.1%} of the nodes lie outside the image or its mask: cells there take the "
+            "nearest voxel's value"
+        )
+
+
 def _problems_with_box(mesh: Mesh, image: Image, is_filled: bool) -> list[str]:
     problems = []
     beyond = beyond_box(mesh, image)
-    if len(outside := np.flatnonzero(beyond > ON_SIDE_VOXELS)):
+    most = ON_SIDE_VOXELS if is_filled else BEYOND_VOXELS
+    if len(outside := np.flatnonzero(beyond > most)):
         problems.append(
             f"nodes up to {beyond.max():.3g} voxels beyond the image's box: {_first(outside)}"
         )

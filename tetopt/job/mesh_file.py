@@ -9,7 +9,6 @@ import numpy as np
 from tetopt.contents.align import SAME_BOX_VOXELS, SAME_GRID_VOXELS
 from tetopt.energy.sampling import overlap_of
 from tetopt.errors import InputError
-from tetopt.geometry.check import beyond_box
 from tetopt.image import Image
 from tetopt.io.images import sha256
 from tetopt.io.label_tables import LabelTable, load_label_table, own_label_table
@@ -44,25 +43,6 @@ def check_overlap(path: Path, mesh: Mesh, image: Image) -> None:
     if (overlap := overlap_of(image, mesh)) is not None:
         raise InputError(
             f"{path}: {overlap}; remove one cell of each pair, or mesh the image again"
-        )
-
-
-def check_place(what: str, mesh: Mesh, image: Image) -> None:
-    """Raise InputError for a mesh outside the image; warn of one partly outside."""
-    if mesh.ndim != image.ndim:
-        raise InputError(
-            f"{what}: expected a {image.ndim}-D mesh like the image, got a {mesh.ndim}-D one"
-        )
-    outside = float((beyond_box(mesh, image) > 1.0).mean())
-    if outside == 1.0:
-        raise InputError(
-            f"{what}: the mesh lies outside the image: no node lies in the image's box; do both "
-            "use the same world coordinates (mm, RAS+)?"
-        )
-    if outside > 0.0:
-        warning(
-            f"{what}: {outside:.1%} of the nodes lie outside the image or its mask: cells there "
-            "take the nearest voxel's value"
         )
 
 

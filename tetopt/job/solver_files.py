@@ -6,19 +6,20 @@ import re
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
 from typing import cast, get_args
 
 import numpy as np
 
 import tetopt
-from tetopt.errors import InputError, error_words
+from tetopt.engine.loop import MeshingResult
+from tetopt.errors import InputError, error_words, prefix_errors
+from tetopt.geometry.check import check_place
 from tetopt.image import Image
 from tetopt.io.formats import FIELDS, FORMATS, file_bytes, format_of, save_mesh, save_model
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.events import note, warning, warnings_heard
-from tetopt.job.mesh_file import check_place, label_table
+from tetopt.job.mesh_file import label_table
 from tetopt.job.options import ModelOptions, SolverOptions
 from tetopt.mesh import Mesh
 from tetopt.model.averages import DEFAULT_AVERAGE, parse_average
@@ -44,7 +45,7 @@ from tetopt.model.sets import (
     standard_names,
 )
 from tetopt.system.arrays import Ints, Json
-from tetopt.system.files import kept_places
+from tetopt.system.files import kept_places, output_place
 
 MEAN_FIELD = r"mean(_\d+)?"  # of the image, and of further contrasts
 SET_GROUPS = ("labels", "interfaces", "boundary")  # groups of the sets that every mesh has
@@ -251,7 +252,8 @@ def convert_model(
     implausible units.
     """
     if image is not None:
-        check_place("mesh and image", loaded.mesh, image)
+        with prefix_errors("mesh and image"), warnings_heard():
+            check_place(loaded.mesh, image)
         fields = loaded.cell_data | cell_fields(loaded.mesh, image)
         loaded = loaded._replace(cell_data=fields)
     table = label_table(options.label_names, loaded)
@@ -379,8 +381,8 @@ def keep_early(mesh: Mesh, labels: Ints | None, places: Iterable[Path]) -> Path 
         except (OSError, MemoryError, InputError) as error:  # as of a format that needs materials
             reason = error_words(error)
         else:
-            return place
-    note(f"cannot save a copy of the optimised mesh before its file is written: {reason}")
+            return output_place(place)
+    note(f"cannot save a copy of the optimised mesh: {reason}")
     return None
 
 
@@ -393,45 +395,30 @@ def drop_early(early: Path) -> None:
 
 
 def save_anyway(
-    output: Path, mesh: Mesh, build: Callable[[], Model], error: Exception, early: Path | None
+    output: Path,
+    result: MeshingResult,
+    build: Callable[[], Model],
+    error: Exception,
+    early: Path | None,
 ) -> None:
-    """Save an optimised mesh whose file was rejected or failed, as VTU: beside it, else in a
-    temporary folder.
+    """Keep an optimised mesh whose file was rejected or failed, as VTU: in `early`, its copy, if
+    there is one; else beside it, else in a temporary folder.
 
-    `build` makes the model to keep; if that also fails, the mesh alone is kept, as in `early` if
-    that is a path.
+    `build` makes the model to keep; if that fails, the mesh and its labels are kept.
 
     Raises
     ------
     InputError
         If the user can fix `error`; the message says where the mesh is.
     """
-    places = chain([] if early is None else [early], kept_places(output))
-    kept = _keep_mesh(
-        places, (lambda path: save_model(path, build()), lambda path: save_mesh(path, mesh))
-    )
-    where = (
-        "could not be saved anywhere"
-        if kept is None
-        else f"is in {kept}: continue from there with tetopt convert"
-    )
+    kept = early or keep_early(result.mesh, result.labels, kept_places(output))
+    where = "could not be saved anywhere"
+    if kept is not None:
+        where = f"is in {kept}: continue from there with tetopt convert"
+        try:
+            save_model(kept, build())
+        except Exception as failed:  # noted; the earlier error is raised at the end
+            note(f"{kept}: holds the mesh and the labels of its cells: {error_words(failed)}")
     if isinstance(error, InputError | OSError | MemoryError):
         raise InputError(f"{error_words(error)}; the optimised mesh {where}") from error
     note(f"the optimised mesh {where}")
-
-
-def _keep_mesh(places: Iterable[Path], ways: Sequence[Callable[[Path], None]]) -> Path | None:
-    """Return the first place where one of the ways to save a mesh succeeds, or where it was
-    saved before.
-    """
-    for path in places:
-        for save in ways:
-            try:
-                save(path)
-            except Exception as error:  # noted; the earlier error is raised at the end
-                note(f"{path}: the optimised mesh cannot be saved here: {error_words(error)}")
-            else:
-                return path
-        if path.exists():
-            return path
-    return None

@@ -45,7 +45,7 @@ from tetopt.report.summary import run_summary
 from tetopt.start.sizes import edge_ratios
 from tetopt.system.arrays import Arrays, Json
 from tetopt.system.budget import peak_bytes, return_freed
-from tetopt.system.files import kept_places, save_bytes
+from tetopt.system.files import kept_places, output_place, save_bytes
 
 
 def model_with(
@@ -125,10 +125,10 @@ def save_outcome(task: Task, outcome: Meshed, failed: dict[str, str]) -> tuple[M
 
         kept = early
         early = None
-        save_anyway(job.output, result.mesh, bare, error, kept)
+        save_anyway(job.output, result, bare, error, kept)
         raise
     finally:
-        if early is not None and early != job.output:
+        if early is not None and early != output_place(job.output):
             drop_early(early)
     return model, about
 

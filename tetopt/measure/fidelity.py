@@ -31,7 +31,7 @@ from tetopt.contents.labels import (
 )
 from tetopt.energy.sampling import Overlap, cell_moments, cell_of_voxel, nearest_values, overlap_of
 from tetopt.errors import InputError
-from tetopt.geometry.check import facets_on_box
+from tetopt.geometry.check import facets_on_box, outside_fraction
 from tetopt.geometry.manifold import OUTSIDE_LABEL
 from tetopt.geometry.nearest import triangle_distances
 from tetopt.geometry.simplex import centroids, volumes
@@ -461,6 +461,7 @@ def cell_labels(labels: Image, mesh: Mesh) -> Ints:
     [1063, 137]
     """
     labels = check_labels("labels", labels)
+    outside_fraction(mesh, labels)
     nearest = nearest_values(labels, centroids(mesh.points, mesh.cells)).astype(np.int64)
     values, rows, nearest = by_row(labels_in_mask(labels, None), nearest)
     return values[_most_frequent(rows, cell_of_voxel(labels, mesh), nearest)]

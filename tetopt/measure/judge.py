@@ -30,8 +30,7 @@ from tetopt.contents.memberships import supersampling
 from tetopt.energy.discretization import content_E_D, unexplained_variance
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.errors import InputError, warn
-from tetopt.geometry.box import ON_SIDE_VOXELS
-from tetopt.geometry.check import beyond_box, manifold_problems
+from tetopt.geometry.check import BEYOND_VOXELS, beyond_box, manifold_problems
 from tetopt.geometry.manifold import OUTSIDE_LABEL
 from tetopt.geometry.simplex import dihedral_angles, edge_pairs, squared_edges
 from tetopt.geometry.topology import components
@@ -191,13 +190,13 @@ def _take_measure(measure: Callable[[], Any]) -> Any:
 def judge(rows: dict[str, Any], required: Requirements) -> dict[str, str]:
     """Return, by name, a sentence on each requirement that measured `rows` violate.
 
-    `min_dihedral`: tetrahedra with a smaller dihedral angle. `box`: nodes farther beyond the
-    image's box than the initial mesh's. `cover`: voxels or volume lost or gained. Within a mask,
-    instead of the last, `overlap`: voxels that lie in two cells; `mask`: a Dice with the mask below
-    0.9; and `components`: more connected components than the mask, or components of the mask, or
-    parts far from any cell, of 50 voxels or more without a cell. `manifold`: edges or nodes at
-    which the boundary, within a mask or of the user's own mesh, or the interface of two labels is
-    not a manifold. `labels`: labels of 200 voxels or more without a cell at one of them, or with
+    `min_dihedral`: tetrahedra with a smaller dihedral angle. `box`: nodes beyond the
+    image's box. `cover`: voxels or volume lost or gained. Within a mask, instead of the last,
+    `overlap`: voxels that lie in two cells; `mask`: a Dice with the mask below 0.9; and
+    `components`: more connected components than the mask, or components of the mask, or parts far
+    from any cell, of 50 voxels or more without a cell. `manifold`: edges or nodes at which the
+    boundary, within a mask or of the user's own mesh, or the interface of two labels is not a
+    manifold. `labels`: labels of 200 voxels or more without a cell at one of them, or with
     0.6 to 1.5 times their volume exceeded, or components of 50 voxels or more without a cell.
     `error`: more unexplained variance than allowed. One that cannot be checked counts as violated,
     with the reason.
@@ -231,10 +230,14 @@ def _say_min_dihedral(angles: Floats, required: Requirements) -> str:
 
 
 def _say_box(beyond: tuple[float, float], _: Requirements) -> str:
-    if beyond[0] <= max(beyond[1], 0.0) + ON_SIDE_VOXELS:
+    if beyond[0] <= BEYOND_VOXELS:
         return ""
-    words = f"nodes lie up to {beyond[0]:.3g} voxels beyond the image's box"
-    return f"{words}; please report this"
+    remedy = (
+        "so do those of the initial mesh: mesh an image that holds it, or leave out its cells there"
+        if beyond[1] > BEYOND_VOXELS
+        else "please report this"
+    )
+    return f"nodes lie up to {beyond[0]:.3g} voxels beyond the image's box; {remedy}"
 
 
 def _say_cover(cover: Cover, _: Requirements) -> str:

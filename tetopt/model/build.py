@@ -11,6 +11,7 @@ from tetopt.contents.content import Content, continue_image
 from tetopt.contents.domain import mask_text
 from tetopt.engine.loop import MeshingResult
 from tetopt.errors import InputError, Note, warn
+from tetopt.geometry.check import check_place
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image
 from tetopt.measure.judge import warn_of_other_mask
@@ -184,10 +185,8 @@ def build_model(
     image, whole, about = _voxels(image, mesh, about or {})
     loaded = mesh if isinstance(mesh, MeshFile) else None
     mesh = mesh.mesh if isinstance(mesh, MeshFile) else mesh
-    if image is not None and image.ndim != mesh.ndim:
-        raise InputError(
-            f"image: expected a {mesh.ndim}-D image, like the mesh, got a {image.ndim}-D one"
-        )
+    if whole is not None:
+        check_place(mesh, whole)
     if loaded is not None:
         loaded = without_stale_results(loaded, is_stale=choices.is_new)
         box = loaded.box if box is None else box

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from tetopt.contents.content import Content, own_image
 from tetopt.energy.sampling import cell_moments_and_ranges
 from tetopt.errors import InputError
+from tetopt.geometry.check import outside_fraction
 from tetopt.geometry.quadratic import cell_edges, quadratic
 from tetopt.geometry.simplex import dihedral_angles, rho
 from tetopt.image import Image
@@ -77,7 +78,9 @@ def cell_fields(mesh: Mesh, image: Image | Content | None = None) -> Arrays:
     if isinstance(image, Content):
         warn_of_other_mask(mesh, image.own_mask)
     if image is not None:
-        moments, (low, high) = cell_moments_and_ranges(own_image(image), mesh)
+        own = own_image(image)
+        outside_fraction(mesh, own)
+        moments, (low, high) = cell_moments_and_ranges(own, mesh)
         fields |= {"mean": moments.mean, "variance": moments.variance, "n_voxels": moments.n_voxels}
         fields |= {"min": low, "max": high}
     fields["volume"] = mesh.cell_volumes

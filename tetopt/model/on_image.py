@@ -60,8 +60,9 @@ def field_on_image(
     Raises
     ------
     InputError
-        Another number of rows, or as many cells as nodes without `at`; values that are not numbers;
-        a curved cell that is folded; or the reasons of `cell_of_voxel`.
+        No voxel lies in the mesh; another number of rows, or as many cells as nodes without `at`;
+        values that are not numbers; a curved cell that is folded; or the reasons of
+        `cell_of_voxel`.
 
     See Also
     --------
@@ -90,7 +91,10 @@ def field_on_image(
     is_curved = order == 2 and mesh.midpoints is not None
     pieces, n_pieces = mesh.straight_pieces() if is_curved else (mesh, 1)
     owner = cell_of_voxel(image, pieces).ravel()
-    inside = np.flatnonzero(owner >= 0)
+    if len(inside := np.flatnonzero(owner >= 0)) == 0:
+        raise InputError(
+            "image: no voxel centre is inside the mesh; do both use the same world coordinates?"
+        )
     result = np.full((len(owner), rows.shape[1]), outside)
     if order == 0:
         result[inside] = rows[owner[inside]]

@@ -17,7 +17,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from contextvars import ContextVar
 from itertools import chain, count
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from tetopt.errors import InputError
 COMPARED_BYTES = 2**24  # compared at a time, which limits additional memory
 # letters of an output's name in its temporary name: the name may have the maximum length
 TEMPORARY_LETTERS = 40
+NUMBERED_LETTERS = 200  # the same in the name of an output whose own is taken
 # Errors of folders that cannot be synchronised at all, as on some network file systems.
 UNSYNCHRONISED = (errno.EINVAL, errno.ENOTSUP, errno.ENOSYS, errno.EACCES, errno.EPERM, errno.EBADF)
 
@@ -35,6 +36,8 @@ class Outputs(NamedTuple):
 
     named: list[Path]  # all files and folders that its options name, including inputs
     places: dict[Path, Path]  # for each checked output, its real place with links followed
+    new: set[Path]  # outputs that had no file: one that appears in their place stays
+    moved: dict[Path, Path]  # where these are then
     written: list[Path]  # checked outputs that have been written
     made: list[Path]  # folders created for the outputs
 
@@ -49,7 +52,7 @@ def outputs_of_command() -> Iterator[Outputs]:
     An output must not be one of the inputs, nor the same as another output. Folders made by
     `results_folder` that are empty at the end are removed.
     """
-    outputs = Outputs([], {}, [], [])
+    outputs = Outputs([], {}, set(), {}, [], [])
     token = _OUTPUTS.set(outputs)
     try:
         yield outputs
@@ -59,6 +62,27 @@ def outputs_of_command() -> Iterator[Outputs]:
             # it is not empty, has been replaced, or has an invalid name
             with suppress(OSError, ValueError):
                 folder.rmdir()
+
+
+def output_place(path: Path) -> Path:
+    """Return where an output is: elsewhere if a file has appeared in its place during the run."""
+    outputs = _OUTPUTS.get()
+    return path if outputs is None else outputs.moved.get(_absolute(path), path)
+
+
+def check_places(outputs: Outputs) -> None:
+    """Raise InputError if files have appeared in places of checked outputs, which are beside
+    them.
+    """
+    moved = {path: place for path, place in outputs.moved.items() if path in outputs.places}
+    if moved:
+        raise InputError(
+            "; ".join(
+                f"{place}: written here, as another file appeared as {path.name} during the run "
+                "and stays"
+                for path, place in moved.items()
+            )
+        )
 
 
 def present_outputs() -> Outputs | None:
@@ -72,9 +96,10 @@ def outputs_of_run(values: Iterable[Any]) -> Iterator[None]:
     if _OUTPUTS.get() is not None:
         yield
         return
-    with outputs_of_command():
+    with outputs_of_command() as outputs:
         name_files(values)
         yield
+        check_places(outputs)
 
 
 def name_files(values: Iterable[Any]) -> None:
@@ -157,6 +182,8 @@ def check_output(
     _check_folder(path, place.parent)
     if (outputs := _OUTPUTS.get()) is not None:
         outputs.places[_absolute(path)] = place
+        if before is None:
+            outputs.new.add(_absolute(path))
     return path
 
 
@@ -214,6 +241,9 @@ def written_whole(path: Path, n_bytes: int | None = None) -> Iterator[Path]:
     """Give a temporary path next to `path`, with its suffix, that replaces `path` when the block
     ends without error.
 
+    A file that has appeared since a command checked the output stays: this one is put beside it, as
+    `output_place` tells, and `check_places` raises an error at the command's end.
+
     After an error or an interruption, the previous file is unchanged. After a kill or a power cut,
     the old or the new file is whole, and a temporary file, whose name begins with a dot, may
     remain. The new file keeps the permissions and, where allowed, the group of the file that it
@@ -235,7 +265,10 @@ def written_whole(path: Path, n_bytes: int | None = None) -> Iterator[Path]:
         try:
             yield temporary
             _on_disk(temporary, place)
-            os.replace(temporary, place)
+            if not _is_new(path):
+                os.replace(temporary, place)
+            else:
+                _name_new(path, temporary, place, suffix, _link_file)
             _synchronise_folder(place.parent)
         finally:
             with suppress(OSError):  # then a hidden file remains, and the first error is reported
@@ -250,16 +283,69 @@ def _output(path: Path, n_bytes: int | None = None) -> Iterator[Path]:
     """
     outputs = _OUTPUTS.get()
     key = _absolute(path)
-    place = (
-        Path(os.path.realpath(path))
-        if outputs is None
-        else outputs.places.get(key, Path(os.path.realpath(path)))
-    )
+    place = Path(os.path.realpath(path))
+    if outputs is not None:
+        place = outputs.moved.get(key) or outputs.places.get(key, place)
     with telling(path, n_bytes, place.parent):
         yield place
+    path = output_place(path)
     if outputs is not None and key in outputs.places and path not in outputs.written:
         # once: a mesh is written first, and again with its measurements
         outputs.written.append(path)
+
+
+def _is_new(path: Path) -> bool:
+    outputs = _OUTPUTS.get()
+    return outputs is not None and _absolute(path) in outputs.new
+
+
+def _name_new(
+    path: Path,
+    temporary: Path,
+    place: Path,
+    suffix: str,
+    give_name: Callable[[Path, Path], None],
+) -> None:
+    """Give an output that had no file its name or, if another file has it by now, the next free
+    one.
+    """
+    stem = place.name.removesuffix(suffix)[:NUMBERED_LETTERS]
+    others = (place.with_name(f"{stem}_{number}{suffix}") for number in count(1))
+    for each in chain([place], others):
+        with suppress(FileExistsError):
+            give_name(temporary, each)
+            break
+    outputs = cast(Outputs, _OUTPUTS.get())
+    outputs.new.discard(_absolute(path))
+    if each != place:
+        outputs.moved[_absolute(path)] = path.with_name(each.name)
+
+
+def _link_file(temporary: Path, place: Path) -> None:
+    """Give a file its name; raise FileExistsError if another has it."""
+    try:
+        os.link(temporary, place)
+    except FileExistsError:
+        # network file systems may answer so after a link that succeeded
+        if os.stat(temporary).st_nlink == 1:
+            raise
+    except OSError:  # a file system without hard links: an empty file keeps the name
+        os.close(os.open(place, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
+        try:
+            os.replace(temporary, place)
+        except BaseException:
+            os.unlink(place)
+            raise
+
+
+def _rename_folder(temporary: Path, place: Path) -> None:
+    """Give a folder its name; raise FileExistsError if another file or folder with files has it."""
+    try:
+        os.rename(temporary, place)
+    except OSError as error:
+        if error.errno in (errno.ENOTEMPTY, errno.ENOTDIR):
+            raise FileExistsError(error.errno, error.strerror) from error
+        raise
 
 
 def _hidden_prefix(path: Path) -> str:
@@ -296,6 +382,9 @@ def folder_written_whole(path: Path) -> Iterator[Path]:
             for name in names:
                 _on_disk(Path(folder) / name)
         _take_rights(temporary, place)
+        if _is_new(path):
+            _name_new(path, temporary, place, path.suffix, _rename_folder)
+            return
         old = None
         if place.is_dir():
             old = _temporary_folder(stack, path, place.parent) / "old"
@@ -365,7 +454,10 @@ def kept_places(path: Path) -> Iterator[Path]:
     """
     names = chain([path.stem], (f"{path.stem}_optimised_{number}" for number in count(1)))
     places = (path.with_name(f"{name}.vtu") for name in names)
-    yield next(place for place in places if place != path and not os.path.lexists(place))
+    beside = next(place for place in places if place != path and not os.path.lexists(place))
+    if (outputs := _OUTPUTS.get()) is not None:
+        outputs.new.add(_absolute(beside))
+    yield beside
     for folder in (tempfile.gettempdir(), os.getcwd(), os.path.expanduser("~")):
         with suppress(OSError):  # the next one
             yield Path(tempfile.mkdtemp(prefix="tetopt-", dir=folder)) / f"{path.stem}.vtu"
