@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 OUTSIDE_VOXELS = 1.0  # beyond the image's box, from which a node lies outside
 # how far nodes of a file with few digits may lie beyond the box of a mesh that need not fill it
-BEYOND_VOXELS = 1e-3
+BOX_ROUNDING_VOXELS = 1e-3
 
 
 def check_mesh(
@@ -318,7 +318,7 @@ def check_place(mesh: Mesh, image: Image) -> None:
 def _problems_with_box(mesh: Mesh, image: Image, is_filled: bool) -> list[str]:
     problems = []
     beyond = beyond_box(mesh, image)
-    most = ON_SIDE_VOXELS if is_filled else BEYOND_VOXELS
+    most = ON_SIDE_VOXELS if is_filled else BOX_ROUNDING_VOXELS
     if len(outside := np.flatnonzero(beyond > most)):
         problems.append(
             f"nodes up to {beyond.max():.3g} voxels beyond the image's box: {_first(outside)}"

@@ -30,7 +30,7 @@ from tetopt.contents.memberships import supersampling
 from tetopt.energy.discretization import content_E_D, unexplained_variance
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.errors import InputError, warn
-from tetopt.geometry.check import BEYOND_VOXELS, beyond_box, manifold_problems
+from tetopt.geometry.check import BOX_ROUNDING_VOXELS, beyond_box, manifold_problems
 from tetopt.geometry.manifold import OUTSIDE_LABEL
 from tetopt.geometry.simplex import dihedral_angles, edge_pairs, squared_edges
 from tetopt.geometry.topology import components
@@ -230,11 +230,11 @@ def _say_min_dihedral(angles: Floats, required: Requirements) -> str:
 
 
 def _say_box(beyond: tuple[float, float], _: Requirements) -> str:
-    if beyond[0] <= BEYOND_VOXELS:
+    if beyond[0] <= BOX_ROUNDING_VOXELS:
         return ""
     remedy = (
         "so do those of the initial mesh: mesh an image that holds it, or leave out its cells there"
-        if beyond[1] > BEYOND_VOXELS
+        if beyond[1] > BOX_ROUNDING_VOXELS
         else "please report this"
     )
     return f"nodes lie up to {beyond[0]:.3g} voxels beyond the image's box; {remedy}"
