@@ -178,6 +178,7 @@ def test_fields_of_cells_are_written_as_asked(name, options, kept):
 def test_materials_sets_and_loads_are_those_of_python():
     """In tests/io/test_writers.py all of the model is in the file, and is read from it."""
     words = f"--young {MAPPING} --nu 0=0.45,1=0.3 --load compress:5% --set dark=below:20"
+    words = words.replace(MAPPING, f'"{MAPPING} kPa"')
     assert_done(f"convert mesh.vtu b.inp {words} --json b.json --units MPa --space lps")
     about = {"young": MAPPING, "nu": "0=0.45,1=0.3", "loads": ["compress:5%"]}
     model = tetopt.build_model(
@@ -418,6 +419,73 @@ def test_loads_on_what_only_the_final_mesh_may_have_are_no_early_error(here):
     assert here() == ["a.inp", "b.inp"]
 
 
+def step_numbers(text):
+    """The numbers of an input file's steps."""
+    found = re.findall(r"-?\d+\.\d+(?:e-?\d+)?", text.partition("*STEP")[2])
+    return np.array(found, dtype=float)
+
+
+MODULI = {  # texts of 2 MPa where it counts, beside their unit in the option
+    "2": "MPa",
+    "0.002 GPa": "kPa",
+    "2000000 Pa": "MPa",
+    "where(h < 1e9, 0*h + 2, 7)": "MPa",
+    "where(h < 1e9, 0*h + 2, 7) MPa": "Pa",
+    "0:2,100:2": "MPa",
+    "0:2,100:2 MPa": "kPa",
+    "0=2,1=2": "MPa",
+    "0=2 MPa,1=2000 kPa": "Pa",
+    "plain.csv": "MPa",
+    "named.csv": "kPa",
+    "named.toml": "Pa",
+}
+
+
+@pytest.mark.parametrize(("text", "units"), MODULI.items())
+def test_moduli_and_pressures_are_in_the_unit_of_the_file_or_their_own(text, units):
+    """What Python builds in kPa, and what is printed in the file's unit."""
+    Path("plain.csv").write_text("label,young\n0,2\n*,2\n")
+    Path("named.csv").write_text("label;Young [MPa]\n0;2\n*;2\n")
+    Path("named.toml").write_text('label = ["*"]\nyoung_MPa = [2]\n')
+    number = {"kPa": 500.0, "MPa": 0.5, "Pa": 5e5}[units]
+    loads = f"--load hold:superior --load pressure:inferior:{number}"
+    loads += ' --load "traction:left:1,2,3 kPa" --load "spring:right:5 Pa/mm"'
+    printed = run_command(f'convert mesh.vtu a.inp --units {units} --young "{text}" {loads}').out
+    model = tetopt.build_model(
+        load_mesh("mesh.vtu"),
+        young=2000.0,
+        loads=[
+            "hold:superior",
+            "pressure:inferior:500",
+            "traction:left:1,2,3",
+            "spring:right:.005",
+        ],
+        about={"tetopt": tetopt.__version__},
+    )
+    assert_allclose(model.materials.young, 2000.0)
+    tetopt.save_model("b.inp", model, units=units)
+    ours, theirs = (Path(name).read_text() for name in ("a.inp", "b.inp"))
+    assert re.findall(r"\*ELASTIC\n.*", ours) == re.findall(r"\*ELASTIC\n.*", theirs)
+    assert_allclose(step_numbers(ours), step_numbers(theirs), rtol=1e-12)
+    shown = {"kPa": "2000", "MPa": "2", "Pa": "2e+06"}[units]
+    assert f"Young's modulus {shown} {units}" in printed
+    assert f"pressure:inferior:{number} {units}" in printed.replace("e5 ", "00000.0 ")
+
+
+def test_units_of_some_values_only_are_refused():
+    assert_refuses('convert mesh.vtu a.inp --young "0=2,1=3 MPa"', "unit")
+
+
+def test_a_file_s_loads_keep_their_unit():
+    """`--units` is of what the command names."""
+    assert_done("convert mesh.vtu a.vtu --young 3 --load hold:superior --load pressure:left:0.5")
+    assert_done("convert a.vtu b.vtu --units MPa")
+    assert_done("convert b.vtu c.vtu --units Pa --young 3000")
+    assert load_mesh("c.vtu").cell_data["young"][0] == pytest.approx(3.0)
+    assert json.loads(load_mesh("c.vtu").text("loads"))[1] == "pressure:left:500.0"
+    assert_refuses("convert mesh.vtu d.inp --young 2 --load 'pressure:left:1 psi'", "kPa")
+
+
 @pytest.mark.parametrize("units", ["MPa", "Pa"])
 def test_loads_of_all_kinds_density_and_moduli_at_nodes_go_on(units):
     """Through other units and LPS and back, into the same CalculiX file as from the first one."""
@@ -436,8 +504,7 @@ def test_loads_of_all_kinds_density_and_moduli_at_nodes_go_on(units):
     for name in "ac":
         assert_done(f"convert {name}.vtu {name}.inp")
         files.append(Path(f"{name}.inp").read_text())
-        step = files[-1].partition("*STEP")[2]
-        numbers.append(np.array(re.findall(r"-?\d+\.\d+(?:e-?\d+)?", step), dtype=float))
+        numbers.append(step_numbers(files[-1]))
     assert_allclose(*numbers, rtol=1e-12)
     assert files[1].count("*STEP") == 2
     assert "*INITIAL CONDITIONS, TYPE=TEMPERATURE" in files[1]

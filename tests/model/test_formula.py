@@ -28,6 +28,12 @@ H = np.array([[0.5, 1.0, 2.0], [3.0, 10.0, 250.0]])
             np.maximum(np.minimum(H, 5), abs(H - 3)) + H**0.5 * np.log(H),
         ),
         ("1/2*h", 0.5 * H),
+        ("where(h < 1.5, 2*h**2.5, 3*h**1.64)", np.where(H < 1.5, 2 * H**2.5, 3 * H**1.64)),
+        ("(h < 1.5)*2*h + (1.5 <= h)*3", np.where(H < 1.5, 2 * H, 3)),
+        (
+            "2 * where(1 < h <= 3 or h == 250, where(h >= 2 and h != 3, -h, 0), 7)",
+            2.0 * np.choose(np.isin(H, [2, 250]) + 2 * np.isin(H, [0.5, 1, 10]), [0 * H, -H, 7]),
+        ),
     ],
 )
 def test_values(text, expected):
@@ -62,6 +68,8 @@ def test_values(text, expected):
         "max(h)",
         "abs(h, 2)",
         "max(h, 1, 2)",
+        "where(h < 1, 2)",
+        "where(h in 1, 2, 3)",
         "abs(x=h)",
         "min(*h)",
         "h; h",
@@ -87,12 +95,25 @@ def test_refuses(text):
     assert len(str(caught.value)) < 300
 
 
+@pytest.mark.parametrize(
+    ("text", "said"), [("2*HU", "write h "), ("h^2", r"write \*\* "), ("h < 2", "where")]
+)
+def test_other_programs_words_are_named(text, said):
+    with refusal(said):
+        parse_formula(text)
+
+
+def test_a_negative_base_is_named():
+    with refusal("nan at intensity -8 .*negative"):
+        young_from(parse_formula("h**1.64"), np.array([-8.0, 1.0]))
+
+
 @pytest.mark.parametrize(("text", "value"), [("10**20", 1e20), ("9**9**9**9", np.inf)])
 def test_powers_are_floats(text, value):
     assert parse_formula(text)(np.array([1.0])) == value
 
 
-@given(st.text(alphabet="h0123456789.+-*/()absqrtexplogminmax, ", max_size=24))
+@given(st.text(alphabet="h0123456789.+-*/()absqrtexplogminmaxwhere<>=!d, ", max_size=24))
 def test_any_text_is_a_mapping_or_an_input_error(text):
     try:
         mapping = parse_formula(text)

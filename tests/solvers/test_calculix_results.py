@@ -46,7 +46,7 @@ def test_from_image_to_solver_and_back(here, units):
     """
     image = tetopt.load_phantom("two_spheres").image(voxel_mm=4.0)
     tetopt.save_image("a.nii.gz", image)
-    mapping = "--young 0.5+h/7 --nu 0.3"
+    mapping = '--young "0.5+h/7 kPa" --nu 0.3'
     loads = "--load compress:3% --space lps --units"
     assert_done("mesh a.nii.gz -o a.vtu --spacing 12 --iterations 0")
     assert_done("convert a.vtu a.inp --image a.nii.gz", mapping, loads, units)

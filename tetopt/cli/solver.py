@@ -24,7 +24,7 @@ from tetopt.job.options import SolverOptions
 from tetopt.model.fields import GAUSS_MODULI
 from tetopt.model.loads import SHOWN_LOAD_DIGITS, count_of_steps, load_words
 from tetopt.model.materials import Materials
-from tetopt.model.model import STRESS_UNITS, Model, element_facets, elements
+from tetopt.model.model import STRESS_UNITS, Model, element_facets, elements, in_units
 from tetopt.model.sets import area_vectors, standard_names
 from tetopt.report.tables import new_table, nodes_in_words, range_words
 
@@ -74,7 +74,7 @@ def _materials_by_name(model: Model, materials: Materials) -> Iterator[str]:
             yield f"  and {len(materials.young) - MOST_SETS} more materials"
             return
         made_of = [names.get(label, str(label)) for label, material in pairs if material == number]
-        yield f"  {young:.4g} kPa, nu {nu:.4g}: {list_names(made_of)}"
+        yield f"  {young:.4g} {model.units}, nu {nu:.4g}: {list_names(made_of)}"
 
 
 def _gmsh_lines(model: Model, suffix: str) -> Iterator[str]:
@@ -103,7 +103,9 @@ def _gmsh_lines(model: Model, suffix: str) -> Iterator[str]:
 def _moduli_lines(output: Path, model: Model) -> Iterator[str]:
     """Yield lines on the materials, and on moduli that vary within cells."""
     if (table := model.materials) is not None:
-        moduli = f"Young's modulus {range_words(table.young)} kPa, nu {range_words(table.nu)}"
+        moduli = (
+            f"Young's modulus {range_words(table.young)} {model.units}, nu {range_words(table.nu)}"
+        )
         yield f"{count_text(len(table.young), 'material')}, {moduli}"
         yield from _materials_by_name(model, table)
         if model.gauss_young is not None:
@@ -121,7 +123,8 @@ def _moduli_lines(output: Path, model: Model) -> Iterator[str]:
         low = model.node_young.min()
         high = model.node_young.max()
         yield (
-            f"the modulus is linear within cells, {low:.4g} to {high:.4g} kPa at their corners"
+            f"the modulus is linear within cells, {low:.4g} to {high:.4g} {model.units} at their "
+            "corners"
             if format_of(output).has_node_moduli
             else "the format has one modulus per cell: the mean of the linear modulus"
         )
@@ -130,7 +133,7 @@ def _moduli_lines(output: Path, model: Model) -> Iterator[str]:
 def _load_lines(output: Path, model: Model) -> Iterator[str]:
     """Yield lines on the loads, and on what the format makes of them."""
     for load in model.loads:
-        yield f"load: {load_words(load, SHOWN_LOAD_DIGITS)}"
+        yield f"load: {load_words(load, SHOWN_LOAD_DIGITS, model.units)}"
     if (n_steps := count_of_steps(model.loads)) > 1:
         yield f"{n_steps} steps, each from the undeformed state"
     if model.loads and not format_of(output).runs:
@@ -144,8 +147,9 @@ def _load_lines(output: Path, model: Model) -> Iterator[str]:
 def _lines(output: Path, model: Model, solver: SolverOptions) -> Iterator[str]:
     form = format_of(output)
     suffix = output.suffix.lower()
-    yield from _moduli_lines(output, model)
-    yield from _load_lines(output, model)
+    in_unit = in_units(model, solver.units, with_lengths=False)
+    yield from _moduli_lines(output, in_unit)
+    yield from _load_lines(output, in_unit)
     if suffix in GMSH_SUFFIXES:
         yield from _gmsh_lines(model, suffix)
     elif suffix in CELL_NUMBERS:

@@ -458,7 +458,8 @@ class ModelOptions:
         str | None,
         Option(
             "MAPPING",
-            'Young\'s modulus, kPa: a number, a formula of the intensity, "0.5 + 0.01*h", a '
+            'Young\'s modulus, kPa or the unit that it names, "3 MPa": a number, a formula of the '
+            'intensity, "0.5 + 0.01*h", "where(h < 1.2, 2*h**2.5, 2*h**1.6)", a '
             'table "0:1,100:5", '
             'by label "1=2.1,liver=1.9,*=5", or a .toml or .csv file with such columns.',
         ),
@@ -528,7 +529,8 @@ class SolverOptions(ModelOptions):
         str,
         Option(
             "kPa|MPa|Pa",
-            "Unit of stress in the file; with Pa, lengths are in m. `young` is in kPa.",
+            "Unit of stress in the file, and of moduli and pressures in `young` and `loads` that "
+            "name none; with Pa, the file's lengths are in m.",
         ),
     ] = "kPa"
     fields: Annotated[

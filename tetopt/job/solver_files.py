@@ -173,6 +173,7 @@ def choices_of(options: ModelOptions) -> Choices:
         bins,
         spacing,
         options.order or 1,
+        options.units if isinstance(options, SolverOptions) else "kPa",
     )
 
 

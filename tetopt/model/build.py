@@ -105,10 +105,10 @@ def build_model(
     young, nu : number, (M,) array, mapping or str, optional
         Young's modulus, kPa, above 0, and Poisson's ratio, above -1 and below 0.5: one for all
         cells, one per cell, or a mapping of the intensity or of the label
-        (`tetopt.model.mappings.parse_any_mapping`). With an image, a mapping of the intensity is
-        averaged over the voxels of each cell; without, it is applied to the cell's "mean". Without
-        `young` the model has no materials. `nu` defaults to the column "nu" of the file that
-        `young` names, or to 0.45.
+        (`tetopt.model.mappings.parse_any_mapping`), whose text may name the unit, "2.5*h MPa". With
+        an image, a mapping of the intensity is averaged over the voxels of each cell; without, it
+        is applied to the cell's "mean". Without `young` the model has no materials. `nu` defaults
+        to the column "nu" of the file that `young` names, or to 0.45.
     density : number, (M,) array, mapping or str, optional
         Density, kg/m3, above 0, in the same forms; defaults to the column "density" of the file
         that `young` names, or to none. Gravity needs it.
@@ -227,6 +227,7 @@ class Choices(NamedTuple):
     bins: int | None = None
     spacing: Spacing = "equal"
     order: int = 1
+    units: str = "kPa"  # of moduli and pressures in texts without a unit
 
     @property
     def is_new(self) -> bool:
@@ -296,7 +297,7 @@ def _model(
         raise InputError("bins: the model has no moduli to group; give `young`")
     elif choices.density is not None:
         raise InputError("density: a material also needs a modulus; give `young`")
-    loads = parse_loads(choices.loads, mesh, all_sets)
+    loads = parse_loads(choices.loads, mesh, all_sets, choices.units)
     if any(load.kind == "gravity" for load in loads):
         density_of(table)  # raises InputError without a density
     about = _with_table_in_words(about, cells.labels)
@@ -391,9 +392,9 @@ def _materials(cells: _ModelCells, choices: Choices) -> Materials:
         nu = young if isinstance(young, str) and has_column(young, "nu") else DEFAULT_NU
     if density is None and isinstance(young, str) and has_column(young, "density"):
         density = young
-    moduli = _values(young, "young", cells, choices.average)
-    ratios = _values(nu, "nu", cells)
-    masses = None if density is None else _values(density, "density", cells)
+    moduli = _values(_mapping(young, "young", choices.units), "young", cells, choices.average)
+    ratios = _values(_mapping(nu, "nu"), "nu", cells)
+    masses = None if density is None else _values(_mapping(density, "density"), "density", cells)
     return materials(moduli, ratios, len(cells.mesh.cells), masses)
 
 
@@ -404,7 +405,7 @@ def _varying_moduli(cells: _ModelCells, choices: Choices) -> tuple[Floats | None
     young = choices.young
     average = choices.average
     order = choices.order
-    mapping: Any = parse_any_mapping(young) if isinstance(young, str) else young
+    mapping = _mapping(young, "young", choices.units)
     place = parse_average(average).place
     if cells.image is None or not (callable(mapping) or np.ndim(mapping) == 2):
         return None, None
@@ -438,9 +439,13 @@ def _cells_of(mesh: Mesh, image: Image | None, cell_data: Arrays, about: Json) -
     return _ModelCells(mesh, image, mean, labels, _table_of(about).names)
 
 
-def _values(value: Any, name: str, cells: _ModelCells, average: str = "mean") -> Floats:
+def _mapping(value: Any, name: str, units: str = "kPa") -> Any:
+    """Return the mapping that a text describes; moduli in kPa."""
+    return parse_any_mapping(value, name, units) if isinstance(value, str) else value
+
+
+def _values(mapping: Any, name: str, cells: _ModelCells, average: str = "mean") -> Floats:
     """Return the value of each cell, or one for all."""
-    mapping: Any = parse_any_mapping(value, name) if isinstance(value, str) else value
     if isinstance(mapping, dict):
         raise InputError(
             f"{name}: expected a number, array, mapping or text, got a dict; use "

@@ -290,8 +290,8 @@ def sets_beside(
 
 
 def loads_in(loaded: MeshFile) -> list[str]:
-    """Return the loads in a file of tetopt's as text, in RAS+ and kPa; none, with a warning, if
-    their sets no longer exist.
+    """Return the loads in a file of tetopt's as text, in RAS+ and kPa, which it states; none, with
+    a warning, if their sets no longer exist.
     """
     try:
         words = json_of(loaded.text("loads") or "[]")
@@ -306,7 +306,8 @@ def loads_in(loaded: MeshFile) -> list[str]:
         return []
     units = STRESS_UNITS.get(loaded.text("units") or "", STRESS_UNITS["kPa"])
     turned = [half_turned(load) if loaded.space == "lps" else load for load in loads]
-    return [load_words(scale_load(load, units.kPa, units.mm)) for load in turned]
+    scaled = (scale_load(load, units.kPa, units.mm) for load in turned)
+    return [load_words(load, units="kPa") for load in scaled]
 
 
 def moduli_in(

@@ -5,7 +5,9 @@ from __future__ import annotations
 import ast
 import operator
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import reduce
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -23,6 +25,7 @@ FORMULA_FUNCTIONS: dict[str, tuple[Callable[..., Any], int]] = {
     "log": (np.log, 1),
     "min": (np.minimum, 2),
     "max": (np.maximum, 2),
+    "where": (np.where, 3),
 }
 BINARY_OPERATORS: dict[type[ast.operator], Callable[..., Any]] = {
     ast.Add: operator.add,
@@ -35,6 +38,14 @@ UNARY_OPERATORS: dict[type[ast.unaryop], Callable[..., Any]] = {
     ast.UAdd: operator.pos,
     ast.USub: operator.neg,
 }
+COMPARISONS: dict[type[ast.cmpop], Callable[..., Any]] = {
+    ast.Lt: operator.lt,
+    ast.LtE: operator.le,
+    ast.Gt: operator.gt,
+    ast.GtE: operator.ge,
+    ast.Eq: operator.eq,
+    ast.NotEq: operator.ne,
+}
 FORMULA_PARTS = f"numbers, h, + - * / **, brackets and {', '.join(FORMULA_FUNCTIONS)}"
 
 
@@ -42,8 +53,9 @@ def parse_formula(text: str) -> Callable[[Floats], Floats]:
     """Convert a formula of h to a function of intensities; operators and precedence are Python's.
 
     Formulas contain numbers, ``h``, ``+ - * / **``, brackets, ``abs``, ``sqrt``, ``exp`` and
-    ``log`` of one argument, and ``min`` and ``max`` of two. Where a formula is undefined (1/0, log
-    of 0) the function returns inf or NaN.
+    ``log`` of one argument, ``min`` and ``max`` of two, and ``where(condition, a, b)``. Comparisons
+    (``0 < h <= 5``, with ``and`` and ``or``) are 1 where they hold, else 0; none is a formula.
+    Where a formula is undefined (1/0, log of 0) the function returns inf or NaN.
 
     Raises
     ------
@@ -54,6 +66,8 @@ def parse_formula(text: str) -> Callable[[Floats], Floats]:
     --------
     >>> parse_formula("1 / max(abs(h), 0.001)")(np.array([0.02, -0.01, 0.0]))
     array([  50.,  100., 1000.])
+    >>> parse_formula("where(h < 1, 2*h, 5)")(np.array([0.5, 1.0]))
+    array([1., 5.])
     """
     if len(text) > MOST_FORMULA_LETTERS:
         raise InputError(
@@ -92,6 +106,19 @@ def _formula_text(text: str) -> str:
     return line if len(line) <= 60 else f"{line[:57]}..."
 
 
+def _hint(node: ast.expr) -> str:
+    """Return how to write what other programs write otherwise, for the end of a message."""
+    match node:
+        case ast.Name():
+            return "; write h for the intensity"
+        case ast.BinOp(op=ast.BitXor()):
+            return "; write ** for powers"
+        case ast.Compare() | ast.BoolOp():
+            return "; a comparison is a condition of where(h < 1.2, 2*h, 3*h)"
+        case _:
+            return ""
+
+
 def _compile_node(node: ast.expr, text: str, depth: int) -> Callable[[Floats], Any]:
     """Convert a syntax tree to a function of h.
 
@@ -115,6 +142,13 @@ def _compile_node(node: ast.expr, text: str, depth: int) -> Callable[[Floats], A
         case ast.UnaryOp(op=op, operand=operand) if type(op) in UNARY_OPERATORS:
             function = UNARY_OPERATORS[type(op)]
             operands = [operand]
+        case ast.BoolOp(op=op, values=operands) if depth:
+            function = _fold(np.logical_and if isinstance(op, ast.And) else np.logical_or)
+        case ast.Compare(left=left, ops=ops, comparators=right) if depth and all(
+            type(op) in COMPARISONS for op in ops
+        ):
+            function = _chain([COMPARISONS[type(op)] for op in ops])
+            operands = [left, *right]
         case ast.Call(func=ast.Name(id=name), args=operands, keywords=[]) if (
             name in FORMULA_FUNCTIONS
         ):
@@ -128,6 +162,18 @@ def _compile_node(node: ast.expr, text: str, depth: int) -> Callable[[Floats], A
             part = ast.get_source_segment(text.strip(), node) or text
             raise InputError(
                 f'formula: expected {FORMULA_PARTS}; cannot use "{_formula_text(part)}"'
+                f"{_hint(node)}"
             )
     values = [_compile_node(operand, text, depth + 1) for operand in operands]
     return lambda h: function(*(value(h) for value in values))
+
+
+def _chain(compare: Sequence[Callable[..., Any]]) -> Callable[..., Any]:
+    """Return a function that compares each value with the next one, as in 0 < h <= 5."""
+    both = _fold(np.logical_and)
+    return lambda *values: both(*map(lambda each, pair: each(*pair), compare, pairwise(values)))
+
+
+def _fold(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function of two as one of any number of values, with 0 and 1 for its truth."""
+    return lambda *values: 1.0 * reduce(function, values)

@@ -25,6 +25,7 @@ from tetopt.geometry.quadratic import (
 )
 from tetopt.geometry.topology import facets
 from tetopt.mesh import Mesh
+from tetopt.model.mappings import MODULUS_UNITS, without_unit
 from tetopt.model.sets import (
     BOUNDARY_SET,
     FACE_NAMES,
@@ -97,7 +98,9 @@ class Load(NamedTuple):
     step: int = 0
 
 
-def parse_loads(texts: Iterable[str], mesh: Mesh, sets: Sets) -> tuple[Load, ...]:
+def parse_loads(
+    texts: Iterable[str], mesh: Mesh, sets: Sets, units: str = "kPa"
+) -> tuple[Load, ...]:
     """Parse loads.
 
     Parameters
@@ -108,9 +111,11 @@ def parse_loads(texts: Iterable[str], mesh: Mesh, sets: Sets) -> tuple[Load, ...
         distance between the two, as `tetopt fem` does; "pressure:SET:P", kPa, inwards;
         "traction:SET:X,Y,Z", kPa; "spring:SET:K", kPa/mm; "gravity:X,Y,Z", mm/s2. The prefix "2/"
         puts a load into step 2 only; without a prefix it is in all steps. Forces on the same facets
-        add up.
+        add up. A unit may follow the numbers in kPa: "pressure:SET:0.2 MPa".
     mesh : Mesh
     sets : Sets
+    units : {"kPa", "MPa", "Pa", "GPa"}
+        Instead of kPa, of numbers without a unit.
 
     Raises
     ------
@@ -124,7 +129,7 @@ def parse_loads(texts: Iterable[str], mesh: Mesh, sets: Sets) -> tuple[Load, ...
         A loaded side is far smaller than the mesh, as where the image's box cuts off a brain's
         stem.
     """
-    loads = tuple(load for text in texts for load in _loads(text, mesh, sets))
+    loads = tuple(load for text in texts for load in _loads(text, mesh, sets, units))
     check_steps(loads)
     for load in loads:
         if load.kind in FACET_FORCES:
@@ -161,7 +166,7 @@ def check_steps(loads: Iterable[Load]) -> None:
             )
 
 
-def parse_load(text: str, ndim: int) -> Load:
+def parse_load(text: str, ndim: int, units: str = "kPa") -> Load:
     """Parse a load, see `parse_loads`, without looking up sets; "compress" is kept as a kind, in
     percent.
 
@@ -188,6 +193,9 @@ def parse_load(text: str, ndim: int) -> Load:
         forms = ", ".join(f"{each}:{form}" for each, (form, _, _) in LOAD_FORMS.items())
         raise InputError(f'load: expected compress:5%, hold:SET, {forms}, got "{text}"')
     form, size, unit = LOAD_FORMS[kind]
+    if kind in FACET_FORCES:
+        rest, units = without_unit(rest.removesuffix("/mm") if kind == "spring" else rest, units)
+        unit = unit.replace("kPa", units)
     name, _, numbers_text = rest.rpartition(":") if "SET" in form else ("", "", rest)
     count = ndim if size == "n" else 1
     numbers = _parse_movement(numbers_text) if kind == "move" else finite_numbers(numbers_text)
@@ -196,12 +204,14 @@ def parse_load(text: str, ndim: int) -> Load:
         raise InputError(f'load: expected {kind}:{form} with {what}, got "{text}"')
     if kind == "spring" and numbers[0] <= 0.0:
         raise InputError(f'load: expected spring:{form} with a stiffness above 0, got "{text}"')
+    if kind in FACET_FORCES:
+        numbers = numbers * MODULUS_UNITS[units]
     return Load("displacement" if kind == "move" else kind, name, numbers, step)
 
 
-def load_words(load: Load, digits: int = 17) -> str:
+def load_words(load: Load, digits: int = 17, units: str = "") -> str:
     """Format a load for `parse_loads`, exactly by default, or with fewer significant digits for
-    display.
+    display; with `units`, numbers of that unit state it.
 
     Examples
     --------
@@ -219,7 +229,8 @@ def load_words(load: Load, digits: int = 17) -> str:
         FREE_WORD if np.isnan(number) else repr(float(f"{number:.{digits}g}"))
         for number in load.numbers.tolist()
     ]
-    return f"{prefix}{kind}:{name}{','.join(numbers)}"
+    unit = LOAD_FORMS[kind][2].replace("kPa", units) if load.kind in FACET_FORCES and units else ""
+    return f"{prefix}{kind}:{name}{','.join(numbers)} {unit}".rstrip()
 
 
 def _step_of(text: str) -> tuple[int, str]:
@@ -244,8 +255,8 @@ def _parse_movement(text: str) -> Floats:
     return np.where(is_free, np.nan, numbers) if len(numbers) else numbers
 
 
-def _loads(text: str, mesh: Mesh, sets: Sets) -> list[Load]:
-    load = parse_load(text, mesh.ndim)
+def _loads(text: str, mesh: Mesh, sets: Sets, units: str) -> list[Load]:
+    load = parse_load(text, mesh.ndim, units)
     if load.kind == "compress":
         return _compression(load, mesh, sets)
     return [

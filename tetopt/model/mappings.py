@@ -22,6 +22,11 @@ from tetopt.system.incoming import text_of, toml_of
 MAPPED_OPTIONS = ("young", "nu", "density")  # options of commands whose text is a mapping
 FILES_IN_TEXTS = (*MAPPED_OPTIONS, "merge", "label_size")  # options whose text may name a file
 NAMED_SUFFIXES = (".toml", ".csv")  # of that file
+BY_LABEL = re.compile("(?<![<>=!])=(?!=)")  # not a comparison
+MODULUS_UNITS = {"Pa": 1e-3, "kPa": 1.0, "MPa": 1e3, "GPa": 1e6}  # kPa
+# not the end of a name, as in h*hPa
+UNIT_AT_END = re.compile(rf"(.*[\d.)\s])\s*({'|'.join(MODULUS_UNITS)})\s*", re.I | re.S)
+COLUMN_WITH_UNIT = re.compile(rf"young[\s_]*[\[(]?({'|'.join(MODULUS_UNITS)})[\])]?", re.I)
 
 ModulusMapping = (
     Callable[[Floats], ArrayLike] | Sequence[Sequence[float]] | NDArray[np.floating] | None
@@ -106,9 +111,14 @@ def young_from(mapping: ModulusMapping, intensities: ArrayLike) -> Floats:
         at, first_of = np.unique(intensities[is_bad], return_index=True)
         pairs = zip(young[is_bad][first_of[:3]], at[:3], strict=True)
         first = ", ".join(f"{modulus:g} at intensity {intensity:g}" for modulus, intensity in pairs)
+        undefined = (
+            " (undefined, as the root or fractional power of a negative number: write max(h, 0))"
+            if np.isnan(young).any()
+            else ""
+        )
         raise InputError(
             f"modulus: expected 0 kPa or more, got {int(is_bad.sum())} invalid values, such as "
-            f"{first}; give a modulus mapping (`young`) that is positive from "
+            f"{first}{undefined}; give a modulus mapping (`young`) that is positive from "
             f"{intensities.min():g} to {intensities.max():g}, or leave out other tissue (`mask`)"
         )
     return young
@@ -138,13 +148,42 @@ def parse_table(text: str) -> list[tuple[float, float]]:
     return [(pair[0], pair[1]) for pair in pairs]
 
 
-def parse_labels(text: str) -> ByLabel:
-    """Parse values by label or by labels' names from a command line, `*` for all others.
+def without_unit(text: str, units: str = "kPa") -> tuple[str, str]:
+    """Return the text of a modulus or pressure without a unit at its end, and this unit or
+    `units`.
+
+    Examples
+    --------
+    >>> without_unit("2017*h**2.5 MPa"), without_unit("3", "Pa")
+    (('2017*h**2.5', 'MPa'), ('3', 'Pa'))
+    """
+    if (match := UNIT_AT_END.fullmatch(text)) is None:
+        return text, units
+    return match[1].rstrip(), _unit_named(match[2])
+
+
+def _unit_named(text: str) -> str:
+    return next(unit for unit in MODULUS_UNITS if unit.lower() == text.lower())
+
+
+def _scale_mapping(mapping: Any, factor: float) -> Any:
+    """Multiply the values of a mapping, of any form but one by label."""
+    if factor == 1.0:
+        return mapping
+    if callable(mapping):
+        return lambda h: factor * mapping(h)
+    return factor * mapping if isinstance(mapping, float) else [(h, factor * v) for h, v in mapping]
+
+
+def parse_labels(text: str, units: str | None = None) -> ByLabel:
+    """Parse values by label or by labels' names from a command line, `*` for all others; with
+    `units`, of those without a unit of their own, the values are moduli.
 
     Raises
     ------
     InputError
-        The text does not consist of such pairs, or names a label twice.
+        The text does not consist of such pairs, names a label twice, or has units for some values
+        only.
 
     Examples
     --------
@@ -155,7 +194,11 @@ def parse_labels(text: str) -> ByLabel:
     """
     pairs = [pair.partition("=") for pair in text.split(",")]
     try:
-        return _by_label([(label, float(value)) for label, _, value in pairs])
+        if units and len({UNIT_AT_END.fullmatch(value) is None for _, _, value in pairs}) > 1:
+            raise InputError(
+                f'values by label: expected a unit for all values or for none, got "{text}"'
+            )
+        return _by_label([(label, _value(value, units)) for label, _, value in pairs])
     except ValueError as error:
         if isinstance(error, InputError):
             raise
@@ -209,10 +252,12 @@ def parse_mapping(text: str) -> ModulusMapping:
         raise InputError(
             f'mapping: expected a mapping of the intensity, got values by label, "{text}"'
         )
-    return parse_formula(text) if isinstance(mapping, float) else mapping
+    return parse_formula(repr(mapping)) if isinstance(mapping, float) else mapping
 
 
-def parse_any_mapping(text: str, quantity: str = "young") -> ModulusMapping | ByLabel | float:
+def parse_any_mapping(
+    text: str, quantity: str = "young", units: str = "kPa"
+) -> ModulusMapping | ByLabel | float:
     """Parse a mapping from a command line.
 
     Parameters
@@ -220,9 +265,11 @@ def parse_any_mapping(text: str, quantity: str = "young") -> ModulusMapping | By
     text : str
         A number; a table of intensities, "0:1,100:5.5"; values by label or name,
         "1=2.1,liver=1.9,*=0.5"; a formula of h (`parse_formula`); or a file named .toml or .csv
-        (`load_mapping`).
+        (`load_mapping`). Moduli may name their unit: "3 MPa", "2017*h**2.5 MPa", "1=2 kPa,2=1 GPa".
     quantity : str
-        The file's column.
+        The file's column; "young" is returned in kPa.
+    units : {"Pa", "kPa", "MPa", "GPa"}
+        Of moduli without a unit.
 
     Raises
     ------
@@ -230,9 +277,17 @@ def parse_any_mapping(text: str, quantity: str = "young") -> ModulusMapping | By
         For the reasons of `parse_table`, `parse_labels`, `parse_formula` and `load_mapping`.
     """
     if (file := named_file(text)) is not None:
-        return load_mapping(file, quantity)
-    if "=" in text:
-        return parse_labels(text)
+        return load_mapping(file, quantity, units)
+    if BY_LABEL.search(text):
+        return parse_labels(text, units if quantity == "young" else None)
+    if quantity == "young":
+        text, unit = without_unit(text, units)
+        return _scale_mapping(_parse_by_intensity(text), MODULUS_UNITS[unit])
+    return _parse_by_intensity(text)
+
+
+def _parse_by_intensity(text: str) -> ModulusMapping | float:
+    """Parse a number, a table or a formula."""
     with contextlib.suppress(ValueError):
         if np.isfinite(value := float(text)):
             return value
@@ -246,14 +301,17 @@ def named_file(text: str) -> Path | None:
     return Path(text) if text.lower().endswith(NAMED_SUFFIXES) else None
 
 
-def load_mapping(path: Path, quantity: str = "young") -> ModulusMapping | ByLabel:
+def load_mapping(
+    path: Path, quantity: str = "young", units: str = "kPa"
+) -> ModulusMapping | ByLabel:
     """Load a mapping from a file with two or more columns: lists in TOML, or CSV with names in the
     first row.
 
     Commas, semicolons or tabs separate the columns of CSV.
 
     One column is "intensity", or "label" (numbers or names, "*" for all others), or "name" instead;
-    another is the quantity, such as "young" (kPa) or "nu".
+    another is the quantity, such as "young" or "nu". Moduli are in `units` unless the column is
+    named "young [MPa]" or similar, or a value has its own unit, and are returned in kPa.
 
     Raises
     ------
@@ -263,7 +321,7 @@ def load_mapping(path: Path, quantity: str = "young") -> ModulusMapping | ByLabe
     """
     try:
         with prefix_errors(path):
-            return _mapping_in(path, quantity)
+            return _mapping_in(path, quantity, units)
     except InputError:
         raise
     except (ValueError, TypeError, csv.Error, RecursionError) as error:
@@ -272,8 +330,8 @@ def load_mapping(path: Path, quantity: str = "young") -> ModulusMapping | ByLabe
         ) from error
 
 
-def _mapping_in(path: Path, quantity: str) -> ModulusMapping | ByLabel:
-    columns = _columns(path)
+def _mapping_in(path: Path, quantity: str, units: str) -> ModulusMapping | ByLabel:
+    columns, unit = _columns(path)
     keys: list[str] = [name for name in ("intensity", "label") if name in columns]
     if not keys and "name" in columns:
         keys = ["name"]
@@ -285,7 +343,9 @@ def _mapping_in(path: Path, quantity: str) -> ModulusMapping | ByLabel:
     if len(columns[keys[0]]) != len(columns[quantity]):
         counts = f"{len(columns[keys[0]])} of {keys[0]} and {len(columns[quantity])} of {quantity}"
         raise InputError(f"expected columns of the same length, got {counts}")
-    pairs = list(zip(columns[keys[0]], map(_number, columns[quantity]), strict=True))
+    units_of = (unit or units) if quantity == "young" else None
+    numbers = [_value(value, units_of) for value in columns[quantity]]
+    pairs = list(zip(columns[keys[0]], numbers, strict=True))
     if keys != ["intensity"]:
         return _by_label([(str(label), value) for label, value in pairs])
     return _check_pairs([(_number(h), value) for h, value in pairs])
@@ -301,6 +361,14 @@ def _number(value: Any) -> float:
     return float(value)
 
 
+def _value(value: Any, units: str | None) -> float:
+    """Convert to float; with `units` a modulus, whose unit may follow it in a text, to kPa."""
+    if units is None:
+        return _number(value)
+    number, unit = without_unit(value, units) if isinstance(value, str) else (value, units)
+    return _number(number) * MODULUS_UNITS[unit]
+
+
 def has_column(text: str, name: str) -> bool:
     """Return whether a mapping's text names a file with this column.
 
@@ -312,13 +380,21 @@ def has_column(text: str, name: str) -> bool:
     if (file := named_file(text)) is None:
         return False
     try:
-        return name in _columns(file)
+        return name in _columns(file)[0]
     except (ValueError, RecursionError):  # reported when the required column is read
         return False
 
 
-def _columns(path: Path) -> dict[str, list[Any]]:
-    return _toml_columns(path) if path.suffix.lower() == ".toml" else _csv_columns(path)
+def _columns(path: Path) -> tuple[dict[str, list[Any]], str | None]:
+    """Return the columns of a file, and the unit that the name of "young" has."""
+    columns = _toml_columns(path) if path.suffix.lower() == ".toml" else _csv_columns(path)
+    of_young = {name: match for name in columns if (match := COLUMN_WITH_UNIT.fullmatch(name))}
+    if not of_young:
+        return columns, None
+    if len(of_young) > 1 or "young" in columns:
+        raise InputError(f"{path}: expected one column of young, found {', '.join(columns)}")
+    ((name, match),) = of_young.items()
+    return columns | {"young": columns[name]}, _unit_named(match[1])
 
 
 def _toml_columns(path: Path) -> dict[str, list[Any]]:

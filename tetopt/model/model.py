@@ -22,6 +22,7 @@ from tetopt.model.fields import (
 )
 from tetopt.model.label_names import TABLE_TEXT, labels_of, table_of_words
 from tetopt.model.loads import FACET_FORCES, SHOWN_LOAD_DIGITS, Load, facet_forces, load_words
+from tetopt.model.mappings import MODULUS_UNITS
 from tetopt.model.materials import Materials
 from tetopt.model.sets import Sets, facet_triples
 from tetopt.model.skfem import skfem_mesh
@@ -46,9 +47,9 @@ class Units(NamedTuple):
 
 
 STRESS_UNITS = {
-    "kPa": Units(1.0, "mm", 1.0, "mN", "uJ", "kg", 1e-6),
-    "MPa": Units(1e3, "mm", 1.0, "N", "mJ", "t", 1e-9),
-    "Pa": Units(1e-3, "m", 1e3, "N", "J", "kg", 1e3),
+    "kPa": Units(MODULUS_UNITS["kPa"], "mm", 1.0, "mN", "uJ", "kg", 1e-6),
+    "MPa": Units(MODULUS_UNITS["MPa"], "mm", 1.0, "N", "mJ", "t", 1e-9),
+    "Pa": Units(MODULUS_UNITS["Pa"], "m", 1e3, "N", "J", "kg", 1e3),
 }
 WATER_DENSITY = 1000.0  # kg/m3
 # Values a thousand times off from any tissue are most likely in another unit. Soft tissue has 0.1
@@ -278,8 +279,9 @@ def half_turned(load: Load) -> Load:
     return load._replace(numbers=half_turn(load.numbers)) if len(load.numbers) == 3 else load
 
 
-def in_units(model: Model, units: str) -> Model:
-    """Convert lengths, moduli and loads to other units, see `STRESS_UNITS`.
+def in_units(model: Model, units: str, *, with_lengths: bool = True) -> Model:
+    """Convert lengths, unless `with_lengths` is false, moduli and loads to other units, see
+    `STRESS_UNITS`.
 
     Raises
     ------
@@ -295,7 +297,7 @@ def in_units(model: Model, units: str) -> Model:
     mesh = model.mesh
     table = model.materials
     stress = old.kPa / new.kPa
-    length = old.mm / new.mm
+    length = old.mm / new.mm if with_lengths else 1.0
     if length != 1.0:
         middles = None if mesh.midpoints is None else mesh.midpoints * length
         mesh = Mesh(mesh.points * length, mesh.cells, middles)
@@ -329,12 +331,12 @@ def odd_units(model: Model) -> Iterator[str]:
         if PASCAL_RANGE[0] <= low and high <= PASCAL_RANGE[1]:
             yield (
                 f"young is {low:.4g} to {high:.4g} kPa, stiffer than soft tissue (0.1 to a few "
-                "hundred kPa): if it is in Pa, divide it by 1000"
+                'hundred kPa): if it is in Pa, name the unit, as in `young` "3500 Pa"'
             )
         elif high < MEGAPASCAL_MOST:
             yield (
                 f"young is at most {high:.4g} kPa, softer than any tissue (0.1 kPa or more): if it "
-                "is in MPa, multiply it by 1000; `units` affects only the output file"
+                'is in another unit, name it, as in `young` "0.003 MPa"'
             )
         if (
             table.density is not None
