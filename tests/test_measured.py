@@ -14,15 +14,11 @@ import tetopt
 SETTINGS = {"0.02", "0.2", "0.3", "0.45", "1.2"}
 CODE = re.compile(r"```.*?```|`[^`\n]*`|\{\{.*?\}\}|\{%.*?%\}", re.DOTALL)
 DECIMAL = re.compile(r"(?<![\w.])\d+\.\d+")
-# Documents whose numbers of three decimals or more are measurements.
-QUOTING = (
-    "README.md",
-    "docs/compare/index.md",
-    "docs/understand/limits.md",
-    "docs/understand/numbers.md",
-    "docs/understand/order.md",
-    "docs/howto/improve.md",
-)
+# Numbers of three decimals or more that are not measured: of formulas and of the code.
+CONSTANTS = {"0.001", "0.002", "0.0255", "1.155", "1.4826", "1.489"}
+# What a page shows of programs; outputs (text) are none of it.
+PROGRAM = re.compile(r"^(`{3,})(bash|python|toml)$.*?^\1$|`[^`\n]+`", re.DOTALL | re.MULTILINE)
+LESSON = "start"  # a folder; `test_the_lesson_runs` compares its numbers
 
 
 @pytest.fixture(scope="module")
@@ -56,28 +52,25 @@ def test_no_number_is_typed_into_a_template(measure):
         ), template.name
 
 
-@pytest.mark.parametrize("name", QUOTING)
-def test_a_quoted_number_is_measured(measure, name):
-    """A number of three decimals or more stands in the data, rounded."""
-    data = json.loads(measure.DATA.read_text(encoding="utf-8"))
-    measured = set(numbers(data))
-    for digits in DECIMAL.findall(CODE.sub(" ", (measure.ROOT / name).read_text(encoding="utf-8"))):
-        places = len(digits.split(".")[1])
-        if places >= 3:
-            assert any(f"{value:.{places}f}" == digits for value in measured), (
-                f"{name}: {digits} is in no row"
-            )
-
-
-def numbers(value):
-    """All floats in a JSON value."""
-    if isinstance(value, dict):
-        value = list(value.values())
-    if isinstance(value, list):
-        for one in value:
-            yield from numbers(one)
-    elif isinstance(value, float):
-        yield value
+def test_a_quoted_number_is_measured(measure):
+    """A number of three decimals or more on a page stands on a page of Measured, which its line
+    links to.
+    """
+    begin, end = map(re.escape, measure.MARKS)
+    made = re.compile(f"{begin}.*?{end}", re.DOTALL)
+    for path in [measure.ROOT / "README.md", *(measure.ROOT / "docs").rglob("*.md")]:
+        parts = path.relative_to(measure.ROOT).parts
+        if {LESSON, "measured", "_build", "gallery", "generated"} & set(parts):
+            continue
+        text = made.sub(" ", PROGRAM.sub(" ", path.read_text(encoding="utf-8")))
+        for line in text.splitlines():
+            sources = {
+                digits
+                for name in re.findall(r"measured/(\w+)\.md", line)
+                for digits in DECIMAL.findall((measure.PAGES / f"{name}.md").read_text("utf-8"))
+            }
+            long = {each for each in DECIMAL.findall(line) if len(each.split(".")[1]) >= 3}
+            assert long <= sources | CONSTANTS, path.name
 
 
 def test_measuring_needs_its_images(measure, tmp_path, capsys):

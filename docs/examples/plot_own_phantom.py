@@ -63,7 +63,7 @@ labels = phantom.label_image()
 result = tetopt.mesh_image(tetopt.content(image, labels), nodes=1200)
 mesh, of_cell = result.mesh, result.labels
 
-# %% The exact volume of the lesion is 4/3 pi a b c. The cells with its label have two per cent
+# %% The exact volume of the lesion is 4/3 pi a b c. The cells with its label have slightly
 # less. Flat facets would cut off more of a curved surface, but nodes lie off it by what their
 # facets cut off.
 

@@ -24,8 +24,8 @@ affine[:3, :3] *= step
 image = tetopt.Image(template.get_fdata()[box], affine)
 mesh = tetopt.mesh_image(image, nodes=3000).mesh
 
-# %% ``below:0.6`` selects the largest connected set of cells with a mean below 0.6 (white matter
-# has 0.85, fluid 0.25). Its facets are a set, too, for loads such as ``pressure:ventricles:1.5``.
+# %% ``below:0.6`` selects the largest connected set of cells with a mean below 0.6 (white matter is
+# brighter, fluid darker). Its facets are a set, too, for loads like ``pressure:ventricles:1.5``.
 
 model = tetopt.build_model(mesh, image, sets=["ventricles=below:0.6"])
 chosen = model.sets.cells["ventricles"]
