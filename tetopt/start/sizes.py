@@ -60,8 +60,7 @@ class Sizes(NamedTuple):
     ----------
     smallest : float
         No block and no split makes a shorter edge, mm, and no target is below it. It takes
-        precedence over `longest`. Nodes may move nearer afterwards: in one run a tenth of the edges
-        ended shorter.
+        precedence over `longest`. Nodes may move nearer afterwards.
     edge_size : float, optional
         Target everywhere, mm, and upper limit of `field`; `inf` for none.
     gradation : float, optional
