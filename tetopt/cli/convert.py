@@ -18,6 +18,7 @@ from tetopt.job.events import Event, listen_with
 from tetopt.job.options import (
     LabelChoice,
     LabelledPart,
+    MeshPart,
     Option,
     SolverOptions,
     VoxelOptions,
@@ -74,7 +75,7 @@ def convert_command(
                     like=image_path,
                     results=results_path,
                     space=solver.space,
-                    is_registered=part.registered,
+                    part=part,
                 )
             )
             return 0
@@ -107,7 +108,8 @@ def _check_options(
         wrong = given_options(voxels)
         what = "a mesh's file; name an image, such as field.nii.gz"
     else:
-        wrong = given_options(replace(part, registered=False)) | given_options(choice)
+        own = replace(part, registered=False, **vars(MeshPart()))
+        wrong = given_options(own) | given_options(choice)
         wrong |= given_options(replace(solver, space="ras"))
         what = "an image, on all voxels of `like`"
     if wrong:

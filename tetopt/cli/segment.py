@@ -47,7 +47,7 @@ def segment_command(
     mesh_path, image_path = mesh_and_image(paths, image_path)
     if image_path is None:
         raise InputError(f"{mesh_path}: which image is to be segmented? pass `image`")
-    loaded = read_mesh(mesh_path)
+    loaded = read_mesh(mesh_path, part)
     what, _ = image_voxels(loaded, mesh_path, image_path, part)
     image = what.given
     mesh = loaded.mesh

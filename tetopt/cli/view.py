@@ -47,7 +47,7 @@ def view_command(
     mesh_path, image_path = mesh_and_image(paths, image_path)
     counted = MaskedPart(**vars(part), **vars(region))
     check_part(image_path, counted)
-    loaded = read_mesh(mesh_path)
+    loaded = read_mesh(mesh_path, region)
     mesh = loaded.mesh
     fields = dict(loaded.cell_data)
     what = voxels_of(loaded, mesh_path, image_path, counted).content

@@ -18,7 +18,7 @@ from tetopt.geometry.topology import facets, largest_component
 from tetopt.io.surfaces import LABELLED_SUFFIXES, SurfaceCheck, check_surface, save_surface
 from tetopt.job.events import note, report_violation, warning
 from tetopt.job.mesh_file import label_table, read_mesh
-from tetopt.job.options import LabelNamesOption, Option, SpaceOption
+from tetopt.job.options import LabelNamesOption, MeshPart, Option, SpaceOption
 from tetopt.measure.fidelity import FacetSurface, surface_areas
 from tetopt.model.file import MeshFile
 from tetopt.model.label_names import LABEL_FIELD, label_words, labels_named
@@ -30,7 +30,7 @@ MOST_LISTED = 12  # interfaces in the table; the file of numbers has all
 
 
 @dataclass(frozen=True, kw_only=True)
-class SurfacePart:
+class SurfacePart(MeshPart):
     """Surface of a mesh to write, and its coordinates."""
 
     below: Annotated[
@@ -79,7 +79,7 @@ def write_surface(mesh: Path, output: Path, part: SurfacePart) -> WrittenSurface
         The request is not for one surface; the surface does not exist; the file cannot hold it.
     """
     _check_part(part, output)
-    loaded = read_mesh(mesh)
+    loaded = read_mesh(mesh, part)
     if loaded.mesh.ndim != 3:
         raise InputError(f"{mesh}: expected tetrahedra, whose boundary is a surface, got triangles")
     names = label_table(part.label_names, loaded).names

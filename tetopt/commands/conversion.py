@@ -102,7 +102,7 @@ def convert_file(
             f"`results`: expected an output file {' or '.join(VTK_SUFFIXES)}, got {output}"
         )
     check_part(image, part, part.labels)
-    loaded = read_mesh(mesh)
+    loaded = read_mesh(mesh, part)
     check_unfolded(loaded.mesh, source=str(mesh))
     if results is None:
         with warnings_heard():

@@ -189,7 +189,7 @@ def judge(
         raise InputError("`labels`: needs `image`, on whose voxels they are compared")
     if label_names is not None and labels is None and part.mask_label is None:
         raise InputError("`label_names`: needs `labels` or `mask_label`")
-    loaded = read_mesh(mesh)
+    loaded = read_mesh(mesh, part)
     shape = quality(loaded.mesh.points, loaded.mesh.cells, loaded.mesh.midpoints)
     size = size_summary(loaded.mesh, loaded.order)
     numbers = {"mesh": mesh.name, "size": size, "quality": shape, "n_turned": loaded.n_turned}

@@ -162,7 +162,7 @@ def _model(
 ) -> Model:
     """Build the model to solve, of the mesh's file and the image."""
     loaded, what, is_other = voxels_of(
-        without_results(read_mesh(path)), path, image, part, part.labels
+        without_results(read_mesh(path, part)), path, image, part, part.labels
     )
     about = texts_of(loaded, is_other=is_other)
     box = loaded.box

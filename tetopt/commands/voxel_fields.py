@@ -15,7 +15,7 @@ from tetopt.io.images import OUTPUT_SUFFIXES, save_image, save_voxels
 from tetopt.job.aligned import read_companion
 from tetopt.job.events import note, progress, warning
 from tetopt.job.mesh_file import check_overlap, read_mesh
-from tetopt.job.options import VoxelOptions
+from tetopt.job.options import MaskPart, VoxelOptions
 from tetopt.model.fields import half_turned_fields
 from tetopt.model.file import MeshFile, words_of_other_box
 from tetopt.model.on_image import At, field_on_image, warped_image
@@ -36,7 +36,7 @@ def write_on_image(
     like: Path | None,
     results: Path | None,
     space: str,
-    is_registered: bool,
+    part: MaskPart,
 ) -> Json:
     """Write a field of a mesh's file on the voxels of an image or, with `options.warp`, that image
     moved by it.
@@ -53,8 +53,8 @@ def write_on_image(
         CalculiX's results for this mesh, which have the field.
     space : {"ras", "lps"}
         Axes of vectors and tensors in the file.
-    is_registered : bool
-        Accept the voxels of another image than the mesh's.
+    part : MaskPart
+        How the mesh is read, and whether the image may be another than the mesh's.
 
     Returns
     -------
@@ -70,9 +70,10 @@ def write_on_image(
     path = options.like or like or options.warp
     _check(output, options, like, space)
     assert path is not None, "the check requires one"
-    loaded = read_mesh(mesh) if results is None else with_results(read_mesh(mesh), results)
+    loaded = read_mesh(mesh, part)
+    loaded = loaded if results is None else with_results(loaded, results)
     name, values, at = _field_of(loaded, mesh, options, space)
-    image = _read(loaded, mesh, path, is_registered)
+    image = _read(loaded, mesh, path, part.registered)
     check_overlap(mesh, loaded.mesh, image)
     numbers: Json = {"mesh": mesh.name, "output": output.name, "field": name, "at": at}
     if options.warp is None:
@@ -91,7 +92,7 @@ def write_on_image(
         words += "" if space_of is None else f" ({space.upper()}+)"
     else:
         outside = 0.0 if options.outside is None else options.outside
-        other = _read(loaded, mesh, options.warp, is_registered)
+        other = _read(loaded, mesh, options.warp, part.registered)
         words = f"{options.warp} moved by {name}"
         space_of = None
         if not options.nearest and is_label_map(other):
@@ -179,7 +180,8 @@ def _field_of(
     # as VTK stores vectors
     if at == "nodes" and loaded.mesh.ndim == 2 and values.shape[1:] == (3,):
         values = values[:, :2]
-    if values.dtype.kind not in "biuf" or not np.isfinite(values).all():
+    is_bad = np.isinf if options.warp is None else lambda rows: ~np.isfinite(rows)
+    if values.dtype.kind not in "biuf" or is_bad(values).any():  # NaN: no value there
         raise InputError(f"{mesh}: expected finite numbers in {name}")
     is_unknown = half_turned_fields({name: values})[name] is values and values.ndim > 1
     if is_unknown and "lps" in (space, loaded.space):

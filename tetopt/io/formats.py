@@ -25,6 +25,7 @@ from tetopt.io.vtk import VTK_SUFFIXES, vtk, vtu
 from tetopt.io.xdmf import xdmf
 from tetopt.mesh import Mesh
 from tetopt.model.fields import node_field
+from tetopt.model.file import MASK_TEXT, POINTS_TEXT, points_words
 from tetopt.model.loads import known_set
 from tetopt.model.materials import Materials
 from tetopt.model.model import Model, in_space, in_units, locking_words
@@ -285,7 +286,11 @@ def file_bytes(path: Path, model: Model, *, space: str = "ras", units: str = "kP
     if model.order == 2 and not kind.has_quadratic:
         able = ", ".join(name for name, other in FORMATS.items() if other.has_quadratic)
         raise InputError(f"{path}: only {able} support quadratic cells; omit `order` 2")
-    ready = in_units(in_space(_check_model(path, model), space), units)
+    checked = _check_model(path, model)
+    if POINTS_TEXT not in checked.about and not {MASK_TEXT, "options"}.isdisjoint(checked.about):
+        of_points = {POINTS_TEXT: points_words(checked.mesh)}
+        checked = checked._replace(about={**checked.about, **of_points})
+    ready = in_units(in_space(checked, space), units)
     whole = kind.write(_rename_data(path, ready))
     return whole.encode() if isinstance(whole, str) else whole
 

@@ -57,7 +57,7 @@ from tetopt.io.tags import (
     without_labels,
 )
 from tetopt.io.text import comment_lines, names_apart, rows
-from tetopt.model.file import MASK_TEXT
+from tetopt.model.file import MASK_TEXT, MOVED, POINTS_TEXT
 from tetopt.model.model import Model, element_facets, elements
 from tetopt.model.sets import facet_triples
 from tetopt.system.arrays import Arrays, Floats, Ints
@@ -70,7 +70,7 @@ TET10_ORDER = np.array([0, 1, 2, 3, 4, 5, 6, 7, 9, 8])
 VIEW_SHAPES = ((3,), (9,))  # of a row: views can hold vectors and tensors
 LABEL_COMMENT = "physical groups of cells are the labels; label 0 is {}"
 NUMBER_COMMENT = "physical group {} is label {}"
-TEXTS = (MASK_TEXT, "violated")  # JSON in the comments
+TEXTS = (MASK_TEXT, "violated", POINTS_TEXT)  # in the comments
 # with 200,000, gmsh takes minutes to open a 2.2 file, and meshio hours for a 4.1 file
 MOST_MATERIAL_GROUPS = 1000
 
@@ -110,7 +110,7 @@ def own_comments(lines: list[str]) -> OwnComments | None:
         elif match := re.fullmatch(r"entity of (cells|facets) (\d+): (.*)", line):
             for name in match[3].split():
                 entities[match[1]].setdefault(name, []).append(int(match[2]))
-        elif match := re.fullmatch(rf"({'|'.join(TEXTS)}): (\{{.*\}})", line):
+        elif match := re.fullmatch(rf"({'|'.join(TEXTS)}): (\{{.*\}}|\d+ nodes.*|{MOVED}.*)", line):
             texts[match[1]] = match[2]
         elif match := re.fullmatch(LABEL_COMMENT.format(r"(\d+)"), line):
             zero = int(match[1])

@@ -17,6 +17,7 @@ from tetopt.interop.conversions import (
     rows_by_kind,
     simplices_of,
 )
+from tetopt.io.clean import piece_words, with_labels, with_merged_nodes, without_ghosts
 from tetopt.io.raw import Raw, by_corners
 from tetopt.io.read_gmsh import read_msh
 from tetopt.io.read_vtk import read_vtk
@@ -24,24 +25,42 @@ from tetopt.io.text import plain
 from tetopt.io.vtk import VTK_SUFFIXES, box_in, sets_in
 from tetopt.mesh import Mesh
 from tetopt.model.fields import half_turned_fields, is_stress, scaled_fields
-from tetopt.model.file import MeshFile, text_in
+from tetopt.model.file import (
+    MASK_TEXT,
+    MOVED,
+    MOVED_FROM_MASK,
+    POINTS_TEXT,
+    MeshFile,
+    points_words,
+    text_in,
+)
 from tetopt.model.model import ON_PREFIX, STRESS_UNITS, half_turn
 from tetopt.model.sets import SET_NAME, Sets, free_name, rows_of
 from tetopt.system.arrays import Arrays, Ints
 from tetopt.system.incoming import regular_file
 
 MESH_SUFFIXES = (*VTK_SUFFIXES, ".msh", ".msh2")
+LENGTH_UNITS = {"m": 1000.0, "cm": 10.0, "mm": 1.0, "um": 1e-3}  # in mm
 # of an edge: a mid-edge node closer to its middle is rounded, as in files with few digits
 STRAIGHT_FRACTION = 1e-6
 
 
-def load_mesh(path: str | Path) -> MeshFile:
+def load_mesh(
+    path: str | Path, *, label_field: str | None = None, mesh_units: str | None = None
+) -> MeshFile:
     """Read triangles or tetrahedra, linear or quadratic, from a VTK or gmsh file.
+
+    Cells that VTK marks as ghosts are left out, nodes that coincide within rounding are merged,
+    and labels are taken from a cell field with a known name, such as "RegionId"; notes list this.
 
     Parameters
     ----------
     path : str or Path
         Its suffix is one of `tetopt.io.meshes.MESH_SUFFIXES`: .vtu, .vtk, .msh, .msh2.
+    label_field : str, optional
+        Name of the cell field with the labels.
+    mesh_units : {"m", "cm", "mm", "um"}, optional
+        The file's unit of length, by default the one that it states, or mm.
 
     Returns
     -------
@@ -52,7 +71,7 @@ def load_mesh(path: str | Path) -> MeshFile:
     ------
     InputError
         The file is missing or unreadable; it has no cells, or other cell types; triangles lie
-        outside the plane; cells are flat.
+        outside the plane; cells are flat; the named field is not one of labels.
 
     See Also
     --------
@@ -67,48 +86,87 @@ def load_mesh(path: str | Path) -> MeshFile:
     >>> bool((file.mesh.points == mesh.points).all()), file.cell_data["mean"].shape
     (True, (1200,))
     """
+    if mesh_units not in (None, *LENGTH_UNITS):
+        raise InputError(f"`mesh_units`: expected {', '.join(LENGTH_UNITS)}, got {mesh_units!r}")
     path = regular_file(path, "mesh file")
-    if path.suffix.lower() == ".pvtu":
-        raise InputError(f"{path}: cannot read .pvtu; save the mesh as .vtu in ParaView")
-    if path.suffix.lower() not in MESH_SUFFIXES:
-        raise InputError(
-            f"{path}: expected a {', '.join(MESH_SUFFIXES[:-1])} or {MESH_SUFFIXES[-1]} mesh"
-        )
-    try:
-        raw = read_msh(path) if path.suffix.lower() in (".msh", ".msh2") else _read_vtk(path)
-    except InputError as error:
-        raise InputError(f"{path}: {plain(str(error))}") from error
-    units = STRESS_UNITS.get(text_in(raw.field_data, "units") or "kPa")
-    if units is not None and units.mm != 1.0:
-        raw = raw._replace(points=raw.points * units.mm)
+    raw = _read(path)
+    stress = STRESS_UNITS.get(text_in(raw.field_data, "units") or "kPa")
+    mm = (1.0 if stress is None else stress.mm) if mesh_units is None else LENGTH_UNITS[mesh_units]
+    if mm != 1.0:
+        raw = raw._replace(points=raw.points * mm)
     with prefix_errors(path):
+        raw = without_ghosts(raw)
         kind = kind_of_cells(raw.cells)
         n = CELL_DIMENSIONS[kind]
+        raw = with_merged_nodes(raw, kind)
         points = half_turn(raw.points) if n == 3 and raw.space == "lps" else raw.points
         picked = simplices_of(points, raw.cells[kind], raw.middles.get(kind))
         middles, is_curved, of_edges = _middles(raw, kind)
         mesh = Mesh(picked.points, picked.cells, points[middles, :n] if is_curved else None)
-    used = picked.used
-    sets, of_sets = (
-        _sets_of_groups(raw, mesh, kind, used) if raw.groups else sets_in(raw.field_data, mesh)
-    )
-    shown = {f"{ON_PREFIX}{name}" for name in sets.facets}  # which repeat the sets
-    at_nodes = {name: values for name, values in raw.point_data.items() if name not in shown}
-    of_cells = {name: values[kind] for name, values in raw.cell_data.items() if kind in values}
-    (cell_data, point_data), notes = _numbers(raw, n, of_cells, at_nodes)
+        used = picked.used
+        sets, of_sets = (
+            _sets_of_groups(raw, mesh, kind, used) if raw.groups else sets_in(raw.field_data, mesh)
+        )
+        shown = {f"{ON_PREFIX}{name}" for name in sets.facets}  # which repeat the sets
+        at_nodes = {name: values for name, values in raw.point_data.items() if name not in shown}
+        of_cells = {name: values[kind] for name, values in raw.cell_data.items() if kind in values}
+        (cell_data, point_data), notes = _numbers(raw, n, mm, of_cells, at_nodes)
+        cell_data, of_labels = with_labels(cell_data, len(mesh.cells), label_field)
+    field_data, moved = _without_former_place(raw.field_data, mesh)
     return MeshFile(
         mesh,
         cell_data,
-        raw.field_data,
+        field_data,
         picked.n_turned,
         sum(len(others) for name, others in raw.cells.items() if name != kind),
         sets,
-        box_in(raw.field_data, n),
+        box_in(field_data, n),
         raw.space,
-        (*raw.notes, *notes, *of_sets, *of_edges),
+        (
+            *raw.notes,
+            *notes,
+            *of_sets,
+            *of_edges,
+            *of_labels,
+            *moved,
+            *(() if MASK_TEXT in field_data else piece_words(mesh)),
+        ),
         2 if kind in raw.middles else 1,
         {name: values[np.concatenate([used, middles])] for name, values in point_data.items()},
     )
+
+
+def _read(path: Path) -> Raw:
+    """Read a file by its suffix."""
+    suffix = path.suffix.lower()
+    if suffix == ".pvtu":
+        raise InputError(f"{path}: cannot read .pvtu; save the mesh as .vtu in ParaView")
+    if suffix not in MESH_SUFFIXES:
+        raise InputError(
+            f"{path}: expected a {', '.join(MESH_SUFFIXES[:-1])} or {MESH_SUFFIXES[-1]} mesh"
+        )
+    try:
+        return read_msh(path) if suffix in (".msh", ".msh2") else _read_vtk(path)
+    except InputError as error:
+        raise InputError(f"{path}: {plain(str(error))}") from error
+
+
+def _without_former_place(field_data: Arrays, mesh: Mesh) -> tuple[Arrays, tuple[str, ...]]:
+    """Return a file's texts, without those of the run that built the mesh if nodes were moved
+    since; and a note on this.
+    """
+    words = text_in(field_data, POINTS_TEXT) or ""
+    now = points_words(mesh)
+    # if another program left out cells, the others may be in place
+    is_whole = words.partition(":")[0] == now.partition(":")[0]
+    if words == now or not (is_whole or words.startswith(MOVED)):
+        return {name: each for name, each in field_data.items() if name != POINTS_TEXT}, ()
+    had_mask = MASK_TEXT in field_data or words == MOVED_FROM_MASK
+    lost = (MASK_TEXT, "options", "violated", "box")
+    texts = {name: each for name, each in field_data.items() if name not in lost}
+    texts[POINTS_TEXT] = np.array([MOVED_FROM_MASK if had_mask else MOVED])
+    remedy = "; its mask no longer fits: pass `mask`" if had_mask else ""
+    return texts, (f"its nodes were moved after meshing{remedy}",)
 
 
 def _middles(raw: Raw, kind: str) -> tuple[Ints, bool, tuple[str, ...]]:
@@ -136,9 +194,11 @@ def _middles(raw: Raw, kind: str) -> tuple[Ints, bool, tuple[str, ...]]:
 
 
 def _numbers(
-    raw: Raw, ndim: int, cell_data: Arrays, point_data: Arrays
+    raw: Raw, ndim: int, mm: float, cell_data: Arrays, point_data: Arrays
 ) -> tuple[list[Arrays], tuple[str, ...]]:
-    """Return numeric cell data and point data in RAS+ and kPa, and notes on dropped data."""
+    """Return numeric cell data and point data in RAS+, kPa and mm, and notes on dropped data; `mm`
+    is the length of the file's unit.
+    """
     fields = []
     notes = []
     for what, values_of in (("cell", cell_data), ("point", point_data)):
@@ -150,7 +210,7 @@ def _numbers(
         fields.append(numbers)
     name = text_in(raw.field_data, "units") or "kPa"
     if (units := STRESS_UNITS.get(name)) is not None:
-        fields = [scaled_fields(each, units.kPa, units.mm, ndim) for each in fields]
+        fields = [scaled_fields(each, units.kPa, mm, ndim) for each in fields]
     elif lost := [name for each in fields for name in each if is_stress(name)]:
         lost += ["nu", "material", "density"] if "young" in lost else []
         fields = [

@@ -16,14 +16,15 @@ from tetopt.io.meshes import load_mesh
 from tetopt.io.text import list_names
 from tetopt.job.events import note, warning
 from tetopt.job.option_values import file_and_volume
+from tetopt.job.options import MeshPart
 from tetopt.mesh import Mesh
 from tetopt.model.file import MeshFile, words_of_other_box
 from tetopt.model.label_names import NO_TABLE
 
 
-def read_mesh(path: Path) -> MeshFile:
+def read_mesh(path: Path, part: MeshPart) -> MeshFile:
     """Read a mesh of the user's; report inverted, dropped and renamed parts."""
-    loaded = load_mesh(path)
+    loaded = load_mesh(path, label_field=part.label_field, mesh_units=part.mesh_units)
     if loaded.n_turned:
         warning(f"{path}: reoriented {loaded.n_turned} inverted cells")
     if loaded.n_left:

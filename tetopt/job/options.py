@@ -35,6 +35,7 @@ from tetopt.system.arrays import Json
 
 Lattice = Literal[Kind, "octree"]
 Method = Literal["fast", "paper"]
+LengthUnit = Literal["m", "cm", "mm", "um"]
 
 
 class Option(NamedTuple):
@@ -107,7 +108,21 @@ MaskLabelOption = Annotated[
 
 
 @dataclass(frozen=True, kw_only=True)
-class MaskPart:
+class MeshPart:
+    """Properties of another program's mesh that its file does not state."""
+
+    label_field: Annotated[
+        str | None,
+        Option("NAME", "Cell field of the mesh with its labels (default: one of a known name)."),
+    ] = None
+    mesh_units: Annotated[
+        LengthUnit | None,
+        Option(None, "Length unit of the mesh's file (default: as it states, or mm)."),
+    ] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaskPart(MeshPart):
     """Mask of the voxels that count for a mesh's file, and whether the image may be another than
     the mesh's.
     """
@@ -350,7 +365,7 @@ class SizeOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class StartOptions:
+class StartOptions(MeshPart):
     """The initial mesh of a run."""
 
     panel: ClassVar[str] = "Initial mesh"

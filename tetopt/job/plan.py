@@ -27,7 +27,7 @@ from tetopt.io.images import check_bounds, file_shape, parse_crop, parse_slice, 
 from tetopt.io.label_tables import NO_TABLE, LabelTable
 from tetopt.job.aligned import read_companion
 from tetopt.job.option_values import balance_of, label_sizes_of, number_of
-from tetopt.job.options import JobOptions, Method
+from tetopt.job.options import JobOptions, MeshPart, Method
 from tetopt.job.solver_files import check_solver_options
 from tetopt.model.mappings import named_file
 from tetopt.model.tissues import groups_of
@@ -314,6 +314,8 @@ def _mode(job: JobOptions) -> Mode:
                 "`start`: only with `method` fast, which preserves a non-convex boundary"
             )
         return "start"
+    if stated := [name for name in vars(MeshPart()) if getattr(job, name) is not None]:
+        raise InputError(f"`{stated[0]}`: needs `start`")
     if is_paper:
         return "paper"
     is_lattice = job.uniform or job.spacing is not None or job.lattice not in (None, "octree")

@@ -66,7 +66,7 @@ def read(job: Job) -> Task:
 
 def read_planned(plan: Plan) -> Task:
     """Read the files of a plan, and fill in the defaults that depend on them."""
-    start = None if plan.job.start is None else read_mesh(plan.job.start)
+    start = None if plan.job.start is None else read_mesh(plan.job.start, plan.job)
     source = read_source(plan.job, plan.job.label_names, loaded=start)
     if start is not None:
         image = source.contrasts[0]

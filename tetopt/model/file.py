@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -45,6 +46,10 @@ MATERIAL_FIELDS = ("young", "nu", "density", "material", GAUSS_MODULI)
 MODULUS_ROUNDING = 1e-9
 # text of a mesh's file: `tetopt.contents.domain.mask_text` of what the mesh was built within
 MASK_TEXT = "mask"
+# text of a mesh's file: `points_words` of the built mesh, or that its nodes were moved since
+POINTS_TEXT = "points_sha256"
+MOVED = "moved"
+MOVED_FROM_MASK = f"{MOVED} from the mask"
 # those that are kept in a new file
 TEXTS_KEPT = ("image", "image_sha256", "inputs", "options", "violated", MASK_TEXT)
 REACTIONS_TEXT = r"reactions(_step\d+)?"  # texts of a solved mesh's file
@@ -99,6 +104,11 @@ class MeshFile(NamedTuple):
     notes: tuple[str, ...] = ()
     order: int = 1
     point_data: Arrays = {}  # noqa: RUF012 - never changed
+
+    @property
+    def is_moved(self) -> bool:
+        """True if another program moved nodes after tetopt had built the mesh."""
+        return POINTS_TEXT in self.field_data
 
     @property
     def labels(self) -> Ints | None:
@@ -187,11 +197,20 @@ def text_in(field_data: Arrays, name: str) -> str | None:
     return str(values.ravel()[0]) if values.dtype.kind == "U" and values.size else None
 
 
-def texts_of(loaded: MeshFile, *, is_other: bool = False) -> Json:
-    """Return the texts of a mesh's file to keep in another file; with another image, only that
-    on the mesh's mask.
+def points_words(mesh: Mesh) -> str:
+    """Return the numbers of a mesh's nodes and cells, and the checksum of its points in single
+    precision, to which other programs may round them.
     """
-    kept = (MASK_TEXT,) if is_other else TEXTS_KEPT
+    single = np.ascontiguousarray(mesh.points + 0.0, dtype="<f4")  # + 0.0: no -0
+    digest = hashlib.sha256(single.tobytes()).hexdigest()
+    return f"{len(mesh.points)} nodes, {len(mesh.cells)} cells: {digest}"
+
+
+def texts_of(loaded: MeshFile, *, is_other: bool = False) -> Json:
+    """Return the texts of a mesh's file to keep in another file; with another image, only those
+    on the mesh's mask and place.
+    """
+    kept = (MASK_TEXT, POINTS_TEXT) if is_other else (*TEXTS_KEPT, POINTS_TEXT)
     return {name: text for name in kept if (text := loaded.text(name)) is not None}
 
 
@@ -238,6 +257,8 @@ def own_mask(loaded: MeshFile, image: Image) -> Image | None:
     inputs = loaded.table("inputs")
     name = inputs.get("mask")
     level = inputs.get("background")
+    if loaded.text(POINTS_TEXT) == MOVED_FROM_MASK:
+        raise InputError("its nodes were moved after meshing, away from its mask: pass `mask`")
     if name is None and level is None:
         return None
     name = f"the foreground above {level}" if name is None else f"the mask {name}"

@@ -1,0 +1,258 @@
+"""Meshes as other programs write them: pieces, ghosts, labels by other names, values by number."""
+
+import numpy as np
+import pytest
+import pyvista
+from commands import assert_done, exit_code
+from numpy.testing import assert_allclose, assert_array_equal
+from refusals import refusal
+
+from tetopt import Image, load_mesh, save_image, save_mesh
+from tetopt.geometry.quadratic import quadratic
+from tetopt.interop.conversions import VTK_KINDS
+from tetopt.start.lattice import lattice_mesh
+
+SHAPES = [(n, order) for n in (2, 3) for order in (1, 2)]
+
+
+def image_of(n):
+    """Of 12 mm a side, from 0."""
+    affine = np.diag([1.0] * (n + 1))
+    affine[:n, n] = 0.5
+    return Image(np.random.default_rng(0).normal(size=(12,) * n), affine)
+
+
+def box_mesh(n):
+    return lattice_mesh(image_of(n), blocks=(2,) * n)
+
+
+def nodes_of(mesh, order):
+    """Nodes in space, and cells of the order."""
+    nodes, cells = (mesh.points, mesh.cells) if order == 1 else quadratic(mesh.points, mesh.cells)
+    return np.column_stack([nodes, np.zeros((len(nodes), 3 - mesh.ndim))]), cells
+
+
+def grid_of(points, cells, n, order=1, **data):
+    grid = pyvista.UnstructuredGrid({VTK_KINDS[n, order]: cells}, points)
+    for name, values in data.items():
+        grid.cell_data[name] = values
+    return grid
+
+
+def pieces(n, order, by=0.0):
+    """Two halves of a box, each with nodes of its own; those of the second are off by `by`."""
+    points, cells = nodes_of(box_mesh(n), order)
+    parts = np.array_split(cells, 2)
+    used, first = np.unique(parts[0], return_inverse=True)
+    others, second = np.unique(parts[1], return_inverse=True)
+    both = np.vstack([first.reshape(parts[0].shape), second.reshape(parts[1].shape) + len(used)])
+    return np.vstack([points[used], points[others] + by]), both
+
+
+@pytest.mark.parametrize(("n", "order"), SHAPES)
+@pytest.mark.parametrize("suffix", [".vtu", ".vtk"])
+@pytest.mark.parametrize("by", [0.0, 1e-7])
+def test_pieces_share_their_nodes(n, order, suffix, by, here):
+    points, cells = pieces(n, order, by * (np.arange(3) < n))
+    grid = grid_of(points, cells, n, order)
+    grid.point_data["x"] = points[:, 0]
+    grid.save(f"a{suffix}")
+    loaded, mesh = load_mesh(f"a{suffix}"), box_mesh(n)
+    whole = nodes_of(mesh, order)[0]
+    assert len(loaded.mesh.points) == len(mesh.points)
+    assert len(loaded.point_data["x"]) == len(whole)
+    n_merged = len(points) - len(whole)
+    assert any(f"merged {n_merged} nodes" in note for note in loaded.notes)
+    assert not any("pieces" in note for note in loaded.notes)
+    assert loaded.mesh.midpoints is None
+    assert_allclose(loaded.mesh.cell_volumes.sum(), 12.0**n)
+    assert_allclose(loaded.point_data["x"][: len(mesh.points)], loaded.mesh.points[:, 0])
+
+
+def test_values_that_differ_at_merged_nodes_are_told(here):
+    points, cells = pieces(3, 1)
+    grid = grid_of(points, cells, 3)
+    grid.point_data["jump"] = np.arange(len(points), dtype=float)
+    grid.save("a.vtu")
+    assert any("jump" in note for note in load_mesh("a.vtu").notes)
+
+
+@pytest.mark.parametrize("size", [1e-6, 1e-4])
+def test_nodes_of_tiny_cells_stay_apart(size, here):
+    points, cells = nodes_of(box_mesh(3), 1)
+    grid_of(100.0 + size * points, cells, 3).save("a.vtu")
+    loaded = load_mesh("a.vtu")
+    assert (len(loaded.mesh.points), loaded.notes) == (len(points), ())
+
+
+@pytest.mark.parametrize(
+    "command", ["quality a.vtu", "convert a.vtu b.vtu", "surface a.vtu -o b.stl --label 1"]
+)
+def test_pieces_that_stay_apart_are_told(command, here, capsys):
+    points, cells = nodes_of(box_mesh(3), 1)
+    both = np.vstack([points, points + [12.5, 0.0, 0.0]])
+    grid_of(both, np.vstack([cells, cells + len(points)]), 3, label=np.ones(2 * len(cells))).save(
+        "a.vtu"
+    )
+    exit_code(command)
+    assert "2 pieces" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize(("bits", "is_left"), [(1, True), (32, True), (33, True), (2, False)])
+def test_ghosts_are_left_out(bits, is_left, order, here):
+    mesh = box_mesh(3)
+    points, cells = nodes_of(mesh, order)
+    ghosts = np.zeros(len(cells), dtype=np.uint8)
+    ghosts[3:7] = bits
+    grid_of(points, cells, 3, order, vtkGhostType=ghosts, x=np.arange(len(cells))).save("a.vtu")
+    loaded = load_mesh("a.vtu")
+    stays = (ghosts == 0) | (not is_left)
+    assert_array_equal(loaded.cell_data["x"], np.flatnonzero(stays))
+    assert_allclose(loaded.mesh.cell_volumes, mesh.cell_volumes[stays])
+    assert any("4 ghost" in note for note in loaded.notes) == is_left
+
+
+def test_ghosts_that_repeat_cells_of_another_piece(here):
+    """As parallel programs write them: the second piece has copies of cells of the first."""
+    points, cells = pieces(3, 1)
+    copied = cells[:5]
+    used, again = np.unique(copied, return_inverse=True)
+    ghosts = np.zeros(len(cells) + 5, dtype=np.uint8)
+    ghosts[-5:] = 1
+    both = np.vstack([cells, again.reshape(5, 4) + len(points)])
+    grid_of(np.vstack([points, points[used]]), both, 3, vtkGhostType=ghosts).save("a.vtu")
+    mesh = load_mesh("a.vtu").mesh
+    assert_allclose(mesh.cell_volumes.sum(), 12.0**3)
+    assert len(mesh.points) == len(box_mesh(3).points)
+
+
+NAMES = ["medit:ref", "gmsh:physical", "labels", "RegionId", "MaterialIDs", "subdomains", "Tissue"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("kind", ["i4", "f4", "i8"])
+def test_labels_by_a_known_name(name, kind, here):
+    points, cells = nodes_of(box_mesh(3), 1)
+    values = np.arange(len(cells)) % 3
+    grid_of(points, cells, 3, size=np.ones(len(cells)), **{name: values.astype(kind)}).save("a.vtu")
+    loaded = load_mesh("a.vtu")
+    assert_array_equal(loaded.labels, values)
+    assert any(name in note for note in loaded.notes)
+
+
+def test_fields_that_are_no_labels(here):
+    """Fractions, numbers below 0, and bins of a modulus are no tissues."""
+    points, cells = nodes_of(box_mesh(3), 1)
+    some = np.arange(len(cells))
+    grid_of(
+        points, cells, 3, region=some / 2, tissue=some - 1, young=1.0 + some, material=some
+    ).save("a.vtu")
+    assert load_mesh("a.vtu").labels is None
+
+
+def test_a_named_field_of_labels(here, capsys):
+    points, cells = nodes_of(box_mesh(3), 1)
+    own = np.arange(len(cells)) % 3
+    grid_of(points, cells, 3, labels=own, organ=own + 4, volume=own / 2).save("a.vtu")
+    assert_array_equal(load_mesh("a.vtu", label_field="organ").labels, own + 4)
+    assert_done("convert a.vtu b.vtu --label-field organ")
+    assert set(load_mesh("b.vtu").labels) == {4, 5, 6}
+    for name in ("volume", "nothing"):
+        with refusal(f"label_field.*{name}.*organ"):
+            load_mesh("a.vtu", label_field=name)
+        assert exit_code("quality a.vtu --label-field", name) == 2
+        assert "--label-field" in capsys.readouterr().err
+
+
+# --------------------------------------------------------------------------------------------------
+# gmsh's values
+
+
+def text_of(*columns):
+    rows = zip(*(np.reshape(each, (len(each), -1)).tolist() for each in columns), strict=True)
+    return "".join(" ".join(str(x) for part in row for x in part) + "\n" for row in rows).encode()
+
+
+def bytes_of(*columns):
+    kinds = [
+        (f"c{k}", "<i4" if np.asarray(each).dtype.kind == "i" else "<f8", np.shape(each)[1:])
+        for k, each in enumerate(columns)
+    ]
+    table = np.zeros(len(columns[0]), kinds)
+    for k, each in enumerate(columns):
+        table[f"c{k}"] = each
+    return table.tobytes()
+
+
+def write_22(path, mesh, numbers, views, is_binary):
+    """Nodes and tetrahedra with `numbers`, and one triangle on them before these."""
+    write = bytes_of if is_binary else text_of
+    end = b"\n" * is_binary
+    at_nodes = 10 + np.arange(len(mesh.points))
+    parts = [(2, [5], mesh.cells[:1, :3]), (4, numbers, mesh.cells)]
+    body = b"$MeshFormat\n2.2 %d 8\n" % is_binary + (b"\1\0\0\0\n" if is_binary else b"")
+    body += b"$EndMeshFormat\n$Nodes\n%d\n" % len(mesh.points) + write(at_nodes, mesh.points) + end
+    body += b"$EndNodes\n$Elements\n%d\n" % (1 + len(mesh.cells))
+    for kind, own, cells in parts:
+        own = np.array(own)
+        two = np.full((len(own), 2), 1)
+        if is_binary:
+            body += bytes_of(np.array([[kind, len(own), 2]])) + bytes_of(own, two, cells + 10)
+        else:
+            head = np.tile([kind, 2], (len(own), 1))
+            body += text_of(own, head, two, cells + 10)
+    body += end + b"$EndElements\n"
+    for section, name, own, values in views:
+        width = values[0].size
+        body += b'$%s\n1\n"%s"\n1\n0.0\n3\n0\n%d\n%d\n' % (section, name, width, len(own))
+        body += write(np.array(own), values) + end + b"$End%s\n" % section
+    path.write_bytes(body)
+
+
+@pytest.mark.parametrize("is_binary", [False, True])
+def test_values_belong_to_numbers(is_binary, here):
+    """Elements in any order with any numbers, rows of views in another; NaN where there is none."""
+    mesh = box_mesh(3)
+    rng = np.random.default_rng(0)
+    numbers = 100 + rng.permutation(len(mesh.cells))
+    rows, few = rng.permutation(len(mesh.cells)), np.arange(0, len(mesh.cells), 3)
+    x = mesh.points[mesh.cells].mean(axis=1)
+    views = [
+        (b"ElementData", b"x", numbers[rows], x[rows, 0]),
+        (b"ElementData", b"part", numbers[few], x[few]),
+        (b"ElementData", b"skin", [5], np.ones(1)),
+        (b"NodeData", b"y", [13, 11], np.array([3.5, 1.5])),
+    ]
+    write_22(here / "a.msh", mesh, numbers, views, is_binary)
+    loaded = load_mesh("a.msh")
+    assert_array_equal(loaded.mesh.points, mesh.points)
+    assert_array_equal(loaded.mesh.cells, mesh.cells)
+    assert_array_equal(loaded.cell_data["x"], x[:, 0])
+    assert_array_equal(loaded.cell_data["part"][few], x[few])
+    assert np.isnan(np.delete(loaded.cell_data["part"], few, axis=0)).all()
+    assert "skin" not in loaded.cell_data
+    assert_array_equal(loaded.point_data["y"][[1, 3]], [1.5, 3.5])
+    assert np.isnan(np.delete(loaded.point_data["y"], [1, 3])).all()
+    assert len(loaded.sets.facets) == 1
+
+
+def test_partial_values_are_missing_voxels(here):
+    mesh, image = box_mesh(3), image_of(3)
+    save_image("i.nii.gz", image)
+    few = np.arange(0, len(mesh.cells), 2)
+    views = [(b"ElementData", b"x", 100 + few, np.ones(len(few)))]
+    write_22(here / "a.msh", mesh, 100 + np.arange(len(mesh.cells)), views, False)
+    assert_done("convert a.msh x.nii.gz --like i.nii.gz --field x")
+    import nibabel
+
+    values = nibabel.load("x.nii.gz").get_fdata()
+    assert 0.2 < np.isnan(values).mean() < 0.8
+    assert set(values[np.isfinite(values)]) == {1.0}
+
+
+@pytest.mark.parametrize("version", ["1.0", "4.0"])
+def test_other_versions_of_gmsh_are_refused(version, here):
+    (here / "a.msh").write_text(f"$MeshFormat\n{version} 0 8\n$EndMeshFormat\n")
+    with refusal("2.2 or 4.1.*msh41"):
+        load_mesh("a.msh")

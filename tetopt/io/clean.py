@@ -1,0 +1,173 @@
+"""Cleaning of what a mesh's file holds: ghosts, nodes at one place, the field of labels."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from tetopt.errors import InputError
+from tetopt.geometry.quadratic import cell_edges
+from tetopt.geometry.topology import connected_sets
+from tetopt.io.raw import Raw
+from tetopt.io.text import list_names
+from tetopt.mesh import Mesh
+from tetopt.model.label_names import LABEL_FIELD, labels_of
+from tetopt.system.arrays import Arrays, Floats, Ints
+
+GHOST_FIELD = "vtkGhostType"
+# VTK's bits of cells that are elsewhere in the file, or not part of the mesh: DUPLICATECELL,
+# REFINEDCELL, HIDDENCELL
+GHOST_BITS = 1 | 8 | 32
+# of the largest coordinate: a few roundings to single precision, or the sixth digit of a text
+MERGE_FRACTION = 1e-6
+# of the shortest edge at both nodes, so that no two nodes of a tiny cell are merged
+MERGE_EDGE_FRACTION = 1e-3
+# Other programs' names of cell data with labels, in lower case, the most specific ones first.
+LABEL_NAMES = (
+    *("label", "labels", "medit:ref", "gmsh:physical", "tissue", "tissues", "tissue_type"),
+    *("regionid", "region_id", "modelregionid", "region", "regions", "materialid", "materialids"),
+    *("material_id", "material", "materials", "subdomain", "subdomains", "subdomain_id"),
+    *("domain", "domains", "domain_id", "cellentityids", "attribute", "attributes", "partid"),
+    *("elemtag", "cell_tags", "cell_markers", "segmentation", "seg", "tag", "tags", "ref"),
+)
+
+
+def without_ghosts(raw: Raw) -> Raw:
+    """Return a file's contents without cells that VTK's ghost array marks as copies or hidden."""
+    ghosts = raw.cell_data.get(GHOST_FIELD)
+    if ghosts is None:
+        return raw
+    is_kept = {
+        kind: (values.astype(np.int64) & GHOST_BITS).reshape(len(values), -1)[:, 0] == 0
+        for kind, values in ghosts.items()
+    }
+    n_left = sum(int((~each).sum()) for each in is_kept.values())
+
+    def kept(by_kind: Arrays) -> Arrays:
+        return {kind: rows[is_kept[kind]] for kind, rows in by_kind.items() if is_kept[kind].any()}
+
+    words = (
+        f"left out {n_left} ghost cells ({GHOST_FIELD}): copies of other pieces' cells, or hidden"
+    )
+    return raw._replace(
+        cells=kept(raw.cells),
+        middles=kept(raw.middles),
+        cell_data={
+            name: kept(by_kind) for name, by_kind in raw.cell_data.items() if name != GHOST_FIELD
+        },
+        notes=(*raw.notes, *[words] * bool(n_left)),
+    )
+
+
+def with_merged_nodes(raw: Raw, kind: str) -> Raw:
+    """Return a file's contents with one node for those that coincide within rounding.
+
+    Parameters
+    ----------
+    raw : Raw
+    kind : str
+        The type of the mesh's cells.
+    """
+    points = raw.points
+    corners = raw.cells[kind]
+    middles = raw.middles.get(kind, np.empty((len(corners), 0), dtype=np.int64))
+    nodes = np.concatenate([each.ravel() for each in (*raw.cells.values(), middles)])
+    is_used = np.zeros(len(points), dtype=bool)
+    is_sound = nodes.min() >= 0 and nodes.max() < len(points)
+    if not is_sound or not np.isfinite(points[nodes]).all():
+        return raw  # refused when the mesh is made
+    is_used[nodes] = True
+    used = np.flatnonzero(is_used)
+    tolerance = MERGE_FRACTION * float(np.abs(points[used]).max())
+    pairs = used[KDTree(points[used]).query_pairs(tolerance, output_type="ndarray")]
+    if len(pairs):
+        apart = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
+        shortest = _shortest_edges(points, corners, middles)[pairs].min(axis=1)
+        pairs = pairs[apart <= MERGE_EDGE_FRACTION * shortest]
+    if not len(pairs):
+        return raw
+    count, number = connected_sets(pairs[:, 0], pairs[:, 1], len(points))
+    first = np.full(count, len(points))
+    np.minimum.at(first, number, np.arange(len(points)))
+    to = first[number]
+    differing = [
+        name
+        for name, values in raw.point_data.items()
+        if not np.array_equal(values[to[used]], values[used], equal_nan=values.dtype.kind == "f")
+    ]
+    words = f"merged {len(points) - count} nodes with others at the same place"
+    words += f"; their {list_names(differing)} differ: using the first" if differing else ""
+    return raw._replace(
+        cells={name: to[rows] for name, rows in raw.cells.items()},
+        middles={name: to[rows] for name, rows in raw.middles.items()},
+        notes=(*raw.notes, words),
+    )
+
+
+def _shortest_edges(points: Floats, corners: Ints, middles: Ints) -> Floats:
+    """Return the length of the shortest edge at each point, (P,); half of it at its middle."""
+    shortest = np.full(len(points), np.inf)
+    for place, (start, end) in enumerate(cell_edges(corners.shape[1] - 1)):
+        length = np.linalg.norm(points[corners[:, start]] - points[corners[:, end]], axis=1)
+        for nodes in (corners[:, start], corners[:, end], *middles[:, place : place + 1].T):
+            np.minimum.at(shortest, nodes, 0.5 * length)
+    return shortest
+
+
+def piece_words(mesh: Mesh) -> tuple[str, ...]:
+    """Return a remark on a mesh whose pieces share no nodes; none for a single piece."""
+    n = mesh.ndim
+    starts, ends = mesh.cells[:, :n].ravel(), mesh.cells[:, 1:].ravel()
+    count, number = connected_sets(starts, ends, len(mesh.points))
+    if count == 1:
+        return ()
+    sizes = np.bincount(number[mesh.cells[:, 0]], mesh.cell_volumes)
+    return (
+        f"{count} pieces share no nodes, so that no force passes between them; the largest has "
+        f"{sizes.max() / sizes.sum():.1%} of the volume",
+    )
+
+
+def with_labels(
+    cell_data: Arrays, n_cells: int, name: str | None
+) -> tuple[Arrays, tuple[str, ...]]:
+    """Return cell data with the labels as field "label", and a note on the field they are from.
+
+    Parameters
+    ----------
+    cell_data : dict of arrays of numbers
+    n_cells : int
+    name : str, optional
+        The field of labels; by default the first of `LABEL_NAMES` that has any but 0.
+
+    Raises
+    ------
+    InputError
+        The named field does not exist, or is not one whole number from 0 for each cell.
+    """
+    fields = {}
+    for each, values in cell_data.items():
+        column = values.reshape(-1) if values.shape[1:] == (1,) else values
+        if (labels := labels_of({LABEL_FIELD: column}, n_cells)) is not None:
+            fields[each] = labels
+    if name is not None:
+        if name not in fields:
+            raise InputError(
+                f'`label_field`: expected a cell field of whole numbers from 0, got "{name}"; '
+                f"there are {list_names([*fields]) or 'none'}"
+            )
+        return cell_data | {LABEL_FIELD: fields[name]}, ()
+    if LABEL_FIELD in cell_data:
+        return cell_data, ()
+    # a material of a modulus is a bin, not a tissue
+    known = {
+        each.lower(): each
+        for each, labels in fields.items()
+        if labels.any() and not ("young" in cell_data and each == "material")
+    }
+    names = [known[each] for each in LABEL_NAMES if each in known]
+    if not names:
+        return cell_data, ()
+    words = f'labels are those of cell field "{names[0]}"'
+    words += f"; `label_field` takes another, {list_names(names[1:])}" if names[1:] else ""
+    return {LABEL_FIELD: fields[names[0]]} | cell_data, (words,)
