@@ -7,7 +7,7 @@ from commands import assert_done, exit_code
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusal
 
-from tetopt import Image, load_mesh, save_image, save_mesh
+from tetopt import Image, load_mesh, save_image
 from tetopt.geometry.quadratic import quadratic
 from tetopt.interop.conversions import VTK_KINDS
 from tetopt.start.lattice import lattice_mesh
@@ -90,7 +90,7 @@ def test_nodes_of_tiny_cells_stay_apart(size, here):
 )
 def test_pieces_that_stay_apart_are_told(command, here, capsys):
     points, cells = nodes_of(box_mesh(3), 1)
-    both = np.vstack([points, points + [12.5, 0.0, 0.0]])
+    both = np.vstack([points, points + 12.5])
     grid_of(both, np.vstack([cells, cells + len(points)]), 3, label=np.ones(2 * len(cells))).save(
         "a.vtu"
     )

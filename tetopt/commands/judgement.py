@@ -81,10 +81,11 @@ class Judgement(NamedTuple):
 
     @property
     def is_filled(self) -> bool:
-        """True if the mesh should fill the image's box: neither built within a mask nor from
-        another mesh.
+        """True if the mesh should fill the image's box: neither built within a mask, nor from
+        another mesh, nor moved since.
         """
-        return not self.is_masked and self.loaded.table("options").get("start") is None
+        was_started = self.loaded.table("options").get("start") is not None
+        return not (self.is_masked or self.loaded.is_moved or was_started)
 
     @property
     def left_out(self) -> list[str]:
@@ -317,7 +318,9 @@ def _measure_fit(judgement: Judgement, names: Names) -> Judgement:
     if not source.content.is_plain:
         measured["contrasts"] = source.by_contrast(cell_moments(source.image, mesh)._asdict())
     judgement = judgement._replace(fit=fit, measured=measured)
-    return judgement._replace(violated=judge_rows(rows, judgement.required))
+    # the run's requirements were those of the nodes' former place
+    violated = {} if loaded.is_moved else judge_rows(rows, judgement.required)
+    return judgement._replace(violated=violated)
 
 
 def _number(value: Any) -> float | None:

@@ -25,7 +25,7 @@ from tetopt.io.vtk import VTK_SUFFIXES, vtk, vtu
 from tetopt.io.xdmf import xdmf
 from tetopt.mesh import Mesh
 from tetopt.model.fields import node_field
-from tetopt.model.file import MASK_TEXT, POINTS_TEXT, points_words
+from tetopt.model.file import MASK_TEXT, PLACE_TEXT, place_words
 from tetopt.model.loads import known_set
 from tetopt.model.materials import Materials
 from tetopt.model.model import Model, in_space, in_units, locking_words
@@ -287,9 +287,9 @@ def file_bytes(path: Path, model: Model, *, space: str = "ras", units: str = "kP
         able = ", ".join(name for name, other in FORMATS.items() if other.has_quadratic)
         raise InputError(f"{path}: only {able} support quadratic cells; omit `order` 2")
     checked = _check_model(path, model)
-    if POINTS_TEXT not in checked.about and not {MASK_TEXT, "options"}.isdisjoint(checked.about):
-        of_points = {POINTS_TEXT: points_words(checked.mesh)}
-        checked = checked._replace(about={**checked.about, **of_points})
+    if PLACE_TEXT not in checked.about and not {MASK_TEXT, "options"}.isdisjoint(checked.about):
+        of_place = {PLACE_TEXT: place_words(checked.mesh)}
+        checked = checked._replace(about={**checked.about, **of_place})
     ready = in_units(in_space(checked, space), units)
     whole = kind.write(_rename_data(path, ready))
     return whole.encode() if isinstance(whole, str) else whole

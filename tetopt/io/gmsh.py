@@ -57,7 +57,7 @@ from tetopt.io.tags import (
     without_labels,
 )
 from tetopt.io.text import comment_lines, names_apart, rows
-from tetopt.model.file import MASK_TEXT, MOVED, POINTS_TEXT
+from tetopt.model.file import MASK_TEXT, MOVED, PLACE_TEXT
 from tetopt.model.model import Model, element_facets, elements
 from tetopt.model.sets import facet_triples
 from tetopt.system.arrays import Arrays, Floats, Ints
@@ -70,7 +70,7 @@ TET10_ORDER = np.array([0, 1, 2, 3, 4, 5, 6, 7, 9, 8])
 VIEW_SHAPES = ((3,), (9,))  # of a row: views can hold vectors and tensors
 LABEL_COMMENT = "physical groups of cells are the labels; label 0 is {}"
 NUMBER_COMMENT = "physical group {} is label {}"
-TEXTS = (MASK_TEXT, "violated", POINTS_TEXT)  # in the comments
+TEXTS = (MASK_TEXT, "violated", PLACE_TEXT)  # in the comments
 # with 200,000, gmsh takes minutes to open a 2.2 file, and meshio hours for a 4.1 file
 MOST_MATERIAL_GROUPS = 1000
 

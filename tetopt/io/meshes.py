@@ -29,9 +29,9 @@ from tetopt.model.file import (
     MASK_TEXT,
     MOVED,
     MOVED_FROM_MASK,
-    POINTS_TEXT,
+    PLACE_TEXT,
     MeshFile,
-    points_words,
+    is_moved_from,
     text_in,
 )
 from tetopt.model.model import ON_PREFIX, STRESS_UNITS, half_turn
@@ -155,16 +155,13 @@ def _without_former_place(field_data: Arrays, mesh: Mesh) -> tuple[Arrays, tuple
     """Return a file's texts, without those of the run that built the mesh if nodes were moved
     since; and a note on this.
     """
-    words = text_in(field_data, POINTS_TEXT) or ""
-    now = points_words(mesh)
-    # if another program left out cells, the others may be in place
-    is_whole = words.partition(":")[0] == now.partition(":")[0]
-    if words == now or not (is_whole or words.startswith(MOVED)):
-        return {name: each for name, each in field_data.items() if name != POINTS_TEXT}, ()
+    words = text_in(field_data, PLACE_TEXT) or ""
+    if not words.startswith(MOVED) and not is_moved_from(words, mesh):
+        return {name: each for name, each in field_data.items() if name != PLACE_TEXT}, ()
     had_mask = MASK_TEXT in field_data or words == MOVED_FROM_MASK
     lost = (MASK_TEXT, "options", "violated", "box")
     texts = {name: each for name, each in field_data.items() if name not in lost}
-    texts[POINTS_TEXT] = np.array([MOVED_FROM_MASK if had_mask else MOVED])
+    texts[PLACE_TEXT] = np.array([MOVED_FROM_MASK if had_mask else MOVED])
     remedy = "; its mask no longer fits: pass `mask`" if had_mask else ""
     return texts, (f"its nodes were moved after meshing{remedy}",)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -46,8 +45,9 @@ MATERIAL_FIELDS = ("young", "nu", "density", "material", GAUSS_MODULI)
 MODULUS_ROUNDING = 1e-9
 # text of a mesh's file: `tetopt.contents.domain.mask_text` of what the mesh was built within
 MASK_TEXT = "mask"
-# text of a mesh's file: `points_words` of the built mesh, or that its nodes were moved since
-POINTS_TEXT = "points_sha256"
+# text of a mesh's file: `place_words` of the built mesh, or that its nodes were moved since
+PLACE_TEXT = "place"
+PLACE_ROUNDING = 1e-6  # of a coordinate, relative to the largest
 MOVED = "moved"
 MOVED_FROM_MASK = f"{MOVED} from the mask"
 # those that are kept in a new file
@@ -108,7 +108,7 @@ class MeshFile(NamedTuple):
     @property
     def is_moved(self) -> bool:
         """True if another program moved nodes after tetopt had built the mesh."""
-        return POINTS_TEXT in self.field_data
+        return PLACE_TEXT in self.field_data
 
     @property
     def labels(self) -> Ints | None:
@@ -197,20 +197,33 @@ def text_in(field_data: Arrays, name: str) -> str | None:
     return str(values.ravel()[0]) if values.dtype.kind == "U" and values.size else None
 
 
-def points_words(mesh: Mesh) -> str:
-    """Return the numbers of a mesh's nodes and cells, and the checksum of its points in single
-    precision, to which other programs may round them.
+def place_words(mesh: Mesh) -> str:
+    """Return the numbers of a mesh's nodes and cells, and a sum of its coordinates with weights
+    that any move changes; rounding hardly does, as by other programs to single precision.
     """
-    single = np.ascontiguousarray(mesh.points + 0.0, dtype="<f4")  # + 0.0: no -0
-    digest = hashlib.sha256(single.tobytes()).hexdigest()
-    return f"{len(mesh.points)} nodes, {len(mesh.cells)} cells: {digest}"
+    weights = np.sin(np.arange(mesh.points.size, dtype=np.float64) ** 2)
+    total = (weights * mesh.points.ravel()).sum()  # not by BLAS, which rounds by threads
+    return f"{len(mesh.points)} nodes, {len(mesh.cells)} cells: {total:.9g}"
+
+
+def is_moved_from(words: str, mesh: Mesh) -> bool:
+    """Return whether a mesh has nodes elsewhere than the one of `place_words`; False for other
+    numbers of nodes or cells, as those that another program left may be in place.
+    """
+    before, _, total = words.partition(": ")
+    now, _, own = place_words(mesh).partition(": ")
+    rounding = PLACE_ROUNDING * np.abs(mesh.points).max() * np.sqrt(mesh.points.size)
+    try:
+        return before == now and not abs(float(total) - float(own)) <= rounding
+    except ValueError:  # another program's
+        return False
 
 
 def texts_of(loaded: MeshFile, *, is_other: bool = False) -> Json:
     """Return the texts of a mesh's file to keep in another file; with another image, only those
     on the mesh's mask and place.
     """
-    kept = (MASK_TEXT, POINTS_TEXT) if is_other else (*TEXTS_KEPT, POINTS_TEXT)
+    kept = (MASK_TEXT, PLACE_TEXT) if is_other else (*TEXTS_KEPT, PLACE_TEXT)
     return {name: text for name in kept if (text := loaded.text(name)) is not None}
 
 
@@ -257,7 +270,7 @@ def own_mask(loaded: MeshFile, image: Image) -> Image | None:
     inputs = loaded.table("inputs")
     name = inputs.get("mask")
     level = inputs.get("background")
-    if loaded.text(POINTS_TEXT) == MOVED_FROM_MASK:
+    if loaded.text(PLACE_TEXT) == MOVED_FROM_MASK:
         raise InputError("its nodes were moved after meshing, away from its mask: pass `mask`")
     if name is None and level is None:
         return None
