@@ -47,7 +47,7 @@ MODULUS_ROUNDING = 1e-9
 MASK_TEXT = "mask"
 # text of a mesh's file: `place_words` of the built mesh, or that its nodes were moved since
 PLACE_TEXT = "place"
-PLACE_ROUNDING = 1e-6  # of a coordinate, relative to the largest
+MOVE_ROUNDING = 1e-6  # of a coordinate, relative to the largest
 MOVED = "moved"
 MOVED_FROM_MASK = f"{MOVED} from the mask"
 # those that are kept in a new file
@@ -212,7 +212,7 @@ def is_moved_from(words: str, mesh: Mesh) -> bool:
     """
     before, _, total = words.partition(": ")
     now, _, own = place_words(mesh).partition(": ")
-    rounding = PLACE_ROUNDING * np.abs(mesh.points).max() * np.sqrt(mesh.points.size)
+    rounding = MOVE_ROUNDING * np.abs(mesh.points).max() * np.sqrt(mesh.points.size)
     try:
         return before == now and not abs(float(total) - float(own)) <= rounding
     except ValueError:  # another program's
