@@ -240,6 +240,16 @@ def shifted_affine(affine: Floats, start: Sequence[int]) -> Floats:
     return shifted
 
 
+def check_image(what: str, image: Any) -> Image:
+    """Return an image; TypeError for anything else."""
+    if not isinstance(image, Image):
+        raise TypeError(
+            f"{what}: expected Image, got {type(image).__name__}; use tetopt.load_image(path) or "
+            "tetopt.Image(array, affine)"
+        )
+    return image
+
+
 def _check_data(data: ArrayLike) -> NDArray[np.floating]:
     """Return a read-only float32 or float64 C-ordered copy of `data`; raise InputError if it
     cannot be an image.
@@ -279,10 +289,6 @@ def check_kind(dtype: np.dtype) -> None:
     if dtype.names is not None or dtype.kind == "O":
         raise InputError(
             f"image data: expected one number per voxel, got {dtype}; convert RGB to grey first"
-        )
-    if dtype.kind == "c":
-        raise InputError(
-            "image data: expected real numbers, got complex ones; compute the magnitude first"
         )
     if dtype.kind not in "buif":
         raise InputError(f"image data: expected numbers, got dtype {dtype}")

@@ -9,13 +9,16 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
+import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from importlib.metadata import version
 from importlib.util import find_spec
+from multiprocessing import resource_tracker
 from typing import Any, NamedTuple
 
 from tetopt.errors import InputError
@@ -130,22 +133,50 @@ def workers(share: Share, scheduler: str | None, threads: int | None) -> Iterato
         with Client(scheduler, timeout=CONNECT_SECONDS) as client:
             yield Workers(client, threads or 1)
         return
-    with (
-        safe_path(),
-        dask.config.set(LOCAL_SETTINGS),
-        LocalCluster(
-            n_workers=share.workers,
-            threads_per_worker=1,  # simultaneous tasks
-            memory_limit=int(share.bytes),
-            dashboard_address="127.0.0.1:0",
-            env={THREADS_NAME: str(share.threads)},
-            silence_logs=logging.CRITICAL,
-            # keeps other users of this machine out; not False
-            security=find_spec("cryptography") is not None or None,
-        ) as cluster,
-        Client(cluster) as client,
-    ):
+    with safe_path(), dask.config.set(LOCAL_SETTINGS), ExitStack() as stack:
+        with _signals_deferred():
+            cluster = stack.enter_context(
+                LocalCluster(
+                    n_workers=share.workers,
+                    threads_per_worker=1,  # simultaneous tasks
+                    memory_limit=int(share.bytes),
+                    dashboard_address="127.0.0.1:0",
+                    env={THREADS_NAME: str(share.threads)},
+                    silence_logs=logging.CRITICAL,
+                    # keeps other users of this machine out; not False
+                    security=find_spec("cryptography") is not None or None,
+                )
+            )
+            client = stack.enter_context(Client(cluster))
         yield Workers(client, share.threads)
+
+
+@contextmanager
+def _signals_deferred() -> Iterator[None]:
+    """Defer Ctrl-C and SIGTERM to the end of the block, and keep Ctrl-C for good from the processes
+    that it starts.
+
+    dask prints where a signal meets it while it begins, and each of its processes does: a terminal
+    sends Ctrl-C to all. They inherit the mask, those that replace them, too, and end with this one.
+    """
+    if threading.current_thread() is not threading.main_thread() or os.name == "nt":
+        yield
+        return
+    came = list[int]()
+    resource_tracker.ensure_running()  # its start would end the mask of the thread
+    handlers = {
+        number: signal.signal(number, lambda number, _: came.append(number))
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        for number in came:
+            signal.raise_signal(number)
 
 
 def memory_limit() -> float:

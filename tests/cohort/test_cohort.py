@@ -143,11 +143,20 @@ def words_of_run():
     return Path("words.txt").read_text()
 
 
-def begin_run(n_meshes):
+def workers_of(run):
+    """Numbers of the processes of a run's workers."""
+    return [
+        child.pid
+        for child in psutil.Process(run.pid).children()
+        if "spawn_main" in " ".join(child.cmdline())
+    ]
+
+
+def begin_run(n_meshes, **options):
     """A run that has begun and has so many meshes, its words in a file."""
     command = [sys.executable, "-m", "tetopt", *f"{COHORT} --iterations 1 --nodes 60".split()]
     with open("words.txt", "w") as stream:
-        run = subprocess.Popen(command, stdout=stream, stderr=stream)
+        run = subprocess.Popen(command, stdout=stream, stderr=stream, **options)
     end = time.monotonic() + WAIT_SECONDS
     while len(meshes()) < n_meshes:
         assert run.poll() is None, words_of_run()
@@ -169,17 +178,23 @@ def test_ctrl_c_keeps_what_is_done_and_a_rerun_does_the_rest_though_a_worker_die
     assert os.listdir("out/.work") == ["tetopt-lock"]
     run = begin_run(len(first) + 1)
     # of the workers, whose child is a run of `tetopt mesh`, or could be
-    (worker, *_) = (
-        child.pid
-        for child in psutil.Process(run.pid).children()
-        if "spawn_main" in " ".join(child.cmdline())
-    )
-    os.kill(worker, signal.SIGKILL)
+    os.kill(workers_of(run)[0], signal.SIGKILL)
     assert run.wait(WAIT_SECONDS) == 0, words_of_run()
     second = meshes()
     assert list(second) == [f"sub-0{number}" for number in range(1, 6)]
     assert first.items() <= second.items()  # none is made again
     assert f"5 subjects: {len(first)} done" in words_of_run()
+
+
+@pytest.mark.deep
+def test_ctrl_c_while_workers_begin_is_one_line():
+    """A terminal sends it to all processes at once."""
+    run = begin_run(0, start_new_session=True)
+    while not workers_of(run):
+        assert run.poll() is None, words_of_run()
+    os.killpg(run.pid, signal.SIGINT)
+    assert run.wait(WAIT_SECONDS) == 130
+    assert "Traceback" not in words_of_run()
 
 
 def refused(capsys, options=""):

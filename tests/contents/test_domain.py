@@ -1,5 +1,8 @@
+import warnings
+
 import numpy as np
 import pytest
+from models import sample_image
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.ndimage import binary_opening, map_coordinates
 from shapes import OBLIQUE, ball_image, distance, grid, shaped
@@ -177,3 +180,11 @@ def test_voxels_in_cubes_of_two_are_scipys(shape):
     for fraction in (0.7, 0.9, 0.97):
         inside = rng.random(shape) < fraction
         assert_array_equal(_open_mask(inside), binary_opening(inside, np.ones((2,) * len(shape))))
+
+
+def test_a_mask_of_all_voxels_is_meshed_without_a_word():
+    image = sample_image(3)
+    whole = tetopt.content(image, mask=Image(np.ones(image.shape), image.affine))
+    with warnings.catch_warnings(action="error"):
+        result = tetopt.mesh_image(whole, 60, iterations=0)
+    assert result.mesh.cell_volumes.sum() == pytest.approx(image.volume)

@@ -143,3 +143,7 @@ def test_no_labels_no_sizes_by_label():
         mesh_image(image, 100, sizes=Sizes(cells_across=1))
     with pytest.raises(InputError, match="sizes_by_label"):
         tetopt.octree_mesh(image, 100, Sizes(cells_across=1))
+    labels = Image(np.round(image.data), image.affine)
+    stepped = tetopt.content(image, labels, smooth_interfaces=False)
+    with pytest.raises(InputError, match="smooth_interfaces"):
+        mesh_image(stepped, 100, sizes=Sizes(cells_across=1))

@@ -17,10 +17,56 @@ MESH = tetopt.Mesh([[0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 4]], [[0, 1, 2, 3]])
     ["a.nii", None, np.zeros((3, 4, 5)), nibabel.Nifti1Image(np.zeros((3, 4, 5)), np.eye(4))],
 )
 def test_what_is_no_image_is_told_how_to_become_one(what):
-    words = r"image: expected Image or Content, got \w+; use tetopt\.load_image"
-    for call in (tetopt.mesh_image, tetopt.octree_mesh):
+    words = r"image: expected Image, got \w+; use tetopt\.load_image"
+    for call in (
+        lambda image: tetopt.mesh_image(image, 500),
+        lambda image: tetopt.octree_mesh(image, 500),
+        lambda image: tetopt.lattice_mesh(image, nodes=500),
+        lambda image: tetopt.E_D(image, MESH),
+        lambda image: tetopt.field_on_image(MESH, MESH.points, image),
+    ):
         with pytest.raises(TypeError, match=words):
-            call(what, 500)
+            call(what)
+    if what is not None:  # which is no argument then
+        for call in (
+            lambda image: tetopt.content([image]),
+            lambda image: tetopt.content(IMAGE, image),
+            lambda image: tetopt.content(IMAGE, mask=image),
+            lambda image: tetopt.build_model(MESH, image),
+            lambda image: tetopt.cell_fields(MESH, image),
+            lambda image: tetopt.cell_labels(image, MESH),
+        ):
+            with pytest.raises(TypeError, match=r"expected Image, got \w+; use"):
+                call(what)
+
+
+def test_a_bare_array_is_no_content():
+    with pytest.raises(TypeError, match="images: expected Image, got ndarray"):
+        tetopt.content(IMAGE.data)
+
+
+@pytest.mark.parametrize("factor", [1j, 1 + 1j, 1 + 0j])
+def test_complex_numbers_keep_no_part_of_themselves(factor):
+    """None is dropped in silence, wherever arrays come in."""
+    for call in (
+        lambda: tetopt.Image(IMAGE.data * factor),
+        lambda: tetopt.Image(IMAGE.data, IMAGE.affine * factor),
+        lambda: tetopt.Mesh(MESH.points * factor, MESH.cells),
+        lambda: tetopt.build_model(MESH, young=np.ones(1) * factor),
+        lambda: tetopt.field_on_image(MESH, MESH.points * factor, IMAGE),
+    ):
+        with pytest.raises(tetopt.InputError, match="real numbers"):
+            call()
+
+
+def test_a_file_in_a_folder_that_is_not_there_is_one_line(tmp_path):
+    for call in (
+        lambda: tetopt.save_mesh(tmp_path / "no" / "a.vtu", MESH),
+        lambda: tetopt.save_image(tmp_path / "no" / "a.nii", IMAGE),
+        lambda: tetopt.save_model(tmp_path / "no" / "a.inp", tetopt.build_model(MESH)),
+    ):
+        with pytest.raises(tetopt.InputError, match="folder does not exist"):
+            call()
 
 
 def test_sizes_that_are_no_numbers_are_refused():

@@ -28,7 +28,7 @@ from tetopt.contents.memberships import (
 )
 from tetopt.contents.noise import noise_level
 from tetopt.errors import InputError
-from tetopt.image import Image
+from tetopt.image import Image, check_image
 from tetopt.system.arrays import Bools, Floats, Ints
 
 RARITY_POWER = 0.5  # exponent of a label's fraction of the voxels by which its voxels count less
@@ -319,7 +319,7 @@ def content(
     >>> np.unique(result.labels).tolist()
     [0, 1]
     """
-    images = [images] if isinstance(images, Image) else list(images)
+    images = [images] if isinstance(images, Image | np.ndarray) else list(images)
     weights = [1.0] * len(images) if weights is None else [float(w) for w in weights]
     _check(images, {"labels": labels, "mask": mask}, weights, label_weight)
     labels = None if labels is None else check_labels("labels", labels, is_map=True)
@@ -458,22 +458,14 @@ def undivide_voxels(what: Content, values: NDArray) -> NDArray:
 
 def plain(image: Image | Content) -> Content:
     """Content of a single image; a content is returned unchanged; TypeError for anything else."""
-    if isinstance(image, Content):
-        return image
-    if not isinstance(image, Image):
-        got = type(image).__name__
-        raise TypeError(
-            f"image: expected Image or Content, got {got}; use tetopt.load_image(path) or "
-            "tetopt.Image(array, affine)"
-        )
-    return Content(image)
+    return image if isinstance(image, Content) else Content(check_image("image", image))
 
 
 def own_image(image: Image | Content) -> Image:
     """Return the first contrast of a content on its own voxels, see `Content.own`; an image is
     returned unchanged.
     """
-    return image.own if isinstance(image, Content) else image
+    return image.own if isinstance(image, Content) else check_image("image", image)
 
 
 def _variance(values: NDArray, region: Region | None) -> float:
@@ -553,9 +545,10 @@ def _check(
     first = images[0]
     named = [
         *(("images", image) for image in images),
-        *((name, image) for name, image in others.items() if image),
+        *((name, image) for name, image in others.items() if image is not None),
     ]
     for name, image in named:
+        check_image(name, image)
         if image.shape != first.shape:
             raise InputError(
                 f"{name}: expected shape {first.shape} like the first, got {image.shape}; see "

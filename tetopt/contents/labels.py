@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tetopt.contents.smoothing import largest_around
 from tetopt.errors import InputError, warn
-from tetopt.image import Image, transform_vectors
+from tetopt.image import Image, check_image, transform_vectors
 from tetopt.system.arrays import Bools, Floats, Ints
 from tetopt.system.kernel_cache import njit
 
@@ -92,7 +92,7 @@ def check_labels(name: str, labels: Image, *, is_map: bool = False) -> Image:
     InputError
         Other values; with `is_map`, also the values of a grey image.
     """
-    data = labels.data
+    data = check_image(name, labels).data
     whole = np.rint(data)
     is_off = whole != data
     # in 32 bits, not exact without 1

@@ -37,7 +37,7 @@ from tetopt.contents.content import Content
 from tetopt.errors import InputError
 from tetopt.geometry.topology import Facets, facets
 from tetopt.geometry.vectors import cross, difference, dot, row
-from tetopt.image import Image
+from tetopt.image import Image, check_image
 from tetopt.mesh import Mesh
 from tetopt.system.arrays import Floats, Ints
 from tetopt.system.budget import check_memory
@@ -150,12 +150,12 @@ class _Sampled(NamedTuple):
 
 
 def _sample_cells(image: Image, mesh: Mesh) -> _Sampled:
-    return _on_grid(image, mesh, sampling_grid(image, mesh.points))
+    return _on_grid(image, mesh, sampling_grid(check_image("image", image), mesh.points))
 
 
 def _place_cells(image: Image, mesh: Mesh) -> _Sampled:
     """Like `_sample_cells`, but without values: only the places of cells."""
-    shape = (1,) * (3 - image.ndim) + image.shape
+    shape = (1,) * (3 - check_image("image", image).ndim) + image.shape
     return _on_grid(
         image,
         mesh,

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tetopt.contents.content import Content, continue_image
+from tetopt.contents.content import Content, continue_image, plain
 from tetopt.contents.domain import mask_text
 from tetopt.engine.loop import MeshingResult
 from tetopt.errors import InputError, Note, warn
@@ -340,7 +340,7 @@ def _voxels(
     """Return the image with the voxels that count, the whole image, and the file's strings with
     one on the mask.
     """
-    whole = image.given if isinstance(image, Content) else image
+    whole = None if image is None else plain(image).given
     if (
         whole is not None
         and isinstance(mesh, MeshFile)

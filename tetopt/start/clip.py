@@ -83,7 +83,8 @@ def lost_fraction(mesh: Mesh, image: Image, region: Region) -> float:
     level, slope = levels(region.level, centre), _slopes(region.level, centre)
     area = np.linalg.norm(normal, axis=1)
     # The level of a mask of fractions has their slope, which is less than 1 at a blurred surface.
-    least_rise = LEAST_RISE * min(float(np.median(np.linalg.norm(slope, axis=1))), 1.0) * area
+    rise = np.linalg.norm(slope, axis=1) if len(slope) else 1.0  # a mask of the whole box has none
+    least_rise = LEAST_RISE * min(float(np.median(rise)), 1.0) * area
     is_surface = (level > 0.0) | (np.abs((slope * normal).sum(axis=1)) >= least_rise)
     cut_off = np.where(is_surface, -area * level * image.ndim / (image.ndim + 1), 0.0)
     volume = mesh.cell_volumes / image.voxel_volume

@@ -299,7 +299,8 @@ def _rules(sizes: Sizes, content: Content) -> dict[int, LabelSize]:
     members = content.memberships
     if members is None:
         raise InputError(
-            "sizes: cells_across and by_label require labels with smooth interfaces; give labels"
+            "sizes: cells_across and by_label require labels with smooth interfaces; "
+            + ("give labels" if content.rows is None else "smooth them (`smooth_interfaces`)")
         )
     if sizes.cells_across is not None and not 0.0 < sizes.cells_across <= MOST_ACROSS:
         raise InputError(

@@ -22,7 +22,7 @@ import numpy as np
 
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import orient_cells
-from tetopt.image import Image
+from tetopt.image import Image, check_image
 from tetopt.mesh import Mesh
 from tetopt.system.arrays import Floats, Ints, whole_number
 from tetopt.system.budget import at_most, check_memory
@@ -84,7 +84,7 @@ def lattice_mesh(
     >>> [len(tetopt.lattice_mesh(cube, kind, nodes=1000).points) for kind in ("bcc", "five-tet")]
     [968, 1000]
     """
-    n = image.ndim
+    n = check_image("image", image).ndim
     kind = KINDS[n][0] if kind is None else kind
     if kind not in KINDS[n]:
         raise InputError(f"lattice: expected one of {', '.join(KINDS[n])} in {n}-D, got {kind!r}")

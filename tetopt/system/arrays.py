@@ -20,7 +20,7 @@ Json = dict[str, Any]  # an object of JSON, or what one states: values by name
 
 def plain_array(what: str, values: ArrayLike) -> NDArray:
     """Return values as an array; InputError for masked ones, whose hidden numbers numpy would
-    use.
+    use, and for complex ones, of which it would drop the imaginary part.
     """
     if isinstance(values, np.ma.MaskedArray) and (
         n_masked := int(np.ma.getmaskarray(values).sum())
@@ -29,7 +29,12 @@ def plain_array(what: str, values: ArrayLike) -> NDArray:
             f"{what}: got {n_masked} masked values; replace them by numbers first, as by "
             "array.filled(0)"
         )
-    return np.asarray(values)
+    array = np.asarray(values)
+    if array.dtype.kind == "c":
+        raise InputError(
+            f"{what}: expected real numbers, got complex ones; compute the magnitude first"
+        )
+    return array
 
 
 def whole_number(what: str, value: SupportsIndex) -> int:
@@ -51,8 +56,7 @@ def simplex_arrays(
         Wrong shapes, non-finite points, no cells, or indices that are not integers or out of range.
     """
     try:
-        places = np.array(plain_array(f"{what} points", points), order="C")
-        places = places.astype(None if places.dtype.kind == "c" else np.float64, copy=False)
+        places = np.array(plain_array(f"{what} points", points), dtype=np.float64, order="C")
         nodes = plain_array(f"{what} cells", cells)
     except InputError:
         raise
@@ -60,11 +64,8 @@ def simplex_arrays(
         raise InputError(
             f"{what}: expected arrays of numbers for points and cells ({error})"
         ) from error
-    if places.ndim != 2 or places.shape[1] not in (2, 3) or places.dtype.kind == "c":
-        got = (
-            f"{places.dtype} of shape {places.shape}" if places.dtype.kind == "c" else places.shape
-        )
-        raise InputError(f"{what} points: expected shape (N, 2) or (N, 3), got {got}")
+    if places.ndim != 2 or places.shape[1] not in (2, 3):
+        raise InputError(f"{what} points: expected shape (N, 2) or (N, 3), got {places.shape}")
     width = n_corners or places.shape[1] + 1
     if nodes.ndim != 2 or nodes.shape[1] != width or len(nodes) == 0:
         raise InputError(f"{what} cells: expected shape (M, {width}) with M > 0, got {nodes.shape}")

@@ -166,8 +166,7 @@ def check_output(
             f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}"
         ) from error
     through = f"is a link to {place}: " if path.is_symlink() else ""
-    if not place.parent.is_dir():
-        raise InputError(f"{path}: {through}its folder does not exist; create it first")
+    _check_parent(path, place, through)
     if before is not None and is_ours is not None and not stat.S_ISDIR(before.st_mode):
         raise InputError(
             f"{path}: {through}expected a folder to write, found something else; remove it first"
@@ -185,6 +184,11 @@ def check_output(
         if before is None:
             outputs.new.add(_absolute(path))
     return path
+
+
+def _check_parent(path: Path, place: Path, through: str = "") -> None:
+    if not place.parent.is_dir():
+        raise InputError(f"{path}: {through}its folder does not exist; create it first")
 
 
 def check_suffix(path: str | Path, suffixes: tuple[str, ...]) -> Path:
@@ -286,6 +290,7 @@ def _output(path: Path, n_bytes: int | None = None) -> Iterator[Path]:
     place = Path(os.path.realpath(path))
     if outputs is not None:
         place = outputs.moved.get(key) or outputs.places.get(key, place)
+    _check_parent(path, place)
     with telling(path, n_bytes, place.parent):
         yield place
     path = output_place(path)
