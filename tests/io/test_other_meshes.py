@@ -7,7 +7,7 @@ from commands import assert_done, exit_code
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusal
 
-from tetopt import Image, load_mesh, save_image
+from tetopt import Image, cell_fields, load_mesh, save_image
 from tetopt.geometry.quadratic import quadratic
 from tetopt.interop.conversions import VTK_KINDS
 from tetopt.start.lattice import lattice_mesh
@@ -256,3 +256,59 @@ def test_other_versions_of_gmsh_are_refused(version, here):
     (here / "a.msh").write_text(f"$MeshFormat\n{version} 0 8\n$EndMeshFormat\n")
     with refusal("2.2 or 4.1.*msh41"):
         load_mesh("a.msh")
+
+
+# --------------------------------------------------------------------------------------------------
+# Units
+
+
+def save_beside_image(n, mm, order=1, origin=0.0, part=1.0):
+    """A box in a unit of `mm`, a.vtu, of a part of an image, i.nii.gz or i.png; both from an
+    origin.
+    """
+    image = image_of(n)
+    affine = image.affine.copy()
+    affine[:n, n] += origin
+    save_image("i.nii.gz", Image(image.data, affine))
+    points, cells = nodes_of(box_mesh(n), order)
+    grid_of((part * points + origin * (np.arange(3) < n)) / mm, cells, n, order).save("a.vtu")
+
+
+UNITS = {"m": 1000.0, "cm": 10.0, "um": 1e-3}
+COMMANDS = {
+    "quality": "quality i.nii.gz a.vtu",
+    "convert": "convert i.nii.gz a.vtu b.vtu --young h**2+1",
+    "start": "mesh i.nii.gz --start a.vtu -o b.vtu --iterations 0",
+}
+
+
+@pytest.mark.parametrize("unit", UNITS)
+@pytest.mark.parametrize("origin", [0.0, -6.0, 30.0])
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_mesh_in_another_unit_is_told_or_refused(unit, origin, command, here, capsys):
+    save_beside_image(3, UNITS[unit], origin=origin)
+    code = exit_code(COMMANDS[command])
+    assert f"--mesh-units {unit}" in " ".join(capsys.readouterr().err.split())
+    assert code == 2 or (unit, origin) != ("m", 0.0)
+    assert exit_code(COMMANDS[command], f"--mesh-units {unit} --force") in (0, 1)
+    assert "--mesh-units" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("n", "order"), SHAPES)
+def test_units_of_a_mesh_in_python(n, order, here):
+    save_beside_image(n, 10.0, order)
+    mesh = load_mesh("a.vtu", mesh_units="cm").mesh
+    assert_allclose(mesh.points, box_mesh(n).points)
+    with refusal("mesh_units.*cm.*inch"):
+        load_mesh("a.vtu", mesh_units="inch")
+    with pytest.warns(UserWarning, match="mesh_units` cm"):
+        cell_fields(load_mesh("a.vtu").mesh, image_of(n))
+
+
+@pytest.mark.parametrize("part", [0.2, 0.1])
+@pytest.mark.parametrize("origin", [0.0, 30.0])
+def test_a_mesh_of_a_part_of_the_image_is_in_mm(part, origin, here, capsys):
+    save_beside_image(3, 1.0, origin=origin, part=part)
+    exit_code("quality i.nii.gz a.vtu")
+    said = capsys.readouterr().err
+    assert "--mesh-units" not in said or (part, origin) == (0.1, 0.0)  # as if in cm

@@ -25,6 +25,11 @@ if TYPE_CHECKING:
     from tetopt.image import Image
     from tetopt.mesh import Mesh
 
+LENGTH_UNITS = {"mm": 1.0, "m": 1000.0, "cm": 10.0, "um": 1e-3}  # in mm
+# A mesh this many times longer or shorter than the image is in another unit.
+MOST_LENGTHS = 400.0
+# of the boxes of mesh and image: a unit is possible, or it is likely
+LEAST_OVERLAP, LIKELY_OVERLAP = 1e-3, 0.5
 OUTSIDE_VOXELS = 1.0  # beyond the image's box, from which a node lies outside
 # how far nodes of a file with few digits may lie beyond the box of a mesh that need not fill it
 BOX_ROUNDING_VOXELS = 1e-3
@@ -291,17 +296,50 @@ def outside_fraction(mesh: Mesh, image: Image) -> float:
     Raises
     ------
     InputError
-        Mesh and image of different dimension, or in different places: no node lies in the box.
+        Mesh and image of different dimension, in different places (no node lies in the image's
+        box, or no voxel's centre in the mesh's), or of lengths that no unit of both explains.
+
+    Warns
+    -----
+    UserWarning
+        Another unit of the mesh would fit the image far better.
     """
     if mesh.ndim != image.ndim:
         raise InputError(f"expected a {image.ndim}-D mesh like the image, got a {mesh.ndim}-D mesh")
     outside = float((beyond_box(mesh, image) > OUTSIDE_VOXELS).mean())
+    low, high = _index_box(mesh, image)
+    length = float(((high - low) / image.shape).max())  # of the image's
+    has_voxel = (np.maximum(np.ceil(low), 0.0) <= np.minimum(high, np.array(image.shape) - 1)).all()
+    fits = {unit: _box_overlap(mesh, image, mm) for unit, mm in LENGTH_UNITS.items()}
+    unit = max(fits, key=lambda each: fits[each])
+    is_other = unit != "mm" and fits[unit] > LEAST_OVERLAP
+    remedy = "do both use the same world coordinates (mm, RAS+)?"
+    remedy = f"is it in {unit}? pass `mesh_units` {unit}" if is_other else remedy
     if outside == 1.0:
         raise InputError(
-            "the mesh lies outside the image: no node lies in the image's box; do both use the "
-            "same world coordinates (mm, RAS+)?"
+            f"the mesh lies outside the image: no node is in the image's box; {remedy}"
         )
+    if not has_voxel or not 1.0 / MOST_LENGTHS < length < MOST_LENGTHS:
+        raise InputError(f"the mesh is {length:.2g} times as long as the image; {remedy}")
+    if is_other and fits[unit] > LIKELY_OVERLAP and fits["mm"] < fits[unit] / MOST_LENGTHS:
+        warn(f"the mesh is {length:.2g} times as long as the image; {remedy}")
     return outside
+
+
+def _index_box(mesh: Mesh, image: Image, mm: float = 1.0) -> tuple[Floats, Floats]:
+    """Return the lowest and the highest index of a mesh's nodes, whose unit of length has `mm`."""
+    index = image.to_index(mm * mesh.points)
+    return index.min(axis=0), index.max(axis=0)
+
+
+def _box_overlap(mesh: Mesh, image: Image, mm: float) -> float:
+    """Return the volume that a mesh's box, in a unit of `mm`, shares with the image's, divided by
+    that of both.
+    """
+    low, high = _index_box(mesh, image, mm)
+    shape = np.array(image.shape)
+    both = np.prod((np.minimum(high, shape - 0.5) - np.maximum(low, -0.5)).clip(0.0))
+    return float(both / (np.prod(high - low) + shape.prod() - both))
 
 
 def check_place(mesh: Mesh, image: Image) -> None:

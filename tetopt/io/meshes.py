@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError, prefix_errors
+from tetopt.geometry.check import LENGTH_UNITS
 from tetopt.geometry.quadratic import numbered_edges
 from tetopt.interop.conversions import (
     CELL_DIMENSIONS,
@@ -40,7 +41,6 @@ from tetopt.system.arrays import Arrays, Ints
 from tetopt.system.incoming import regular_file
 
 MESH_SUFFIXES = (*VTK_SUFFIXES, ".msh", ".msh2")
-LENGTH_UNITS = {"m": 1000.0, "cm": 10.0, "mm": 1.0, "um": 1e-3}  # in mm
 # of an edge: a mid-edge node closer to its middle is rounded, as in files with few digits
 STRAIGHT_FRACTION = 1e-6
 
