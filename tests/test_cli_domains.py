@@ -1,8 +1,10 @@
 """The command with masks, backgrounds, labels and several contrasts."""
 
 import contextlib
+import itertools
 import re
 import threading
+import time
 from pathlib import Path
 
 import nibabel
@@ -131,6 +133,40 @@ def test_the_wait_for_a_start_is_said(monkeypatch):
     assert "building the initial mesh, " in begun
     assert "building the initial mesh" not in rest
     assert "preparing the optimisation, " in rest
+
+
+def test_log_files_get_few_lines(monkeypatch, capsys):
+    """Each line of a stage waits twice as long as the one before."""
+    monkeypatch.setattr(cli_run, "LINE_SECONDS", 0.02)
+    with cli_run.waiting("reading"):
+        time.sleep(0.5)
+    assert 1 <= capsys.readouterr().err.count("reading, ") <= 5
+    now = itertools.count()
+    monkeypatch.setattr(cli_run.time, "perf_counter", lambda: 0.01 * next(now))
+    say = cli_run.rare_lines()
+    for _ in range(100):
+        say("compiling")
+    assert 4 <= capsys.readouterr().err.count("compiling") <= 6
+
+
+def noisy_head(folder):
+    """A ball in noise above 0."""
+    rng, grid = np.random.default_rng(1), np.indices((30, 30, 30)) - 14.5
+    data = np.abs(rng.normal(0.0, 8.0, (30, 30, 30))) + 0.1
+    data[rng.uniform(size=data.shape) < 0.09] = 0.0
+    data[(grid**2).sum(axis=0) < 100.0] += 100.0
+    tetopt.save_image(folder / "noisy.nii.gz", tetopt.Image(data))
+
+
+@pytest.mark.parametrize(("level", "is_told"), [("0", True), ("auto", False), ("40", False)])
+def test_a_background_of_noise_asks_for_auto_not_for_nodes(level, is_told):
+    noisy_head(Path())
+    words = "mesh noisy.nii.gz --nodes 200 --iterations 0 -o noisy.vtu --background"
+    said = run_command(f"{words} {level}", code=None).err
+    lines = [line for line in said.splitlines() if "use --background auto" in line]
+    assert bool(lines) == is_told
+    assert not is_told or "noise" in lines[0]
+    assert not is_told or "allow more nodes" not in said
 
 
 def test_an_organ_is_compressed_between_its_own_top_and_bottom():

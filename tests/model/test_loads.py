@@ -29,6 +29,7 @@ from tetopt.model.sets import (
     FACE_NAMES,
     area_vectors,
     box_of,
+    facet_triples,
     nodes_of,
     standard_sets,
     with_requested,
@@ -196,10 +197,10 @@ def test_a_side_where_the_box_cuts_a_stem_is_told(n):
     nodes, cells = np.unique(whole.cells[is_kept], return_inverse=True)
     mesh = tetopt.Mesh(whole.points[nodes], cells.reshape(-1, n + 1))
     known, (low, high) = standard_sets(mesh, box_of(image)), FACE_NAMES[n][-1]
-    with pytest.warns(UserWarning, match=f'"{low}" is only {len(known.facets[low])} facet') as told:
+    with pytest.warns(UserWarning, match=f'"{low}" has .*: {len(known.facets[low])} facet') as told:
         parse_loads(["compress:5%"], mesh, known)
     assert len(told) == 1
-    percent = float(re.search(", (.*) % of the area that", str(told[0].message))[1])
+    percent = float(re.search("has (.*) % of the area that", str(told[0].message))[1])
     # cut cells at the stem's root show a little more
     assert percent == pytest.approx(100.0 * k ** (1.0 - n), rel=0.05)
     request = str(told[0].message).split('"')[-2]
@@ -216,6 +217,32 @@ def test_a_side_where_the_box_cuts_a_stem_is_told(n):
             wider,
         )
         parse_loads(["hold:tip"], mesh, small)
+
+
+def test_a_side_beside_its_counterpart_is_told(n):
+    """The lowest part hangs from the body's right half, as a vertebra's process behind it: of
+    area enough, but beside the upper side, which the left half has.
+    """
+    k = {2: 40, 3: 10}[n]
+    image = tetopt.Image(np.zeros((2 * k,) * n))
+    whole = tetopt.lattice_mesh(image, blocks=(k,) * n)
+    across, *_, up = (whole.points[whole.cells].mean(axis=1) + 0.5).T
+    is_kept = ((up > k) & (across < 1.2 * k)) | ((up < 1.4 * k) & (across > 1.2 * k))
+    nodes, cells = np.unique(whole.cells[is_kept], return_inverse=True)
+    mesh = tetopt.Mesh(whole.points[nodes], cells.reshape(-1, n + 1))
+    known, (low, high) = standard_sets(mesh), FACE_NAMES[n][-1]
+    with pytest.warns(UserWarning, match=f'"{low}" lies beside "{high}"') as told:
+        parse_loads([f"hold:{high}", f"pressure:{low}:1"], mesh, known)
+    words = str(told[0].message)
+    assert re.search(rf"x {1.2 * k - 0.5:g} to {2 * k - 0.5:g}", words)
+    wider = with_requested(mesh, known, [words.split('"')[-2]], None)
+    centres = mesh.points[facet_triples(mesh.cells, wider.facets["base"])].mean(axis=1)
+    assert (np.abs(centres[:, -1] - (k - 0.5)) < 2.0).mean() > 0.8
+    assert centres[:, 0].max() <= 1.2 * k
+    assert len(told) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        parse_loads([f"pressure:{low}:1"], mesh, known)
 
 
 def test_no_side_to_press():

@@ -227,9 +227,57 @@ def test_near_a_point_and_a_plane():
         assert "p" not in sets.cells
 
 
+@pytest.mark.parametrize("n", [2, 3])
+def test_in_a_direction_and_within_a_box(n):
+    mesh = ball_mesh(n)
+    every = boundary_rows(mesh)
+    nodes = facet_triples(mesh.cells, every)
+    areas = area_vectors(mesh, every)
+    down = -areas[:, -1] / np.linalg.norm(areas, axis=1) >= np.cos(np.radians(50.0))
+    low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
+    high[0] = mesh.points[:, 0].mean()
+    is_left = (mesh.points <= high).all(axis=1)[nodes].all(axis=1)
+    direction, *corners = (
+        ",".join(map(repr, each.tolist())) for each in (-3.0 * np.eye(n)[-1], high, low)
+    )
+    texts = [f"d=facing:{direction}:50", f"b=box:{corners[0]}:{corners[1]}"]
+    texts += [f"both={texts[0][2:]} & {texts[1][2:]}", f"same={texts[1][2:]} & d"]
+    texts += ["rest=d-both & boundary"]
+    known = with_requested(mesh, standard_sets(mesh), texts, None).facets
+    for name, expected in {
+        "d": down,
+        "b": is_left,
+        "both": down & is_left,
+        "same": down & is_left,
+        "rest": down & ~is_left,
+    }.items():
+        assert 0 < expected.sum() < len(every)
+        assert_array_equal(known[name], every[expected])
+
+
+def test_a_part_of_an_interface():
+    model = sample_model()
+    mesh = model.mesh
+    labels = (mesh.points[mesh.cells].mean(axis=1)[:, 0] > mesh.points[:, 0].mean()).astype(int)
+    known = standard_sets(mesh, labels=labels)
+    low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
+    low[1] = mesh.points[:, 1].mean()
+    box = ":".join(",".join(map(repr, each.tolist())) for each in (low, high))
+    part = with_requested(mesh, known, [f"a=interface_0_1 & box:{box}"], None).facets["a"]
+    rows = known.facets["interface_0_1"]
+    assert 0 < len(part) < len(rows)
+    assert {*map(tuple, part.tolist())} <= {*map(tuple, rows.tolist())}
+
+
 @pytest.mark.parametrize(
     ("text", "match"),
     [
+        ("p=facing:0,0,0:30", "expected a normal other than 0"),
+        ("p=facing:0,0,1:-3", "an angle of 0 or more"),
+        ("p=box:0,0,0:1,1", "expected 3 numbers"),
+        ("p=left & below:3", "beside &"),
+        ("p=left & right", "no facet in common"),
+        ("p=left & ", "NAME=A & B"),
         ("dark", "expected NAME=below:T"),
         ("dark=below:x", "expected 1 number"),
         ("dark=below:-5", "no cell has a mean below -5"),

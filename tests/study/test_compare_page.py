@@ -427,7 +427,7 @@ def test_the_table_in_the_terminal_fits_into_80_columns(tmp_path, monkeypatch, c
     called = SimpleNamespace(obj=["compare"])
     assert compare_command(called, Path("T1.nii.gz"), tmp_path, CompareOptions()) == 0
     lines = capsys.readouterr().out.splitlines()
-    table = lines[: next(k for k, line in enumerate(lines) if line.startswith("mine: twice"))]
+    table = lines[: next(k for k, line in enumerate(lines) if line.startswith("* E_D"))]
     assert max(map(len, table)) <= 80
     text = "\n".join(table)
     assert "…" not in text
@@ -437,4 +437,28 @@ def test_the_table_in_the_terminal_fits_into_80_columns(tmp_path, monkeypatch, c
     heads = text[: text.index("tetopt")].split()
     assert sorted(heads) == sorted(word for column in columns for word in column.heading.split())
     numbers = [text for row in rows_of(report, columns) for text, _ in row.cells]
-    assert all(number in text.split() for number in numbers)
+    assert all({number, f"{number}*"} & set(text.split()) for number in numbers)
+
+
+@pytest.mark.parametrize(("times", "n_blank"), [(1.0, 0), (1.0 + 1e-9, 1)])
+def test_the_printed_table_ranks_nothing_below_the_reference_s_own_error(
+    tmp_path, monkeypatch, capsys, wide_lines, times, n_blank
+):
+    """And marks the E_D of peers that did not see the image."""
+    report = fake_report()
+    nu, of_nu = next(iter(report.reference.by_nu.items()))
+    shown = [each.median for _, each in report.meshes() if each.median is not None]
+    error = min(run.measurement.fem[nu].errors.displacement for run in shown)
+    of_nu = of_nu._replace(own_error=OwnError(0.01, times * error))
+    by_nu = report.reference.by_nu | {nu: of_nu}
+    report = report._replace(reference=report.reference._replace(by_nu=by_nu))
+    monkeypatch.setattr(compare_files, "compare_image", lambda *_, **__: report)
+    called = SimpleNamespace(obj=["compare"])
+    compare_command(called, Path("T1.nii.gz"), tmp_path, CompareOptions())
+    said = capsys.readouterr().out
+    assert (number_text(error) in said.split()) == (n_blank == 0)
+    assert said.count("reference's own error") == n_blank
+    for title, each in report.meshes():
+        (line,) = (row for row in said.splitlines() if row.startswith(f"{title} "))
+        is_blind = each.kind == "peer" and each.median is not None
+        assert ("*" in line) == is_blind, line

@@ -14,7 +14,7 @@ from tetopt.cli.console import print_line, print_table
 from tetopt.cli.options import ForceOption, ImageArgument
 from tetopt.job.options import Option
 from tetopt.report.tables import new_table
-from tetopt.study.compare_table import columns_of, rows_of
+from tetopt.study.compare_table import short_table
 from tetopt.study.options import CompareOptions
 
 
@@ -32,12 +32,13 @@ def compare_command(
 
     command = f"tetopt {' '.join(map(shlex.quote, context.obj))}"
     report = compare_image(image_path, output, options, command, force=force)
-    columns = [column for column in columns_of(report) if column.is_short]
-    rows = rows_of(report, columns)
+    columns, rows, notes = short_table(report)
     table = new_table("", *(Text(column.heading.replace(" ", "\n")) for column in columns))
     for row in rows:
         table.add_row(escape(row.title), *([text for text, _ in row.cells] or ["failed"]))
     print_table(table)
+    for line in notes:
+        print_line(line)
     for row in rows:
         if row.failure is not None:
             print_line(f"{row.title}: {row.failure}")

@@ -18,7 +18,8 @@ from tetopt.job.events import Event, Stage
 from tetopt.job.mesh_stage import left_words
 from tetopt.system.budget import memory_words, resident_bytes
 
-LINE_SECONDS = 10.0  # between lines, if there is no terminal for a bar
+# to the first line of a stage, if there is no terminal for a bar; each wait is twice the one before
+LINE_SECONDS = 10.0
 
 
 class Display:
@@ -120,8 +121,10 @@ def waiting(words: str) -> Iterator[None]:
     is_done = threading.Event()
 
     def lines() -> None:
-        while not is_done.wait(LINE_SECONDS):
+        wait = LINE_SECONDS
+        while not is_done.wait(wait):
             log.print(f"{words}, {_spent(time.perf_counter() - begin)}")
+            wait *= 2.0
 
     if log.is_terminal:
         with log.status(f"{words} ..."):
@@ -137,16 +140,14 @@ def waiting(words: str) -> Iterator[None]:
 
 
 def rare_lines(is_first_said: bool = False) -> Callable[[str], None]:
-    """Return a function that prints lines if there is no terminal, at most one per
-    `LINE_SECONDS`.
-    """
-    last = -np.inf if is_first_said else time.perf_counter()
+    """Return a function that prints lines if there is no terminal, ever more rarely."""
+    last, wait = -np.inf if is_first_said else time.perf_counter(), LINE_SECONDS
 
     def say(words: str) -> None:
-        nonlocal last
+        nonlocal last, wait
         now = time.perf_counter()
-        if not log.is_terminal and now - last >= LINE_SECONDS:
-            last = now
+        if not log.is_terminal and now - last >= wait:
+            last, wait = now, 2.0 * wait
             log.print(words)
 
     return say

@@ -139,7 +139,7 @@ class Judgement(NamedTuple):
         if not self.is_checked:  # only what makes the numbers meaningless
             requirements = {name: each for name, each in requirements.items() if name == "mask"}
             measured = {}
-        problems += unmet_requirements(requirements, measured, self.mask_word)
+        problems += unmet_requirements(requirements, measured, self.required)
         if self.is_checked and self.source is None:
             problems += self._recorded(("min_dihedral", *(name for name, _ in named)))
         return order_problems(

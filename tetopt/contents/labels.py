@@ -184,6 +184,8 @@ class LostComponent(NamedTuple):
         Number of its voxels.
     place : tuple of float
         World coordinates of the voxel nearest to their mean, mm.
+    size_in_cells : float, optional
+        Its volume, relative to the mean cell around it; None if not measured.
 
     Examples
     --------
@@ -193,6 +195,7 @@ class LostComponent(NamedTuple):
 
     voxels: int
     place: tuple[float, ...]
+    size_in_cells: float | None = None
 
 
 def voxel_components(
@@ -200,11 +203,13 @@ def voxel_components(
     is_met: Bools,
     affine: Floats,
     box: Sequence[slice] = (),
+    shares: Floats | None = None,
 ) -> tuple[int, tuple[LostComponent, ...]]:
     """Number of face-connected components of voxels, and those without one that `is_met`, the
     largest first.
 
-    The voxels are in a `box` of the grid with this affine, by default at its corner.
+    The voxels are in a `box` of the grid with this affine, by default at its corner; `shares` is
+    the volume of each relative to that of its cell.
     """
     n_components, lost = component_runs(inside, is_met)
     component, row, begin, end = lost.T
@@ -220,8 +225,11 @@ def voxel_components(
     order = np.lexsort((((index - middle[of_voxel]) ** 2).sum(axis=1), of_voxel, -sizes[of_voxel]))
     near = order[np.sort(np.unique(of_voxel[order], return_index=True)[1])]  # the first of each
     places = transform_vectors(index[near] + start, affine[:-1, :-1]) + affine[:-1, -1]
-    rows = zip(sizes[of_voxel[near]].tolist(), places.tolist(), strict=True)
-    return n_components, tuple(LostComponent(size, tuple(place)) for size, place in rows)
+    columns = [sizes[of_voxel[near]].tolist(), map(tuple, places.tolist())]
+    if shares is not None:
+        in_cells = np.bincount(of_voxel, shares[tuple(index.T)])
+        columns.append(in_cells[of_voxel[near]].tolist())
+    return n_components, tuple(map(LostComponent, *columns))
 
 
 def component_runs(inside: Bools, is_met: Bools, *, has_corners: bool = False) -> tuple[int, Ints]:

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, Literal, NamedTuple
 
-from tetopt.contents.labels import BACKGROUND_LABEL
+from tetopt.contents.labels import BACKGROUND_LABEL, COMPONENT_VOXELS
 from tetopt.engine.aim import Mode
 from tetopt.engine.loop import MeshingResult
 from tetopt.engine.sliding import MOST_MEETING
@@ -16,7 +16,16 @@ from tetopt.io.text import count_text, list_names
 from tetopt.job.events import note, report_violation, warning
 from tetopt.job.options import Method
 from tetopt.measure.fidelity import LabelFidelity, LabelInterface, LabelPieces, MaskFidelity
-from tetopt.measure.judge import LABEL_VOXELS, MORE_NODES, Requirements, faulty_labels
+from tetopt.measure.judge import (
+    FOREGROUND,
+    LABEL_VOXELS,
+    LEAST_CELLS,
+    MORE_NODES,
+    Requirements,
+    faulty_labels,
+    is_pocket,
+    is_shown,
+)
 from tetopt.model.label_names import count_of_labels, label_words
 from tetopt.start.label_sizes import SizesByLabel
 from tetopt.start.octree import is_for_walls
@@ -135,19 +144,19 @@ def failures(failed: Mapping[str, str], known: Iterable[Problem]) -> Iterator[Pr
 
 
 def unmet_requirements(
-    requirements: Mapping[str, str], measured: Json, word: str = "mask"
+    requirements: Mapping[str, str], measured: Json, required: Requirements
 ) -> Iterator[Problem]:
     """Yield violated `requirements` (`tetopt.measure.judge`), and lesser deviations from mask and
-    labels. `word` is the name of the meshed region in messages.
+    labels; `required` has the words for them.
     """
     for name, words in requirements.items():
         yield Problem(words, name=name, wants=SMALLER_CELLS.get(name))
-    yield from _of_labels(measured, word)
-    yield from _of_mask(measured.get("mask"), word)
+    yield from _of_labels(measured, required)
+    yield from _of_mask(measured.get("mask"), required)
     if n_dropped := measured.get("dropped_components"):
         yield Problem(
             f"dropped {n_dropped} small connected components of the mesh that are not separate in "
-            f"the {word}{_dropped_words(measured)}",
+            f"the {required.region}{_dropped_words(measured)}",
             "`keep_components` keeps them",
         )
 
@@ -164,16 +173,27 @@ def _dropped_words(measured: Json) -> str:
     return f", as large as {sum(voxels.values()):.3g} voxels{of_labels}"
 
 
-def _of_labels(measured: Json, word: str) -> Iterator[Problem]:
+def _of_labels(measured: Json, required: Requirements) -> Iterator[Problem]:
     """Yield small labels without a cell, and labels of poor volume or overlap, beyond those that
     violate the requirement.
     """
     labels = measured.get("labels", [])
-    required = required_of(word, measured.get("label_names", {}))
-    faulty = set(faulty_labels(labels))
-    others = [row for row in labels if row.label not in faulty]
+    faulty = set(faulty_labels(labels, required))
+    others = [row for row in labels if row.label not in faulty and not is_pocket(row, required)]
+    for row in labels:
+        if is_pocket(row, required) and row.overlap.dice < LEAST_DICE:
+            count = count_text(row.pieces.components, "piece")
+            yield Problem(
+                f"Dice {row.overlap.dice:.2f} for label {required.label_words(row.label)}, "
+                f"{row.extent.voxels} voxels in {count}",
+                "leave them out: `keep_labels` names the tissues, `background` auto keeps fewer",
+            )
     there = [row for row in others if row.extent.covered_voxels and row.extent.mesh_volume > 0.0]
     large = [row for row in others if row.extent.voxels >= LABEL_VOXELS]
+    # more nodes do not help crumbs of voxels
+    unhelped = frozenset(
+        row.label for row in labels if row.extent.voxels < COMPONENT_VOXELS * row.pieces.components
+    )
 
     def words(row: LabelFidelity) -> str:
         return required.label_words(row.label)
@@ -183,7 +203,8 @@ def _of_labels(measured: Json, word: str) -> Iterator[Problem]:
         lambda row: row.extent.is_lost,
         0,
         words,
-        f"no cell has label {{1}}, of fewer than {LABEL_VOXELS} voxels in the mesh",
+        f"no cell has label {{1}}, of fewer than {LABEL_VOXELS} voxels in the mesh, or in pieces "
+        f"smaller than {LEAST_CELLS:g} cells",
     )
     yield from find_odd_labels(
         there,
@@ -193,7 +214,7 @@ def _of_labels(measured: Json, word: str) -> Iterator[Problem]:
         f"{{}} with more than {TIMES_VOLUME:g} times the volume of the voxels, or less than half "
         "(ratio in brackets): {}",
         MORE_NODES,
-        unhelped=required.unhelped,
+        unhelped=unhelped,
     )
     yield from find_odd_labels(
         large,
@@ -203,22 +224,16 @@ def _of_labels(measured: Json, word: str) -> Iterator[Problem]:
         f"Dice below {LEAST_DICE:g} for label {{1}}",
         f"{MORE_NODES}, or check that these are labels, not intensities",
         5,
-        required.unhelped,
+        unhelped,
     )
 
 
-def required_of(word: str, names: Mapping[int, str]) -> Requirements:
-    """Return the words for a verdict: of the meshed region, and of labels by their names.
-
-    More nodes are no remedy for label 0 within a foreground: it has the voxels that are no
-    background.
-    """
-    pockets = {BACKGROUND_LABEL: POCKETS} if word == "foreground" else {}
+def required_of(word: str, names: Mapping[int, str], remedy: str = MORE_NODES) -> Requirements:
+    """Return the words for a verdict: of the meshed region, and of labels by their names."""
+    pockets = {BACKGROUND_LABEL: POCKETS} if word == FOREGROUND else {}
     known = {**names, **pockets}
     return Requirements(
-        region=word,
-        label_words=lambda label: label_words(label, known),
-        unhelped=frozenset(pockets),
+        region=word, label_words=lambda label: label_words(label, known), remedy=remedy
     )
 
 
@@ -228,7 +243,7 @@ def beyond_requirements(measured: Mapping[str, Any], word: str = "mask") -> dict
 
     Labels are counted, and the worst named, among all labels; of label 0, only the volume counts.
     """
-    beyond, of_labels = dict[str, str](), dict[str, list[tuple[float, str]]]()
+    beyond, of_labels = dict[str, str](), dict[str, list[tuple[float, str, str]]]()
     if (mask := measured.get("mask")) is not None:
         of_mask = [
             f"{what} ({words})"
@@ -243,17 +258,16 @@ def beyond_requirements(measured: Mapping[str, Any], word: str = "mask") -> dict
         faults = _faults(row.pieces, ratio, NEAR_VOLUME, row.surface, is_whole)
         for what, rank, words in faults:
             if row.label != BACKGROUND_LABEL or "volume" in what:
-                of_labels.setdefault(what, []).append(
-                    (rank, f"{label_words(row.label, names)} ({words})")
-                )
+                name = label_words(row.label, names)
+                of_labels.setdefault(what, []).append((rank, f"{name} ({words})", name))
     n_all = count_of_labels([row.label for row in rows])
     texts = [
-        f"{len(some)} {what}: {list_names([each for _, each in sorted(some)], 5)}"
+        f"{len(some)} {what}: {list_names([each for _, each, _ in sorted(some)], 5)}"
         for what, some in of_labels.items()
     ]
-    return beyond | (
-        {"not all labels fit": f"labels: of {n_all}, {'; '.join(texts)}"} if texts else {}
-    )
+    names_of = dict.fromkeys(name for some in of_labels.values() for _, _, name in sorted(some))
+    what = f"not all labels fit: {list_names(list(names_of), 5)}"
+    return beyond | ({what: f"labels: of {n_all}, {'; '.join(texts)}"} if texts else {})
 
 
 def _faults(
@@ -263,44 +277,41 @@ def _faults(
     surface: LabelInterface | None = None,
     is_whole: bool = True,
 ) -> Iterator[tuple[str, float, str]]:
-    """Yield kinds of faults of a label or mask, each with a rank, the least for the worst, and
-    numbers.
+    """Yield kinds of faults of a label or mask, with the use for which they matter, each with a
+    rank, the least for the worst, and numbers.
 
     `ratio` is that of its cells' volume to its voxels', usually within `near`; `is_whole` if all
     voxels count.
     """
-    n_lost, n_pieces = len(row.lost_components), row.mesh_components
-    voxels, n_kept = sum(each.voxels for each in row.lost_components), row.components - n_lost
+    n_all, n_pieces = row.components, row.mesh_components
+    lost, n_kept = list(filter(is_shown, row.lost_components)), n_all - len(row.lost_components)
     if not near[0] <= ratio <= near[1]:
         what = "with less than {:g} or more than {:g} times the volume of voxels".format(*near)
+        what = f"{what} (matters for stiffness and mass)"
         yield what, min(ratio, 1.0 / max(ratio, near[0])), f"{ratio:.3g}"
-    if n_lost:
-        yield (
-            "with components without a cell",
-            -voxels,
-            f"{n_lost} of {row.components}, voxels: {voxels}",
-        )
-    if n_pieces > max(n_kept, 1):
-        yield "with more pieces of cells than of voxels", -n_pieces, f"{n_pieces}"
-    if is_whole and 0 < n_pieces < n_kept:
-        yield (
-            "with fewer pieces of cells than of voxels",
-            n_pieces - n_kept,
-            f"{n_pieces} of {n_kept}",
-        )
+    if lost:
+        voxels = sum(each.voxels for each in lost)
+        what = "with components without a cell (matters if these carry load)"
+        yield what, -voxels, f"{len(lost)} of {n_all}, voxels: {voxels}"
+    if n_pieces > max(n_all, 1) or (is_whole and 0 < n_pieces < n_kept):
+        which, rank = ("more", -n_pieces) if n_pieces > n_all else ("fewer", n_pieces - n_kept)
+        what = f"with {which} pieces of cells than of voxels (matters for what is connected)"
+        yield what, rank, f"{n_pieces} for {n_all}"
     if surface is not None and is_whole and n_pieces and surface.mesh_cavities < surface.cavities:
         n_left, n_all = surface.mesh_cavities, surface.cavities
-        yield "with fewer cavities in cells than in voxels", n_left - n_all, f"{n_left} of {n_all}"
+        what = "with fewer cavities in cells than in voxels (matters for fluid in them)"
+        yield what, n_left - n_all, f"{n_left} of {n_all}"
 
 
-def _of_mask(mask: MaskFidelity | None, word: str) -> Iterator[Problem]:
+def _of_mask(mask: MaskFidelity | None, required: Requirements) -> Iterator[Problem]:
     if mask is None:
         return
+    word = required.region
     if mask.components > mask.mesh_components:  # fewer violate a requirement
         yield Problem(
             f"the {word} has {mask.components} connected components, the mesh "
             f"{mask.mesh_components}: elements are too large for the {word}'s detail",
-            MORE_NODES,
+            required.remedy,
             wants="smaller",
         )
     p95, mean = (
@@ -311,7 +322,7 @@ def _of_mask(mask: MaskFidelity | None, word: str) -> Iterator[Problem]:
         yield Problem(
             f"the mesh's boundary and the {word}'s surface are {p95:.1f} voxels apart at the 95th "
             f"percentile, {mean:.1f} on average: elements are too large for the details",
-            MORE_NODES,
+            required.remedy,
             wants="smaller",
         )
 
@@ -403,17 +414,20 @@ def of_empty(
     n_empty: int,
     spacing: Floats,
     is_masked: bool = False,
+    has_moduli: bool = False,
 ) -> Iterator[Problem]:
     """Yield a problem if many cells contain no voxel centre; `spacing` (n,) are the edges of the
     voxels, mm.
 
     `is_free` is True if the number of nodes can be chosen; `is_masked` if a mask determines the
-    domain, so that the image may be of no importance, and fewer nodes are no remedy.
+    domain, so that the image may be of no importance, and fewer nodes are no remedy; `has_moduli`
+    if moduli come from the image.
     """
     n_cells = len(result.mesh.cells)
     if n_empty <= EMPTY_FRACTION * n_cells:
         return
     more = ", which is harmless unless moduli come from the image" if is_masked else ""
+    more = ", also for their moduli" if has_moduli else more
     is_thick = spacing.max() >= THICK_SLICES * spacing.min()
     if is_thick:
         more += f"; slices are {spacing.max():.3g} mm apart, so some cells lie between them"
@@ -478,8 +492,7 @@ def of_sizes(
     if (least := sizes.smallest) and shortest < (1.0 - EDGE_MISS) * least:
         yield Problem(
             f"the shortest edge is {shortest:.4g} mm, {1.0 - shortest / least:.0%} under "
-            f"`size_min` {least:g}: splits respect it, but nodes move together",
-            "raise it",
+            f"`size_min` {least:g}: splits respect it, but nodes move together"
         )
     if edges is not None and edges.above > LONG_FRACTION:
         yield Problem(

@@ -77,12 +77,13 @@ def warn_of_other_image(
     image_path: Path,
     image: Image,
     *,
-    is_registered: bool,
+    is_registered: bool | None,
     is_exact: bool = False,
 ) -> bool:
-    """Warn if the mesh's file names another source image than this one; return whether it does.
+    """Warn if the mesh's file names another source image than this one, which is not said to be
+    registered; return whether it does.
 
-    Reject such an image unless it is registered or has the source's box to a voxel; with
+    Reject such an image unless it is registered, or None, or has the source's box to a voxel; with
     `is_exact`, reject any image with another box.
     """
     made_from = loaded.text("image_sha256")
@@ -90,12 +91,12 @@ def warn_of_other_image(
     is_other = made_from is not None and made_from != sha256(image_path)
     if is_exact or is_other:
         words = words_of_other_box(loaded, image, SAME_GRID_VOXELS if is_exact else SAME_BOX_VOXELS)
-    if words and (is_exact or not is_registered):
+    if words and (is_exact or is_registered is False):
         remedy = "if it is registered to that image of the same subject, pass `registered`"
         remedy = "`check` needs that image, with its crop" if is_exact else remedy
         name = f"{mesh_path}'s image, {loaded.text('image')}"
         raise InputError(f"{image_path}: expected the box of {name}, {words}; {remedy}")
-    if is_other:
+    if is_other and not is_registered:
         of_box = f": its box was {words}" if words else ""
         warning(f"{mesh_path} was built from a different image, not {image_path}{of_box}")
     return is_other

@@ -500,7 +500,8 @@ class ModelOptions:
         Option(
             "NAME=...",
             "Add a set: NAME=below:T, NAME=point:X,Y,Z:D, NAME=plane:X,Y,Z:NX,NY,NZ:D (mm, RAS+), "
-            "or of other sets: NAME=A-B, NAME=outer:A-B, NAME=inner:A-B. May be repeated.",
+            "NAME=facing:NX,NY,NZ:DEGREES, NAME=box:X,Y,Z:X,Y,Z, or of other sets: NAME=A-B, "
+            'NAME=outer:A-B, NAME=inner:A-B; what is in several: "NAME=A & B". May be repeated.',
             "set",
         ),
     ] = None

@@ -73,7 +73,7 @@ def read_planned(plan: Plan) -> Task:
         path = Path(str(plan.job.start))
         with prefix_errors(path), warnings_heard():
             check_place(start.mesh, image)
-        warn_of_other_image(start, path, source.paths[0], image, is_registered=True)
+        warn_of_other_image(start, path, source.paths[0], image, is_registered=None)
         if plan.job.order is None and start.order == 2 and format_of(plan.job.output).has_quadratic:
             plan = plan._replace(job=changed_options(plan.job, order=2))
         if source.labels is not None and not source.table.names:

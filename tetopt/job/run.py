@@ -33,6 +33,7 @@ from tetopt.measure.judge import judge
 from tetopt.measure.measures import measure_each
 from tetopt.measure.quality import quality
 from tetopt.mesh import Mesh
+from tetopt.model.mappings import parse_any_mapping
 from tetopt.model.model import Model
 from tetopt.report.summary import model_summary
 from tetopt.system.arrays import Json
@@ -194,7 +195,7 @@ def _problems(result: Result, failed: dict[str, str]) -> list[Problem]:
     if outcome.result.labels is None:  # but its file gives each cell that of most voxels
         of_labels = {name: rows for name, rows in measured.items() if name == "labels"}
         required |= judge(of_labels, task.source.required)
-    problems = list(unmet_requirements(required, measured, task.source.mask_word))
+    problems = list(unmet_requirements(required, measured, task.source.required))
     problems += failures(failed, problems)
     job = task.plan.job
     mode = task.plan.mode
@@ -207,7 +208,10 @@ def _problems(result: Result, failed: dict[str, str]) -> list[Problem]:
     is_most = has_most_empty(outcome.result, n_empty)
     is_free = mode != "start" and (is_most or task.source.labels is None)
     is_free &= measured.get("nodes_of_sizes", 0) <= n_nodes
-    empty = list(of_empty(outcome.result, is_free, n_empty, spacing, task.source.mask is not None))
+    mapping = None if job.young is None else parse_any_mapping(job.young)
+    has_moduli = callable(mapping) or isinstance(mapping, list)
+    is_masked = task.source.mask is not None
+    empty = list(of_empty(outcome.result, is_free, n_empty, spacing, is_masked, has_moduli))
     problems = [*empty, *problems] if is_most else problems
     if job.cells_across is not None:
         problems += of_layers(

@@ -299,8 +299,9 @@ def check_early(
     known = model.sets
     for request in requests:
         check_free_names(request, known)
-        if request.difference and INTERFACE_PREFIX not in request.difference.lower():
-            places_in(request, known)
+        for part in request.parts or (request,):
+            if part.difference and INTERFACE_PREFIX not in part.difference.lower():
+                places_in(part, known)
         known = Sets(
             known.facets | dict.fromkeys(request.names(), known.facets[BOUNDARY_SET]), known.cells
         )

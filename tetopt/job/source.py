@@ -50,7 +50,7 @@ from tetopt.job.option_values import (
 from tetopt.job.options import SourceOptions
 from tetopt.job.request import checksum
 from tetopt.measure.fidelity import cell_labels, unexplained_of
-from tetopt.measure.judge import Requirements
+from tetopt.measure.judge import MORE_NODES, Requirements
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
 from tetopt.model.file import MASK_TEXT, MeshFile
@@ -67,6 +67,10 @@ from tetopt.model.sets import box_of, box_text
 from tetopt.model.tissues import is_preset, merge_labels, numbers_by_name, renumber_labels
 from tetopt.system.arrays import Arrays, Ints, Json
 
+AUTO_BACKGROUND = "use `background` auto"
+# of a foreground, from which its part that is no brighter than the background's noise is reported
+NOISE_SHARE = 0.25
+
 
 class Source(NamedTuple):
     """The content to mesh, and its files."""
@@ -79,6 +83,7 @@ class Source(NamedTuple):
     mask: Image | None
     about: Json  # names, checksums, weights and the image's box, for the mesh's file
     table: LabelTable  # of the labels
+    remedy: str = MORE_NODES  # if the region has more detail than cells
 
     @property
     def image(self) -> Image:
@@ -95,7 +100,7 @@ class Source(NamedTuple):
     @property
     def required(self) -> Requirements:
         """Words for the verdict on its mesh."""
-        return required_of(self.mask_word, self.table.names)
+        return required_of(self.mask_word, self.table.names, self.remedy)
 
     @property
     def surface_words(self) -> str:
@@ -185,7 +190,7 @@ def read_source(
     ):
         image = labels
     contrasts = [image, *(beside(path, resample_contrast) for path in paths[1:])]
-    mask, level = _region(options, image, labels, beside, loaded)
+    mask, level, remedy = _region(options, image, labels, beside, loaded)
     labels, mask, kept = _choose_labels(options, labels, mask, table, kept)
     del finest, beside  # the files as read: their memory is needed
     balance = _balance(options, is_own)
@@ -219,7 +224,7 @@ def read_source(
         **({} if mask is None else {MASK_TEXT: mask_text(mask)}),
     }
     return Source(
-        paths, balance.weights, combined, contrasts, labels, mask, about, NO_TABLE
+        paths, balance.weights, combined, contrasts, labels, mask, about, NO_TABLE, remedy
     ).with_table(table)
 
 
@@ -243,13 +248,36 @@ def _region(
     labels: Image | None,
     beside: Beside,
     loaded: MeshFile | None,
-) -> tuple[Image | None, float | None]:
-    """Return the mask, and the background's level if the options remove one."""
+) -> tuple[Image | None, float | None, str]:
+    """Return the mask, the background's level if the options remove one, and the remedy if cells
+    are too large for the mask.
+    """
     if options.background is None:
-        return mask_for(options, image, beside, loaded), None
+        return mask_for(options, image, beside, loaded), None, MORE_NODES
     is_auto = options.background == "auto"
     level = background_level(image) if is_auto else number_of("`background`", options.background)
-    return _foreground(image, level, labels), level
+    front = _foreground(image, level, labels)
+    noise = "" if is_auto else _words_on_noise(image, level, front)
+    if noise:
+        warning(f"background: {noise}; {AUTO_BACKGROUND}")
+    return front, level, AUTO_BACKGROUND if noise else MORE_NODES
+
+
+def _words_on_noise(image: Image, level: float, front: Image) -> str:
+    """Describe a foreground above a level that keeps the background's noise; empty if it keeps
+    little.
+    """
+    try:
+        highest = background_level(image)
+    except InputError:
+        return ""  # no background is found
+    is_dark = (front.data > 0.0) & (image.data <= highest)
+    share = is_dark.sum() / front.data.sum()
+    if highest <= level or share < NOISE_SHARE:
+        return ""
+    return (
+        f"{share:.0%} of what stays above {level:g} is no brighter than the noise ({highest:.4g})"
+    )
 
 
 def _inputs(

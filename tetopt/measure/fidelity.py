@@ -109,6 +109,9 @@ class LabelExtent(NamedTuple):
         Number of its cells without voxel centre.
     is_lost : bool
         True if no part of the mesh has the label.
+    size_in_cells : float
+        Volume of its largest connected component of voxels, relative to the mean cell around it;
+        inf if not measured.
     one_layer_fraction : float
         Fraction of its cells' volume in cells whose nodes all lie on its surface, one cell thick;
         nan without cells, or if not measured.
@@ -126,6 +129,7 @@ class LabelExtent(NamedTuple):
     n_cells: int = 0
     n_empty_cells: int = 0
     is_lost: bool = False
+    size_in_cells: float = np.inf
     one_layer_fraction: float = np.nan
 
     @property
@@ -560,7 +564,10 @@ def label_extents(voxels: OwnedVoxels, mesh: Mesh, row_of_cell: Ints) -> list[La
     n_true, n_painted = (_voxel_counts(rows, n_labels) for rows in (true, painted))
     n_cells = np.bincount(row_of_cell, minlength=n_labels)
     mesh_volume = np.bincount(row_of_cell, mesh.cell_volumes, n_labels)
-    volume = n_true * abs(np.linalg.det(voxels.affine[:-1, :-1]))
+    voxel_volume = abs(np.linalg.det(voxels.affine[:-1, :-1]))
+    volume = n_true * voxel_volume
+    # of voxels in no cell, that of a mean cell, in the last place
+    shares = voxel_volume / np.append(mesh.cell_volumes, mesh.cell_volumes.mean())
     n_owned = np.bincount(voxels.owner[voxels.owner >= 0], minlength=len(row_of_cell))
     n_empty = np.bincount(row_of_cell[n_owned == 0], minlength=n_labels)
     dice = _voxel_dice(true, painted, n_true)
@@ -570,7 +577,11 @@ def label_extents(voxels: OwnedVoxels, mesh: Mesh, row_of_cell: Ints) -> list[La
             continue
         own, is_covered = true[box] == row, voxels.is_covered[box]
         is_met = own & (painted[box] == row)
-        n_components, lost = voxel_components(own, is_met | ~is_covered, voxels.affine, box)
+        of_voxel = shares[voxels.owner[box]]
+        n_components, lost = voxel_components(
+            own, is_met | ~is_covered, voxels.affine, box, of_voxel
+        )
+        number = own if n_components == 1 else scipy.ndimage.label(own)[0]
         measured.append(
             LabelFidelity(
                 int(voxels.labels[row]),
@@ -582,6 +593,7 @@ def label_extents(voxels: OwnedVoxels, mesh: Mesh, row_of_cell: Ints) -> list[La
                     n_cells=int(n_cells[row]),
                     n_empty_cells=int(n_empty[row]),
                     is_lost=bool(n_cells[row] == 0 and n_painted[row] == 0),
+                    size_in_cells=float(np.bincount(number[own], of_voxel[own]).max()),
                 ),
                 pieces=LabelPieces(
                     components=n_components,

@@ -43,6 +43,8 @@ from tetopt.system.arrays import Bools, Floats, Ints
 MASK_DICE = 0.9
 # a label with as many voxels must have cells that contain some, of about their volume
 LABEL_VOXELS = 200
+# cells around it that a label or a component of one must be as large as to have a cell of its own
+LEAST_CELLS = 2.0
 LARGE_COMPONENTS = f"of {COMPONENT_VOXELS} voxels or more"
 LEAST_VOLUME, MOST_VOLUME = 0.6, 1.5  # of a label's cells, over its voxels'
 MORE_NODES = "allow more nodes"
@@ -54,6 +56,7 @@ PIECES_REMEDY = (
     f"{MORE_NODES}, so that cells are smaller than these, or merge (`merge`) or "
     "clean labels of crumbs"
 )
+FOREGROUND = "foreground"  # the region of a removed background
 COMPONENTS_LISTED = 5  # of those without a cell
 # degrees by which a measured angle may be below the minimum that kernels enforce in ticks
 ANGLE_ROUNDING = 1e-6
@@ -74,7 +77,7 @@ class Requirements(NamedTuple):
     is_initial: bool = False  # the run made no iteration
     region: str = "mask"  # the name of the meshed region
     label_words: Callable[[int], str] = str
-    unhelped: frozenset[int] = frozenset()  # labels to which more nodes bring no more voxels
+    remedy: str = MORE_NODES  # if the region has more detail than cells
 
 
 class Cover(NamedTuple):
@@ -197,7 +200,8 @@ def judge(rows: dict[str, Any], required: Requirements) -> dict[str, str]:
     from any cell, of 50 voxels or more without a cell. `manifold`: edges or nodes at which the
     boundary, within a mask or of the user's own mesh, or the interface of two labels is not a
     manifold. `labels`: labels of 200 voxels or more without a cell at one of them, or with
-    0.6 to 1.5 times their volume exceeded, or components of 50 voxels or more without a cell.
+    0.6 to 1.5 times their volume exceeded, or components of 50 voxels or more without a cell; not
+    of components smaller than two mean cells around them, nor of label 0 in a foreground.
     `error`: more unexplained variance than allowed. One that cannot be checked counts as violated,
     with the reason.
     """
@@ -257,7 +261,7 @@ def _say_overlap(twice: int, _: Requirements) -> str:
 def _say_mask(dice: float, required: Requirements) -> str:
     words = (
         f"the mesh and the {required.region} overlap with a Dice of only {dice:.3f}: cells are too "
-        f"large for the {required.region}'s detail; {MORE_NODES}"
+        f"large for the {required.region}'s detail; {required.remedy}"
     )
     return words if dice < MASK_DICE else ""
 
@@ -278,32 +282,44 @@ def _say_components(parts: MaskComponents, required: Requirements) -> str:
         texts.append(
             f"parts of the {word} {LARGE_COMPONENTS} with no cell near: {_list_components(far)}"
         )
-    return "; ".join([*texts, MORE_NODES]) if texts else ""
+    return "; ".join([*texts, required.remedy]) if texts else ""
 
 
-def _say_manifold(problems: tuple[list[str], list[str], bool], _: Requirements) -> str:
+def _say_manifold(problems: tuple[list[str], list[str], bool], required: Requirements) -> str:
     of_boundary, of_labels, is_own = problems
-    remedy = "mend the initial mesh" if of_boundary and is_own else MORE_NODES
+    remedy = "mend the initial mesh" if of_boundary and is_own else required.remedy
     texts = [*of_boundary, *of_labels]
     return "; ".join([*texts, remedy]) if texts else ""
 
 
-def faulty_labels(rows: Iterable[LabelFidelity]) -> Iterator[int]:
+def faulty_labels(rows: Iterable[LabelFidelity], required: Requirements) -> Iterator[int]:
     """Yield the labels that violate the requirement."""
     for row in rows:
-        if _is_absent(row) or _is_off(row) or _pieces(row):
+        if not is_pocket(row, required) and (_is_absent(row) or _is_off(row) or _pieces(row)):
             yield row.label
+
+
+def is_pocket(row: LabelFidelity, required: Requirements) -> bool:
+    """Return whether a row is that of label 0 in a foreground, which is no tissue: the voxels that
+    are no background.
+    """
+    return row.label == BACKGROUND_LABEL and required.region == FOREGROUND
+
+
+def _is_judged(row: LabelFidelity) -> bool:
+    """Return whether a label has voxels for a verdict, and a component that cells can show."""
+    return row.extent.covered_voxels >= LABEL_VOXELS and row.extent.size_in_cells >= LEAST_CELLS
 
 
 def _is_absent(row: LabelFidelity) -> bool:
     """Return whether a large label has no cell, or cells elsewhere."""
-    return row.extent.covered_voxels >= LABEL_VOXELS and row.overlap.dice == 0.0
+    return _is_judged(row) and row.overlap.dice == 0.0
 
 
 def _is_off(row: LabelFidelity) -> bool:
     """Return whether a large label has cells of too much or too little volume."""
     is_right = LEAST_VOLUME <= row.extent.ratio <= MOST_VOLUME
-    return row.extent.covered_voxels >= LABEL_VOXELS and not (is_right or _is_absent(row))
+    return _is_judged(row) and not (is_right or _is_absent(row))
 
 
 def _pieces(row: LabelFidelity) -> list[LostComponent]:
@@ -314,12 +330,18 @@ def _pieces(row: LabelFidelity) -> list[LostComponent]:
     return [] if is_exempt else [each for each in row.pieces.lost_components if _is_large(each)]
 
 
+def is_shown(component: LostComponent) -> bool:
+    """Return whether cells can show a component: it is as large as `LEAST_CELLS` of them."""
+    return component.size_in_cells is None or component.size_in_cells >= LEAST_CELLS
+
+
 def _is_large(component: LostComponent) -> bool:
-    return component.voxels >= COMPONENT_VOXELS
+    return component.voxels >= COMPONENT_VOXELS and is_shown(component)
 
 
 def _say_labels(rows: Sequence[LabelFidelity], required: Requirements) -> str:
     words, texts = required.label_words, list[str]()
+    rows = [row for row in rows if not is_pocket(row, required)]
     if lost := [words(row.label) for row in rows if _is_absent(row)]:
         texts.append(
             f"no voxel of label {', '.join(lost)}, of {LABEL_VOXELS} voxels or more, lies in a "
@@ -334,9 +356,10 @@ def _say_labels(rows: Sequence[LabelFidelity], required: Requirements) -> str:
         )
     if pieces := [(each, f" of label {words(row.label)}") for row in rows for each in _pieces(row)]:
         texts.append(
-            f"components of labels {LARGE_COMPONENTS} without a cell: {_list_components(pieces)}"
+            f"components of labels {LARGE_COMPONENTS} without a cell, as large as "
+            f"{LEAST_CELLS:g} cells around or more: {_list_components(pieces)}"
         )
-    if not set(faulty_labels(rows)) <= required.unhelped:
+    if texts:
         texts.append(PIECES_REMEDY if pieces else LABEL_REMEDY)
     return "; ".join(texts)
 

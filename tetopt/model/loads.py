@@ -11,6 +11,7 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Iterable
+from itertools import zip_longest
 from typing import NamedTuple
 
 import numpy as np
@@ -29,7 +30,6 @@ from tetopt.model.mappings import MODULUS_UNITS, without_unit
 from tetopt.model.sets import (
     BOUNDARY_SET,
     FACE_NAMES,
-    SIDE_DEPTH,
     Sets,
     area_vectors,
     facet_triples,
@@ -41,7 +41,8 @@ from tetopt.system.arrays import Floats, Ints
 
 # the sum of area vectors of a flat set is at least this fraction of its area
 PLANE_FRACTION = 1.0 - 1e-6
-SMALL_SIDE = 0.05  # of the area that a mesh shows to a side: a loaded side with less is reported
+SMALL_SIDE = 0.25  # of the area that a mesh shows to a side: a loaded side with less is reported
+FACING_DEGREES = 50  # of facets of a suggested set: more than those of steps, at 45
 MOST_COMPRESSION_PERCENT = 50.0  # more is beyond a linear step
 FREE_WORD = "free"  # a component of move:SET:X,Y,Z that is not prescribed
 # By kind: the form of the arguments, the count of numbers (n: one per dimension), and their unit.
@@ -126,8 +127,9 @@ def parse_loads(
     Warns
     -----
     UserWarning
-        A loaded side is far smaller than the mesh, as where the image's box cuts off a brain's
-        stem.
+        A loaded side has less than a quarter of the area that the mesh shows to it, as where the
+        image's box cuts off a brain's stem, or lies beside the opposite, loaded side, as the tip of
+        a vertebra's spinous process does.
     """
     loads = tuple(load for text in texts for load in _loads(text, mesh, sets, units))
     check_steps(loads)
@@ -138,9 +140,12 @@ def parse_loads(
         _check_apart(
             [load for load in in_step(loads, step) if load.kind == "displacement"], mesh, sets
         )
-    sides = {name for pair in FACE_NAMES[mesh.ndim] for name in pair}
-    for name in dict.fromkeys(load.set_name for load in loads if load.set_name in sides):
-        _warn_of_small(name, mesh, sets)
+    names = {load.set_name for load in loads}
+    for pair in FACE_NAMES[mesh.ndim]:
+        sides = [name for name in pair if name in names]
+        sides.sort(key=lambda name: float(np.abs(area_vectors(mesh, sets.facets[name])).sum()))
+        for name, other in zip_longest(sides, sides[1:]):
+            _warn_of_side(name, other, mesh, sets)
     return loads
 
 
@@ -323,9 +328,12 @@ def _upwards(mesh: Mesh, sets: Sets, low: str, high: str) -> Floats:
     return np.eye(mesh.ndim)[-1]
 
 
-def _warn_of_small(name: str, mesh: Mesh, sets: Sets) -> None:
-    """Warn of a side with a small part of the area that the whole mesh shows in its direction."""
-    total = area_vectors(mesh, sets.facets[name]).sum(axis=0)
+def _warn_of_side(name: str, other: str | None, mesh: Mesh, sets: Sets) -> None:
+    """Warn of a side with a small part of the area that the whole mesh shows in its direction, or
+    beside the other, larger, loaded one.
+    """
+    areas = area_vectors(mesh, sets.facets[name])
+    total = areas.sum(axis=0)
     size = float(np.sqrt((total**2).sum()))
     if size == 0.0 or BOUNDARY_SET not in sets.facets:
         return
@@ -333,19 +341,34 @@ def _warn_of_small(name: str, mesh: Mesh, sets: Sets) -> None:
     share = size / float(
         np.maximum((area_vectors(mesh, sets.facets[BOUNDARY_SET]) * normal).sum(axis=1), 0.0).sum()
     )
+    points = mesh.points[nodes_of(mesh, sets.facets[name])]
+    low, high = points.min(axis=0), points.max(axis=0)
+    corners = np.stack([mesh.points.min(axis=0), mesh.points.max(axis=0)])
+    problems = []
     if share < SMALL_SIDE:
-        count = len(sets.facets[name])
-        along = (mesh.points * normal).sum(axis=1)
-        vectors = (mesh.points[along.argmax()], normal, [SIDE_DEPTH * np.ptp(along)])
-        plane = ":".join(",".join(f"{number + 0.0:.4g}" for number in each) for each in vectors)
-        what = (
-            f"{count} facet{'s' * (count > 1)}, {100.0 * share:.2g} % of the area that the "
-            "mesh shows to that side"
+        problems.append(f"has {100.0 * share:.2g} % of the area that the mesh shows to that side")
+    if other is not None:
+        there = mesh.points[nodes_of(mesh, sets.facets[other])]
+        across = np.linalg.svd(normal[None])[2][1:, None]  # (n-1, 1, n), directions
+        middle, places = (points.mean(axis=0) * across).sum(axis=2), (there * across).sum(axis=2)
+        if (middle < places.min(axis=1, keepdims=True)).any() or (
+            middle > places.max(axis=1, keepdims=True)
+        ).any():
+            problems.append(f'lies beside "{other}"')
+            beside = np.stack([there.min(axis=0), there.max(axis=0)])
+            corners = np.where(np.abs(normal) < np.abs(normal).max(), beside, corners)
+    if problems:
+        extent = ", ".join(
+            f"{axis} {a:.4g} to {b:.4g}" for axis, a, b in zip("xyz", low, high, strict=False)
         )
+        step = 10.0 ** np.floor(np.log10(np.ptp(corners, axis=0).max()) - 1.0)
+        corners = step * np.stack([np.floor(corners[0] / step), np.ceil(corners[1] / step)])
+        texts = [",".join(f"{x + 0.0:.4g}" for x in vector) for vector in (normal, *corners)]
         warn(
-            f'load: set "{name}" is only {what}; hold or move a larger set instead, such as that '
-            "of `sets` "
-            f'"base=plane:{plane}"',
+            f'load: set "{name}" {" and ".join(problems)}: {len(areas)} facets of '
+            f"{np.sqrt((areas**2).sum(axis=1)).sum():.4g} mm{mesh.ndim - 1}, {extent} mm; hold or "
+            "move a larger set of the same region instead, such as `sets` "
+            f'"base=facing:{texts[0]}:{FACING_DEGREES} & box:{texts[1]}:{texts[2]}"',
             Remark,
         )
 

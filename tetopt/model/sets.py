@@ -372,9 +372,12 @@ def with_requested(mesh: Mesh, sets: Sets, requests: Iterable[str], mean: Floats
         "NAME=below:T", the cells of the largest facet-connected set with a mean below T (Fig. 3(f)
         of the paper), and the facets around them, "NAME_surface"; "NAME=point:X,Y,Z:D" and
         "NAME=plane:X,Y,Z:NX,NY,NZ:D", boundary facets with all nodes within D mm of a point, or of
-        a plane through a point with a normal; world mm, RAS+. "NAME=A-B-C", the facets of set A
-        that are in no other of these, and "NAME=outer:A-B", "NAME=inner:A-B", its outer or inner
-        connected parts (`_is_inner`). "interface_b_a" is "interface_a_b" seen from b.
+        a plane through a point with a normal; "NAME=facing:NX,NY,NZ:A", those whose outward normal
+        is within A degrees of a direction; "NAME=box:X,Y,Z:X,Y,Z", those with all nodes in a box
+        between two corners; world mm, RAS+. "NAME=A-B-C", the facets of set A that are in no other
+        of these, and "NAME=outer:A-B", "NAME=inner:A-B", its outer or inner connected parts
+        (`_is_inner`). "interface_b_a" is "interface_a_b" seen from b. "NAME=A & B", of any of these
+        but the first, the facets in all of them.
     mean : (M,) float64, optional
         Mean intensity of each cell.
 
@@ -387,14 +390,12 @@ def with_requested(mesh: Mesh, sets: Sets, requests: Iterable[str], mean: Floats
     for text in requests:
         request = parse_set(text, mesh.ndim)
         check_free_names(request, sets)
-        if request.difference:
-            sets = Sets(sets.facets | {request.name: _of_sets(mesh, request, sets)}, sets.cells)
-        elif request.kind == "below":
+        if request.kind == "below":
             cells = _cells_below(mesh, request, mean)
             surface = {f"{request.name}_surface": enclosing_facets(mesh, cells)}
             sets = Sets(sets.facets | surface, sets.cells | {request.name: cells})
         else:
-            sets = Sets(sets.facets | {request.name: _facets_within(mesh, request)}, sets.cells)
+            sets = Sets(sets.facets | {request.name: _facets_of(mesh, request, sets)}, sets.cells)
     return sets
 
 
@@ -405,6 +406,7 @@ class SetRequest(NamedTuple):
     kind: str
     vectors: list[Floats]  # the numbers between the colons
     difference: str = ""  # "A-B-C", of sets of facets
+    parts: tuple[SetRequest, ...] = ()  # whose facets in common it has
 
     def names(self) -> tuple[str, ...]:
         """Return the names of the sets that it creates."""
@@ -420,17 +422,25 @@ def parse_set(text: str, ndim: int) -> SetRequest:
         Invalid words or numbers, or a name that is not supported by all formats.
     """
     name, equals, what = text.partition("=")
+    if equals and "&" in what:
+        parts = tuple(parse_set(f"{name}={part.strip()}", ndim) for part in what.split("&"))
+        if any(part.kind == "below" for part in parts):
+            raise InputError(f'set {name}: expected sets of facets beside &, got "{what}"')
+        return SetRequest(name, "", [], parts=parts)
     kind, _, rest = what.partition(":")
     shapes = {
         "below": ("T", [1]),
         "point": ("X,Y,Z:D", [ndim, 1]),
         "plane": ("X,Y,Z:NX,NY,NZ:D", [ndim, ndim, 1]),
+        "facing": ("NX,NY,NZ:DEGREES", [ndim, 1]),
+        "box": ("X,Y,Z:X,Y,Z", [ndim, ndim]),
     }
     is_difference = kind in SIDE_KINDS or (":" not in what and what.strip("- ") != "")
     if not equals or not (kind in shapes or is_difference):
+        forms = ", ".join(f"NAME={each}:{form}" for each, (form, _) in shapes.items())
         raise InputError(
-            "set: expected NAME=below:T, NAME=point:X,Y,Z:D, NAME=plane:X,Y,Z:NX,NY,NZ:D, "
-            f'NAME=A-B, NAME=outer:A-B or NAME=inner:A-B of sets A, B, ..., got "{text}"'
+            f"set: expected {forms}, NAME=A-B, NAME=outer:A-B, NAME=inner:A-B or NAME=A & B of "
+            f'sets A, B, ..., got "{text}"'
         )
     if not SET_NAME.fullmatch(name):
         raise InputError(
@@ -449,9 +459,10 @@ def parse_set(text: str, ndim: int) -> SetRequest:
     if len(parts) != len(counts):
         raise InputError(f'set {name}: expected {kind}:{form}, got "{rest}"')
     vectors = [_numbers(name, part, count) for part, count in zip(parts, counts, strict=True)]
-    if kind != "below" and vectors[-1][0] < 0.0:
-        raise InputError(f"set {name}: expected a distance of 0 or more, got {vectors[-1][0]:g}")
-    if kind == "plane" and not vectors[1].any():
+    if kind not in ("below", "box") and vectors[-1][0] < 0.0:
+        what = "an angle" if kind == "facing" else "a distance"
+        raise InputError(f"set {name}: expected {what} of 0 or more, got {vectors[-1][0]:g}")
+    if kind in ("plane", "facing") and not vectors[-2].any():
         raise InputError(f"set {name}: expected a normal other than 0, got 0")
     return SetRequest(name, kind, vectors)
 
@@ -461,6 +472,26 @@ def enclosing_facets(mesh: Mesh, cells: Ints) -> Ints:
     part = Mesh(mesh.points, mesh.cells[cells])
     rows = boundary_rows(part)
     return np.column_stack([cells[rows[:, 0]], rows[:, 1]])
+
+
+def _facets_of(mesh: Mesh, request: SetRequest, sets: Sets) -> Ints:
+    """Return the facets (K, 2) of a request: those of sets, within places, or in all its parts.
+
+    Of an interface and places, these are facets of the interface.
+    """
+    rows = None
+    ordered = sorted(request.parts or (request,), key=lambda part: not part.difference)
+    for part in ordered:
+        if part.difference:
+            of_sets = _of_sets(mesh, part, sets)
+            number = (mesh.ndim + 1, 1)
+            rows = of_sets if rows is None else rows[np.isin(rows @ number, of_sets @ number)]
+        else:
+            rows = _facets_within(mesh, part, boundary_rows(mesh) if rows is None else rows)
+    assert rows is not None
+    if len(rows) == 0:
+        raise InputError(f"set {request.name}: its parts have no facet in common")
+    return rows
 
 
 def _of_sets(mesh: Mesh, request: SetRequest, sets: Sets) -> Ints:
@@ -579,24 +610,42 @@ def _cells_below(mesh: Mesh, request: SetRequest, mean: Floats | None) -> Ints:
     return chosen
 
 
-def _facets_within(mesh: Mesh, request: SetRequest) -> Ints:
-    """Return the boundary facets with all nodes within the distance of the point or plane."""
-    offset = mesh.points - request.vectors[0]
-    if request.kind == "point":
-        distance = np.sqrt((offset**2).sum(axis=1))
+def _facets_within(mesh: Mesh, request: SetRequest, rows: Ints) -> Ints:
+    """Return those of some facets (K, 2) with all nodes near a point, a plane or in a box, or that
+    face a direction.
+    """
+    if len(rows) == 0:
+        return rows
+    nodes = facet_triples(mesh.cells, rows)
+    reach, unit = float(request.vectors[-1][0]), "mm"
+    if request.kind == "facing":
+        areas, direction = area_vectors(mesh, rows), _unit(request.vectors[0])
+        sizes = np.sqrt((areas**2).sum(axis=1))
+        cosines = (areas * direction).sum(axis=1) / np.where(sizes > 0.0, sizes, 1.0)
+        farthest, unit = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0))), "degrees"
     else:
-        # its square neither overflows nor vanishes
-        normal = request.vectors[1] / np.abs(request.vectors[1]).max()
-        distance = np.abs((offset * (normal / np.linalg.norm(normal))).sum(axis=1))
-    reach = float(request.vectors[-1][0])
-    rows = boundary_rows(mesh)
-    farthest = distance[facet_triples(mesh.cells, rows)].max(axis=1)
+        offset = mesh.points - request.vectors[0]
+        if request.kind == "box":
+            low, high = np.sort(request.vectors, axis=0)
+            distance = np.maximum(low - mesh.points, mesh.points - high).max(axis=1)
+            reach = 0.0
+        elif request.kind == "point":
+            distance = np.sqrt((offset**2).sum(axis=1))
+        else:
+            distance = np.abs((offset * _unit(request.vectors[1])).sum(axis=1))
+        farthest = distance[nodes].max(axis=1)
     if not (farthest <= reach).any():
         raise InputError(
-            f"set {request.name}: no boundary facet lies within {reach:g} mm; the nearest one lies "
-            f"within {farthest.min():.4g} mm"
+            f"set {request.name}: no facet lies within {reach:g} {unit} of {request.kind}; the "
+            f"nearest one lies within {farthest.min():.4g} {unit}"
         )
     return rows[farthest <= reach]
+
+
+def _unit(vector: Floats) -> Floats:
+    """Return a vector of length 1; the squares neither overflow nor vanish."""
+    scaled = vector / np.abs(vector).max()
+    return np.asarray(scaled / np.linalg.norm(scaled))
 
 
 def _numbers(name: str, text: str, count: int) -> Floats:

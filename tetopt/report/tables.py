@@ -129,11 +129,10 @@ def add_quality(
 def mask_table(mask: MaskFidelity, ndim: int, word: str) -> Table:
     """Return a table of how well a mesh fills its mask, which the table calls `word`."""
     table = new_table(word, "in voxels", "in the mesh")
-    change = 100.0 * (mask.mesh_volume / mask.volume - 1.0)
     table.add_row(
         size_words(ndim),
         size_text(mask.volume, 1),
-        f"{size_text(mask.mesh_volume, 1)} ({change:+.1f} %)",
+        f"{size_text(mask.mesh_volume, 1)} ({_change_text(mask.mesh_volume, mask.volume)} %)",
     )
     table.add_row("Dice, by voxels", "", f"{mask.dice:.4f}")
     for title, *distances in (
@@ -164,6 +163,11 @@ def mask_table(mask: MaskFidelity, ndim: int, word: str) -> Table:
     table.add_row("connected components", str(mask.components), str(mask.mesh_components))
     table.add_row("Euler number of the surface", str(mask.euler), str(mask.mesh_euler))
     return table
+
+
+def _change_text(new: float, old: float) -> str:
+    """Format by how many percent a number is larger; never as -0.0."""
+    return f"{round(100.0 * (new / old - 1.0), 1) + 0.0:+}"
 
 
 def sizes_in_words(edges: EdgeRatios) -> str:
@@ -221,14 +225,13 @@ def label_table(rows: Sequence[LabelFidelity], names: Mapping[int, str], ndim: i
     )
     for row in rows:
         extent = row.extent
-        change = 100.0 * (extent.mesh_volume / extent.volume - 1.0)
         size = size_text(extent.volume, 1 if extent.volume < LARGE_SIZE else 0)
         table.add_row(
             _label_words(row.label, names),
             str(extent.voxels),
             size,
             str(extent.n_cells),
-            f"{change:+.1f}",
+            _change_text(extent.mesh_volume, extent.volume),
             f"{row.overlap.dice:.4f}",
             size_text(row.distance.p95, 3),
             str(row.pieces.components),
@@ -396,8 +399,6 @@ def label_differences(rows: Sequence[LabelFidelity], names: Mapping[int, str]) -
         parts = []
         if abs(more) > CHANGED_FRACTION * volume:
             parts.append(f"{abs(more) / volume:.0%} {'smaller' if more < 0.0 else 'larger'}")
-        if n_voxels != n_cells:
-            parts.append(f"{count_text(n_voxels, 'component')} of voxels, {n_cells} of cells")
         parts += _surplus(n_cells + of_cells - surface.mesh_euler // 2 - holes, "hole")
         parts += _surplus(of_cells - cavities, "cavity")
         if parts and row.extent.n_cells:

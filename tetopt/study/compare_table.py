@@ -21,6 +21,7 @@ COMPRESSION_ERRORS = (  # of the compression, and the fields of `tetopt.fem.refe
     ("interface strain", "interface_strain"),
 )
 ARROWS = {-1: " ↓", 1: " ↑", 0: ""}
+IMAGE_WORD = "{image}"  # in the command of a program that gets the image
 Value = Callable[[PipelineRun], float | None]
 
 
@@ -32,6 +33,7 @@ class Column(NamedTuple):
     value: Value
     better: int  # -1 if smaller is better, +1 if larger, 0 if neither
     is_short: bool = False  # also in the terminal
+    least: float = 0.0  # the reference's own error, below which errors say nothing
 
     @property
     def heading(self) -> str:
@@ -81,6 +83,7 @@ def columns_of(report: Report) -> list[Column]:
                 _error(nu, name),
                 -1,
                 is_short=(k, name) == (0, "displacement"),
+                least=_own_error(report, nu, name),
             )
             for k, nu in enumerate(ratios)
             for title, name in COMPRESSION_ERRORS
@@ -164,12 +167,41 @@ def labels_of_table(report: Report) -> set[int]:
     return {label for label, n in voxels.items() if n > JUDGED_VOXELS} or set(voxels)
 
 
+def _own_error(report: Report, nu: str, name: str) -> float:
+    """Return the reference's own error; 0 if it is unknown."""
+    energy = report.reference.by_nu.get(nu)
+    return 0.0 if energy is None else getattr(energy.own_error, name, None) or 0.0
+
+
 def _error(nu: str, name: str) -> Value:
     def value(run: PipelineRun) -> float | None:
         solved = run.measurement.fem.get(nu)
         return None if solved is None else getattr(solved.errors, name)
 
     return value
+
+
+def short_table(report: Report) -> tuple[list[Column], list[TableRow], list[str]]:
+    """Return the columns and rows for the terminal, and a line on each mark.
+
+    Errors below the reference's own are blank. An E_D of a mesh that was made of labels alone has
+    a star.
+    """
+    columns = [column for column in columns_of(report) if column.is_short]
+    rows, notes = rows_of(report, columns), dict[str, str]()
+    for row, (_, pipeline) in zip(rows, report.meshes(), strict=True):
+        for k, column in enumerate(columns if row.cells else []):
+            value = None if pipeline.median is None else column.value(pipeline.median)
+            if value is not None and value < column.least:
+                row.cells[k] = "", ""
+                notes[column.group] = (
+                    f"{column.group}, {column.title}: blank below the reference's own error, "
+                    f"{number_text(column.least)}, which ranks no mesh"
+                )
+            elif "E_D" in column.title and row.kind == "peer" and IMAGE_WORD not in pipeline.about:
+                row.cells[k] = f"{row.cells[k][0]}*", ""
+                notes["E_D"] = "* E_D, of the variance: made from labels or classes alone"
+    return columns, rows, list(notes.values())
 
 
 def rows_of(report: Report, columns: list[Column]) -> list[TableRow]:
