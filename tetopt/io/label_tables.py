@@ -269,12 +269,12 @@ def _of_colours(path: Path, lines: list[tuple[str, tuple[str, ...]]]) -> Iterato
         (where, label, name.split(), re.split(r"[\s,;]+", numbers.strip(" \t,;")))
         for where, (label, name, numbers) in lines
     ]
-    long = [(*words, *map(float, numbers)) for *_, words, numbers in rows if len(numbers) > 4]
+    long = [(words, [*map(float, numbers)]) for *_, words, numbers in rows if len(numbers) > 4]
     # The fifth number is a tissue type, unless names end in numbers, such as "rib 3".
     has_types = (
-        all(len(row) == 6 and row[4] in (0.0, 255.0) for row in long)
-        and len({row[0] for row in long}) == len(long)
-        and 0.0 < max((row[-1] for row in long), default=0.0) <= MOST_TISSUES
+        all(len(words) == 1 and len(v) == 5 and v[3] in (0.0, 255.0) for words, v in long)
+        and len({words[0] for words, _ in long}) == len(long)
+        and 0.0 < max((v[-1] for _, v in long), default=0.0) <= MOST_TISSUES
     )
     # Names of two words seldom differ in both, as abbreviations and names do.
     pairs = [words for *_, words, numbers in rows if (len(words), len(numbers)) == (2, 4)]
