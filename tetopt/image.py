@@ -291,7 +291,7 @@ def check_kind(dtype: np.dtype) -> None:
             f"image data: expected one number per voxel, got {dtype}; convert RGB to grey first"
         )
     if dtype.kind not in "buif":
-        raise InputError(f"image data: expected numbers, got dtype {dtype}")
+        raise InputError(f"image data: expected real numbers, got dtype {dtype}")
 
 
 def check_intensities(low: float, high: float) -> None:

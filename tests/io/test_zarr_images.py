@@ -459,10 +459,10 @@ def test_metadata_that_is_damaged(tmp_path, name, text):
 @pytest.mark.parametrize(
     ("options", "match"),
     [
-        ({"dtype": "complex64"}, "expected real numbers, got complex ones"),
+        ({"dtype": "complex64"}, "expected real numbers, got dtype complex"),
         ({"dtype": "bool"}, None),
         ({"dtype": "float16"}, None),
-        ({"dtype": "S3"}, r"expected numbers, got dtype \|S3"),
+        ({"dtype": "S3"}, r"expected real numbers, got dtype \|S3"),
         ({"dtype": [("r", "u1"), ("g", "u1")]}, "expected one number per voxel, got .*'r'"),
         ({"compressors": [numcodecs.Pickle()], "dtype": "i2"}, "pickle"),
         ({"filters": [numcodecs.Pickle()], "dtype": "i2"}, "pickle"),
