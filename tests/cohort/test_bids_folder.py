@@ -115,6 +115,16 @@ def test_all_that_is_wrong_is_told_at_once(raw):
         bids_subjects(folder, participants=["1"], sessions=["x"])
 
 
+def test_columns_of_participants_are_notes(raw):
+    folder = filled(raw, "sub-1/anat/sub-1_T1w.nii.gz", "sub-2/anat/sub-2_T1w.nii.gz")
+    table = folder / "participants.tsv"
+    table.write_text("participant_id\tage\tsex\nsub-2\t34\tn/a\n")
+    assert [row.notes for row in bids_subjects(folder)] == [{}, {"age": "34"}]
+    table.write_bytes(b"\xff\xfe\x00")
+    with pytest.warns(UserWarning, match="participants"):
+        assert [row.notes for row in bids_subjects(folder)] == [{}, {}]
+
+
 PATTERNS = {  # by words of them: a session, and what matches
     "aseg_dseg": ("a", "fmriprep/sub-1/ses-a/anat/sub-1_ses-a_desc-aseg_dseg.nii.gz"),
     "{session}_desc-brain_mask": ("", "fmriprep/sub-1/anat/sub-1_desc-brain_mask.nii.gz"),

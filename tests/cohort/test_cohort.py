@@ -99,13 +99,25 @@ def test_what_failed_is_a_row_and_a_rerun_would_make_what_changed_and_what_faile
     Path("cut.nii.gz").write_bytes(Path("a.nii.gz").read_bytes()[:300])
     command = f"{COHORT} --iterations 0 --nodes 300 --scheduler {scheduler}"
     write_table(
-        "01 a.nii.gz coarse.nii.gz n/a", "02 cut.nii.gz n/a n/a", "03 a.nii.gz far.nii.gz n/a"
+        "01 a.nii.gz coarse.nii.gz n/a 31 f",
+        "02 cut.nii.gz n/a n/a 32.5 m",
+        "03 a.nii.gz far.nii.gz n/a n/a f",
+        "04 a.nii.gz no.nii.gz n/a 034 m",
+        columns="subject image labels nodes age site",
     )
+    capfd.readouterr()
     assert exit_code(command) == 1
-    assert statuses() == {"sub-01": "done", "sub-02": "failed", "sub-03": "failed"}
+    said = " ".join(capfd.readouterr().err.split())
+    assert said.count("age, site") == 1
+    assert re.search(r"line 5: labels: \S*no.nii.gz does not exist", said)
+    failed = {f"sub-0{number}": "failed" for number in (2, 3, 4)}
+    assert statuses() == {"sub-01": "done"} | failed
+    assert list(statuses("table.age").values()) == ["31", "32.5", "n/a", "034"]
+    assert list(statuses("table.site").values()) == ["f", "m", "f", "m"]
     logs, page = Path("out/logs"), Path("out/cohort.html").read_text()
     assert "resampled to the image's grid" in " ".join((logs / "sub-01.log").read_text().split())
-    for name, file in (("sub-02", "cut.nii.gz"), ("sub-03", "far.nii.gz")):
+    assert '"table.age"' in page
+    for name, file in zip(failed, ("cut.nii.gz", "far.nii.gz", "no.nii.gz"), strict=True):
         failure = numbers_in(logs / f"{name}.failed.json")
         reason = failure["reason"]
         assert failure["command"].startswith(f"tetopt mesh -o {name}.vtu --")

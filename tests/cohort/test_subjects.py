@@ -148,10 +148,26 @@ def test_a_pattern_means_one_file(tmp_path, monkeypatch, pattern, session, name)
     assert matching(pattern, subject("0-1", session)) == tmp_path / name
 
 
-def test_a_pattern_of_none_or_two_files_is_refused(tmp_path):
-    with pytest.raises(InputError, match="expected one file, got none"):
-        matching(f"{tmp_path}/*.nii", subject("01"))
+def test_a_pattern_of_two_files_is_refused(tmp_path):
+    """One of none is itself, whose run fails."""
+    assert not matching(f"{tmp_path}/*.nii", subject("01")).exists()
     for name in ("a.nii", "b.nii"):
         (tmp_path / name).touch()
     with pytest.raises(InputError, match=r"expected one file, got 2: a\.nii, b\.nii"):
         matching(f"{tmp_path}/*.nii", subject("01"))
+
+
+def test_columns_that_are_no_options_are_notes_and_slips_are_not(tmp_path):
+    path = table(
+        tmp_path / "s.tsv",
+        "participant_id\timage\tage\tsex\tsite\tdiagnosis\tlables\tmaks\tk_d",
+        "sub-01\ta.nii\t31\tF\tn/a\tAD, MCI\t\t\t0.3",
+    )
+    (row,) = read_table(path)
+    assert row.notes == {"age": "31", "sex": "F", "diagnosis": "AD, MCI"}
+    assert row.options == {"k_d": "0.3"}
+    path.write_text(path.read_text().replace("AD, MCI\t\t\t", "AD\tl.nii\tm.nii\t"))
+    (row,) = read_table(path)
+    assert set(row.options) == {"lables", "maks", "k_d"}  # which their plan refuses
+    write_table(tmp_path / "t.csv", [row])
+    assert read_table(tmp_path / "t.csv")[0].notes == row.notes

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tetopt.cohort.subjects import Problems, Subject
+from tetopt.cohort.subjects import NO_VALUES, Problems, Subject, table_cells
 from tetopt.errors import InputError, warn
 from tetopt.io.text import plain
 from tetopt.system.extras import install_hint
@@ -94,10 +94,36 @@ def bids_subjects(
             else f"_{suffix}"
         )
         _warn_of_others(folder, what, {subject for subject, _ in paths})
+    notes = _notes(folder / "participants.tsv")
     return [
-        Subject(subject, session, (path,), {}, plain(str(path.relative_to(folder))))
+        Subject(
+            subject,
+            session,
+            (path,),
+            {},
+            plain(str(path.relative_to(folder))),
+            notes.get(subject, {}),
+        )
         for (subject, session), (path,) in paths.items()
     ]
+
+
+def _notes(path: Path) -> dict[str, dict[str, str]]:
+    """Return what a table of participants says of each, by subject; nothing without one."""
+    if not path.is_file():
+        return {}
+    try:
+        (_, names), *lines = table_cells(path)
+    except InputError as error:
+        warn(f"{error}; its columns are left out")
+        return {}
+    rows = [dict(zip(names, cells, strict=False)) for _, cells in lines]
+    return {
+        row.pop("participant_id", "").removeprefix("sub-"): {
+            name: cell for name, cell in row.items() if cell not in NO_VALUES
+        }
+        for row in rows
+    }
 
 
 def _images(folder: Path, suffix: str, labels: Sequence[str]) -> list[Any]:

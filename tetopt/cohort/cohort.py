@@ -19,7 +19,16 @@ from tetopt.cohort.cohort_plan import (
     with_states,
 )
 from tetopt.cohort.estimate import Estimate, estimate_memory, share_for
-from tetopt.cohort.layout import WORK_NAME, begin, check_out, clean, failure_path, linked_place
+from tetopt.cohort.layout import (
+    WORK_NAME,
+    begin,
+    check_out,
+    clean,
+    failure_path,
+    linked_place,
+    notes_path,
+    table_in,
+)
 from tetopt.cohort.numbers import Row, collect
 from tetopt.cohort.options import CohortOptions
 from tetopt.cohort.subject_runs import Ended, SubjectTask, run_all
@@ -39,7 +48,7 @@ from tetopt.job.job import in_kinds
 from tetopt.job.options import RunOptions, kinds_of, near_hint
 from tetopt.job.plan import changed_options
 from tetopt.system.budget import memory_words
-from tetopt.system.files import check_output
+from tetopt.system.files import check_output, save_json
 from tetopt.system.work_directory import lock_directory
 from tetopt.workers import SchedulerLost, check_workers, workers
 
@@ -217,6 +226,8 @@ def run_planned(plan: CohortPlan) -> list[Row]:
         # Again, as another run may have ended since.
         to_run = choose_subjects(with_states(plan.to_run, place, plan.suffix), cohort.retry_failed)
         for entry in plan.entries:
+            if (table_in(notes := notes_path(place, entry.key)) or {}) != entry.subject.notes:
+                save_json(notes, entry.subject.notes)
             # later failures had other options or inputs
             if entry.state.status in ("done", "violated"):
                 failure_path(place, entry.key).unlink(missing_ok=True)

@@ -20,7 +20,7 @@ from tetopt.cohort.flags import (
     units,
 )
 from tetopt.cohort.layout import PAGE_NAME, TABLE_NAME
-from tetopt.cohort.numbers import Row, Value, description, present, save_table
+from tetopt.cohort.numbers import NOTE_BEGINNING, Row, Value, description, present, save_table
 from tetopt.io.text import count_text
 from tetopt.report.page import data_html, package_text, render_page, script_html, write_page
 
@@ -209,6 +209,9 @@ def _columns(rows: Sequence[Row]) -> dict[str, Quantity]:
     }
     for name, each in sorted(_options(rows).items()):
         if name.startswith(OPTION_BEGINNINGS) and len(each) > 1:
+            shown[name] = Quantity(name, _option(name), "", "both", False, 0.0)
+    for name in sorted(known):
+        if name.startswith(NOTE_BEGINNING):
             shown[name] = Quantity(name, _option(name), "", "both", False, 0.0)
     labels = sorted({number for row in rows for number in row.volumes if number > 0})
     names = {number: name for row in reversed(rows) for number, name in row.label_names.items()}

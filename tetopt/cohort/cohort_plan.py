@@ -27,7 +27,7 @@ from tetopt.cohort.subjects import (
 from tetopt.errors import InputError
 from tetopt.io.formats import BUILT_IN
 from tetopt.io.label_tables import is_preset_table
-from tetopt.job.events import note
+from tetopt.job.events import note, warning
 from tetopt.job.option_values import file_and_volume, tissue_files
 from tetopt.job.options import JobOptions, RunOptions, given_options
 from tetopt.job.plan import Plan, changed_options, plan_job
@@ -94,11 +94,14 @@ def entries_of(
 ) -> list[PlannedSubject]:
     """Return the subjects with their options and states.
 
+    Missing files of some subjects are warned of: their runs fail.
+
     Raises
     ------
     Problems
         All problems of all subjects.
     """
+    lost = list[tuple[str, str]]()
     problems = [("", line) for line in name_problems(subjects)]
     texts = {name: text for name in FILES_IN_TEXTS if (text := getattr(options, name)) is not None}
     # a worker may have another current folder
@@ -110,10 +113,12 @@ def entries_of(
         except InputError as error:
             problems.append((subject.place, str(error)))
             continue
-        problems += [(subject.place, words) for words in _missing(plan.job)]
+        lost += [(subject.place, words) for words in _missing(plan.job)]
         entries.append(PlannedSubject(subject, key(subject), plan, SubjectState("missing", "")))
-    if problems:
-        raise Problems(list(_lines(problems)))
+    if problems or len({place for place, _ in lost}) == len(subjects):
+        raise Problems(list(_lines([*problems, *lost])))
+    for line in _lines(lost):
+        warning(f"{line}; without it the subject fails")
     if (n_there := sum(numbers_path(out, entry.key).is_file() for entry in entries)) > 0:
         note(f"comparing inputs and options of {n_there} existing subjects with the requested ones")
     return with_states(entries, out, suffix)
@@ -178,9 +183,12 @@ def with_states(entries: list[PlannedSubject], out: Path, suffix: str) -> list[P
     def state(entry: PlannedSubject) -> PlannedSubject:
         request = None
         if numbers_path(out, entry.key).is_file():
-            request = job_request(
-                changed_options(entry.plan.bare, output=Path(mesh_name(entry.key, suffix)))
-            )
+            try:
+                request = job_request(
+                    changed_options(entry.plan.bare, output=Path(mesh_name(entry.key, suffix)))
+                )
+            except InputError as error:  # a file is missing by now
+                return entry._replace(state=SubjectState("failed", str(error)))
         return entry._replace(state=state_of(out, entry.key, request))
 
     with ThreadPoolExecutor() as pool:

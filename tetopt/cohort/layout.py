@@ -5,6 +5,7 @@
 - OUT/sub-X[/ses-Y]/KEY_desc-tetopt_mesh.vtu, with the run's numbers in a JSON file of the same name
 - OUT/sub-X[/ses-Y]/figures/: its pictures
 - OUT/logs/KEY.log, KEY.failed.json: events of the last run, and why it failed
+- OUT/logs/KEY.notes.json: what the table of subjects says of it beside options
 - OUT/.work/: unfinished outputs (`tetopt.system.work_directory`)
 """
 
@@ -56,6 +57,11 @@ def log_path(out: Path, key: str) -> Path:
 def failure_path(out: Path, key: str) -> Path:
     """Return the path of the failure of a subject's last run, which exists only if it failed."""
     return out / LOGS_NAME / f"{key}.failed.json"
+
+
+def notes_path(out: Path, key: str) -> Path:
+    """Return the path of what the table of subjects says of one beside its options."""
+    return out / LOGS_NAME / f"{key}.notes.json"
 
 
 def thumbnail_path(out: Path, key: str) -> Path:

@@ -20,6 +20,7 @@ from tetopt.cohort.layout import (
     LOGS_NAME,
     failure_path,
     log_path,
+    notes_path,
     numbers_path,
     table_in,
     thumbnail_path,
@@ -56,7 +57,10 @@ NOT_AVAILABLE = "n/a"  # BIDS' text for a missing value
 # First letters of texts that spreadsheets read as formulas (OWASP, "CSV Injection"), in all widths.
 FORMULA_LETTERS = ("=", "+", "-", "@", "\uff1d", "\uff0b", "\uff0d", "\uff20")
 OBLIQUE_DIGITS = 1  # of degrees: the precision of an affine's float32 numbers
+NUMBER = re.compile(r"-?(0|[1-9][0-9]{0,15})(\.[0-9]+)?")
+NOTE_BEGINNING = "table."  # of columns that the table of subjects has beside options
 COLUMN_GROUPS = {
+    "table": "Of the table of subjects: ",
     "options": "Option ",
     "request": "Option ",
     "versions": "Version of ",
@@ -122,6 +126,10 @@ def row_of(out: Path, key: str) -> Row:
     status, reason = state_of(out, key)
     places = {"log": log_path(out, key)}
     row = Row(key, status, reason, (), {}, {}, {}, {}, {})
+    notes = {
+        f"{NOTE_BEGINNING}{plain(name)}": _number_or_text(text)
+        for name, text in (table_in(notes_path(out, key)) or {}).items()
+    }
     if status in ("done", "violated"):
         numbers = numbers_path(out, key)
         places |= {
@@ -134,7 +142,14 @@ def row_of(out: Path, key: str) -> Row:
     files = {
         name: path.relative_to(out).as_posix() for name, path in places.items() if path.exists()
     }
-    return row._replace(files=files)
+    return row._replace(files=files, numbers=notes | row.numbers)
+
+
+def _number_or_text(text: str) -> Value:
+    """Return a decimal number as such; others, as codes with leading zeros, as text."""
+    if NUMBER.fullmatch(text) is None:
+        return plain(text)
+    return float(text) if "." in text else int(text)
 
 
 def with_numbers(row: Row, run: dict[str, Any]) -> Row:

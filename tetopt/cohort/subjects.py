@@ -6,6 +6,7 @@ import csv
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from difflib import get_close_matches
 from functools import partial
 from io import StringIO
 from pathlib import Path
@@ -13,6 +14,8 @@ from typing import NamedTuple
 
 from tetopt.errors import InputError
 from tetopt.io.label_tables import is_preset_table
+from tetopt.job.events import note
+from tetopt.job.options import RunOptions, kinds_of, option_name
 from tetopt.model.mappings import FILES_IN_TEXTS, named_file
 from tetopt.system.files import save_text
 from tetopt.system.incoming import text_of
@@ -22,6 +25,9 @@ SUBJECT_COLUMNS = ("subject", "participant_id")  # the second is from BIDS
 SESSION_COLUMNS = ("session", "session_id")
 # of `tetopt mesh`, with files
 FILE_OPTIONS = ("mask", "labels", "tissues", "sizing", "start", "label_names")
+# of participants in BIDS and other tables; some resemble options, as site does set
+NOTE_COLUMNS = ("age", "sex", "handedness", "group", "site", "weight", "height", "strain")
+RESEMBLANCE = 0.75  # of difflib's ratio: a column like an option is one with a slip
 NO_VALUES = ("", "n/a")  # of an empty cell; the second is from BIDS
 LEFT_OUT = "#"  # prefix of columns that are the user's notes
 IMAGE_PATTERN = re.compile(r"image(?:_([1-9][0-9]{0,2}))?$")
@@ -38,6 +44,7 @@ class Subject(NamedTuple):
     images: tuple[Path, ...]
     options: dict[str, str]  # by the names of `tetopt mesh`, with underscores, as text
     place: str  # its place in the table, for messages
+    notes: dict[str, str] = {}  # noqa: RUF012 - never modified; by columns that are no options
 
 
 class Problems(InputError):
@@ -67,8 +74,9 @@ def read_table(path: Path) -> list[Subject]:
     """Read the subjects of a table, a line each; its first line has the columns' names.
 
     `subject` (or `participant_id`), `session`, `image`, `image_2` and so on, `mask`, `labels`, and
-    any other option of `tetopt mesh` for the subject alone. Paths are relative to the table. Empty
-    cells and "n/a" are ignored, as are columns whose names begin with #.
+    any other option of `tetopt mesh` for the subject alone; other columns are notes, unless their
+    names resemble an option's. Paths are relative to the table. Empty cells and "n/a" are ignored,
+    as are columns whose names begin with #.
 
     Raises
     ------
@@ -76,8 +84,9 @@ def read_table(path: Path) -> list[Subject]:
         All problems of the table itself.
     """
     folder = path.parent.resolve()
-    names, *lines = _cells(path)
+    names, *lines = table_cells(path)
     columns = _columns(path, names)
+    notes = [name for name in columns if _is_note(name)]
     problems: list[str] = []
     subjects: list[Subject] = []
     for number, line in lines:
@@ -99,7 +108,7 @@ def read_table(path: Path) -> list[Subject]:
         options = {
             name: cell
             for name, cell in cells.items()
-            if name not in ("subject", "session", *images)
+            if name not in ("subject", "session", *images, *notes)
         }
         subjects.append(
             Subject(
@@ -108,10 +117,16 @@ def read_table(path: Path) -> list[Subject]:
                 tuple(_absolute(folder, cells[name]) for name in images),
                 with_files(options, partial(_absolute, folder)),
                 place,
+                {name: cells[name] for name in notes if name in cells},
             )
         )
     if problems:
         raise Problems(problems)
+    if notes:
+        note(
+            f"{path}: columns that are no options of tetopt mesh, and go into the cohort's table: "
+            f"{', '.join(notes)}"
+        )
     if not subjects:
         raise InputError(
             f"{path}: expected a line for each subject below the column names, got none"
@@ -158,7 +173,8 @@ def write_table(path: Path, subjects: Sequence[Subject]) -> None:
         key=lambda name: (name not in FILE_OPTIONS, name),
     )
     session = ["session"] if any(each.session for each in subjects) else []
-    columns = ["subject", *session, *images, *options]
+    notes = dict.fromkeys(name for each in subjects for name in each.notes)
+    columns = ["subject", *session, *images, *options, *notes]
     stream = StringIO()
     writer = csv.DictWriter(
         stream,
@@ -174,6 +190,7 @@ def write_table(path: Path, subjects: Sequence[Subject]) -> None:
             name: os.path.relpath(image, folder)
             for name, image in zip(images, each.images, strict=False)
         }
+        row |= each.notes
         writer.writerow(row | with_files(each.options, partial(os.path.relpath, start=folder)))
     save_text(path, stream.getvalue())
 
@@ -194,7 +211,7 @@ def with_files(options: dict[str, str], function: Callable[[str], Path | str]) -
 
 
 def matching(pattern: str, subject: Subject) -> Path:
-    """Return the one file of this subject that a pattern matches.
+    """Return the one file of this subject that a pattern matches, or the pattern itself.
 
     {subject} and {session} are its names as in `key`; without a session, "ses-{session}" is removed
     with the "_" or "/" before or after it. *, ? and [...] are as in a shell.
@@ -202,7 +219,7 @@ def matching(pattern: str, subject: Subject) -> Path:
     Raises
     ------
     InputError
-        No file matches, or several do.
+        Several files match, or a placeholder is unknown.
     """
     words = pattern
     if unknown := [
@@ -222,15 +239,24 @@ def matching(pattern: str, subject: Subject) -> Path:
     if path.exists() or not any(letter in words for letter in GLOB_LETTERS):
         return path
     matches = sorted(Path(path.anchor).glob(str(path.relative_to(path.anchor))))
-    if len(matches) == 1:
-        return matches[0]
-    named = ", ".join(match.name for match in matches[:3])
-    raise InputError(
-        f"{path}: expected one file, " + (f"got {len(matches)}: {named}" if matches else "got none")
-    )
+    if len(matches) > 1:
+        named = ", ".join(match.name for match in matches[:3])
+        raise InputError(f"{path}: expected one file, got {len(matches)}: {named}")
+    return (*matches, path)[0]
 
 
-def _cells(path: Path) -> list[tuple[int, list[str]]]:
+def _is_note(column: str) -> bool:
+    """Return whether a column is neither an option nor of a name that resembles one."""
+    options = {
+        option_name(name, kind).replace("-", "_") for name, kind in kinds_of(RunOptions).items()
+    }
+    is_known = not column or column in ("subject", "session", *options)
+    if is_known or IMAGE_PATTERN.match(column):
+        return False
+    return column in NOTE_COLUMNS or not get_close_matches(column, options, 1, RESEMBLANCE)
+
+
+def table_cells(path: Path) -> list[tuple[int, list[str]]]:
     """Return the non-empty lines of a table with their numbers, as cells."""
     text = text_of(path, "table of subjects")
     first = text.partition("\n")[0]
