@@ -27,7 +27,7 @@ SESSION_COLUMNS = ("session", "session_id")
 FILE_OPTIONS = ("mask", "labels", "tissues", "sizing", "start", "label_names")
 # of participants in BIDS and other tables; some resemble options, as site does set
 NOTE_COLUMNS = ("age", "sex", "handedness", "group", "site", "weight", "height", "strain")
-RESEMBLANCE = 0.75  # of difflib's ratio: a column like an option is one with a slip
+LEAST_RESEMBLANCE = 0.75  # of difflib's ratio: a column like an option is one with a slip
 NO_VALUES = ("", "n/a")  # of an empty cell; the second is from BIDS
 LEFT_OUT = "#"  # prefix of columns that are the user's notes
 IMAGE_PATTERN = re.compile(r"image(?:_([1-9][0-9]{0,2}))?$")
@@ -253,7 +253,7 @@ def _is_note(column: str) -> bool:
     is_known = not column or column in ("subject", "session", *options)
     if is_known or IMAGE_PATTERN.match(column):
         return False
-    return column in NOTE_COLUMNS or not get_close_matches(column, options, 1, RESEMBLANCE)
+    return column in NOTE_COLUMNS or not get_close_matches(column, options, 1, LEAST_RESEMBLANCE)
 
 
 def table_cells(path: Path) -> list[tuple[int, list[str]]]:
