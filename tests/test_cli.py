@@ -4,6 +4,7 @@ input.
 
 import functools
 import hashlib
+import inspect
 import json
 import os
 import re
@@ -45,7 +46,7 @@ from tetopt import (
     save_image,
     save_mesh,
 )
-from tetopt.cli.app import COMMANDS, help_line, loaded_command
+from tetopt.cli.app import COMMANDS, SHOWN_OPTIONS, help_line, loaded_command
 from tetopt.cli.console import show_error, show_event
 from tetopt.job.advice import order_problems, sentences, tell, unmet_requirements
 from tetopt.job.events import listen_with
@@ -546,7 +547,7 @@ def test_the_checksum_is_of_what_was_read(monkeypatch):
 
 
 @pytest.mark.parametrize("width", ["80", "120"])
-@pytest.mark.parametrize("words", ["--help", "mesh --help", "mesh --help-all", "fem --help"])
+@pytest.mark.parametrize("words", ["--help", "mesh --help", "mesh --help-all", "fem --help-all"])
 def test_help_names_no_value_of_a_switch_and_breaks_no_word(monkeypatch, words, width):
     monkeypatch.setenv("COLUMNS", width)
     text = run_command(words).out
@@ -567,18 +568,47 @@ def groups_of_help(words):
     }
 
 
-def test_help_of_mesh_has_the_twenty_options_that_most_users_take(monkeypatch):
+def test_help_of_mesh_has_the_options_that_most_users_take(monkeypatch):
     """In groups of at most nineteen, with the others by `--help-all`."""
     monkeypatch.setenv("COLUMNS", "80")
     every, shown = (groups_of_help(f"mesh {word}") for word in ("--help-all", "--help"))
     assert max(map(len, every.values())) <= 19
-    assert sum(map(len, shown.values())) == 20 + 1
+    assert sum(map(len, shown.values())) == 21 + 1
     assert all(
         set(options) < set(every[name]) or name == "Options" for name, options in shown.items()
     )
     assert {"--output", "--mask", "--nodes", "--young", "--load"} <= set().union(*shown.values())
     # has no shorter one
-    assert groups_of_help("cohort --help")["Optimisation"] == every["Optimisation"]
+    assert groups_of_help("cohort --help-all")["Optimisation"] == every["Optimisation"]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_of_no_command_has_more_than_a_page_of_options(monkeypatch, command):
+    """Each of many options shows those that most users take, each of which there is."""
+    monkeypatch.setenv("COLUMNS", "80")
+    groups = groups_of_help(f"{command} --help").values()
+    assert sum(map(len, groups)) <= 26 + 1
+    known = inspect.signature(loaded_command(command)).parameters
+    assert set(SHOWN_OPTIONS.get(command, ())) <= set(known)
+    if len(known) > 26:
+        every = groups_of_help(f"{command} --help-all").values()
+        assert sum(map(len, every)) >= len(known) - 2
+
+
+@pytest.mark.parametrize("more", ["", "--target-error 0.2", "--edge-size 5"])
+def test_a_dry_run_meshes_and_writes_nothing(here, more):
+    words = f"mesh disc.nii -o d.vtu --json d.json --figures f --k-d 0.3 {more} --dry-run"
+    said = run_command(words).out
+    lines = dict(line.split(": ", 1) for line in said.replace("\n  ", " ").splitlines())
+    assert here() == []
+    assert "disc.nii" in lines["reads"]
+    assert all(name in lines["writes"] for name in ("d.vtu", "d.json", "slice.png"))
+    assert re.search(r"\d", lines["nodes"])
+    assert re.search(r"\d [MG]B", lines["memory"])
+    assert "k_D 0.3" in lines["options"]
+    assert lines["options"].count("0.3") == 1
+    assert "unknown" in lines["time"]
+    assert_refuses(f"{words} --nodes -1", "nodes")
 
 
 def test_help_lists_the_commands():

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tetopt.cli import main
-from tetopt.cli.app import COMMANDS
+from tetopt.cli.app import COMMANDS, SHOWN_OPTIONS
 
 pytestmark = pytest.mark.full
 
@@ -33,7 +33,7 @@ def test_page(command):
 def test_options_are_those_of_the_help(command, capsys, monkeypatch):
     """Every option that the whole help prints is on the page, and no other."""
     monkeypatch.setenv("COLUMNS", "200")
-    main([command, "--help-all" if command == "mesh" else "--help"])
+    main([command, "--help-all" if command in SHOWN_OPTIONS else "--help"])
     rows = re.findall(
         r"^│ [* ]{0,3}((?:--?[a-z][a-z-]* +)+)", capsys.readouterr().out, re.MULTILINE
     )

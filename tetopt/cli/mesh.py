@@ -11,21 +11,34 @@ from tetopt.cli.ending import is_ended, mesh_kept, tell_end
 from tetopt.cli.options import ForceOption
 from tetopt.cli.run import Display
 from tetopt.cli.solver import print_model
-from tetopt.engine.loop import DEFAULT_NODES
+from tetopt.engine.loop import DEFAULT_NODES, TARGET_NODES_MAX
+from tetopt.engine.meshing import process_bytes
 from tetopt.io.mni import mni_path
 from tetopt.job.job import Job
-from tetopt.job.options import Option, has_model
+from tetopt.job.options import Option, given_options, has_model
+from tetopt.job.plan import expected_nodes, stated_options
+from tetopt.job.read import read
 from tetopt.job.run import Result, run
 from tetopt.job.source import whose_variance
+from tetopt.job.task import Task
 from tetopt.report.summary import size_summary
 from tetopt.report.tables import add_quality, new_table, nodes_in_words
+from tetopt.system.budget import memory_words
 from tetopt.system.files import results_folder
 
 
-def mesh_command(job: Job) -> int:
+def mesh_command(
+    job: Job,
+    dry_run: Annotated[
+        bool, Option(None, "Read the files and show the plan and its memory; mesh nothing.")
+    ] = False,
+) -> int:
     """Mesh an image with optimised elements, smaller where it has detail (or uniform), as VTU or
     for a solver.
     """
+    if dry_run:
+        _print_plan(read(job))
+        return 0
     with mesh_kept() as begin_keeping, closing(Display(begin_keeping)) as display:
         result = run(job, display, display.is_over)
         display.end_stage()
@@ -37,6 +50,42 @@ def mesh_command(job: Job) -> int:
             result.violated, f"{job.output}: {size}", result.measured, result.task.source.mask_word
         )
         return code
+
+
+def _print_plan(task: Task) -> None:
+    """Print what a run would read, do and write, with its memory."""
+    plan, content = task.plan, task.source.content
+    job, image = plan.job, task.source.contrasts[0]
+    nodes = expected_nodes(plan, content) if task.started is None else len(task.started.mesh.points)
+    shape = " x ".join(map(str, image.shape))
+    spacing = " x ".join(f"{each:.4g}" for each in image.spacing)
+    if job.target_error is not None:
+        nodes = job.nodes_max or TARGET_NODES_MAX
+    most = "" if job.target_error is None else f"up to, for an error of {job.target_error:g}: "
+    files = (*task.request["files"].items(),)
+    options = stated_options(plan, image.ndim)
+    known = {name.lower() for name in options}
+    left_out = {name for name, _ in files} | {"output", "json", "figures", "force", "nodes"}
+    for name, value in given_options(plan.bare).items():
+        if name.replace("-", "_") not in known:
+            options[name] = value
+    lines = {
+        "reads": "; ".join(f"{name} {', '.join(each for each, _ in rows)}" for name, rows in files),
+        "voxels": f"{shape} of {spacing} mm, {content.n_voxels} to mesh",
+        "nodes": f"{most}{nodes}",
+        "memory": f"about {memory_words(process_bytes(content, nodes))}",
+        "time": "unknown; a run tells it from its third iteration on",
+        "options": ", ".join(
+            f"{name} {value}"
+            for name, value in options.items()
+            if value is not None and name not in left_out
+        ),
+        "writes": ", ".join(
+            str(path) for path in (job.output, job.json_path, *plan.pictures) if path is not None
+        ),
+    }
+    for name, words in lines.items():
+        print_line(f"{name}: {words}")
 
 
 def _print(result: Result) -> None:
