@@ -2,6 +2,8 @@
 said.
 """
 
+from itertools import permutations
+
 import naive
 import numpy as np
 import pytest
@@ -19,9 +21,11 @@ from tetopt.engine.complex import energies, node_stars, remeasure
 from tetopt.engine.density import (
     EdgeMoves,
     Limits,
+    _is_linked,
     best_collapses,
     best_splits,
     collapse_edge,
+    compact_state,
     exchange,
     make_exchanges,
     mend,
@@ -32,7 +36,8 @@ from tetopt.engine.flips import close_gaps
 from tetopt.engine.repair import cell_cosines
 from tetopt.engine.smooth import blocks
 from tetopt.engine.state import state_of
-from tetopt.geometry.simplex import volumes
+from tetopt.geometry.check import manifold_problems
+from tetopt.geometry.simplex import orient_cells, volumes
 from tetopt.geometry.topology import boundary_facets
 from tetopt.start.carve import part_of
 
@@ -211,6 +216,41 @@ def test_pairs_of_collapses_on_a_mask_leave_its_surface_whole():
         assert state.complex.is_frozen[np.unique(outer), 3].all()
         remeasure(state)
         assert_allclose(state.complex.sums[:n_cells], sums, atol=1e-6 * sums.max())
+
+
+def block_ring():
+    """3 x 3 x 1 blocks of six tetrahedra without the middle one, and the numbers of their nodes."""
+    number = np.arange(32).reshape(4, 4, 2)
+    points = 4.0 * np.stack(np.unravel_index(number.ravel(), number.shape), axis=1) + 1.5
+    cells = [
+        [number[tuple(np.add(block, np.isin(range(3), way[:n])))] for n in range(4)]
+        for block in np.ndindex(3, 3, 1)
+        for way in permutations(range(3))
+        if block != (1, 1, 0)
+    ]
+    return tetopt.Mesh(points, orient_cells(points, np.array(cells))), number
+
+
+def test_two_collapses_do_not_close_a_tunnel_on_a_mask():
+    """Opposite edges of its rim: each may be collapsed alone, both would pinch the boundary."""
+    (mesh, number), mask = block_ring(), np.zeros((16, 16, 8))
+    mask[2:14, 2:14, 2:6], mask[6:10, 6:10] = 1.0, 0.0
+    target = tetopt.content(Image(mask), mask=Image(mask))
+    state = state_of(target, mesh, channel_grid(target, mesh.points), 0.85, is_graded=True)
+    stars, N = node_stars(state), len(mesh.points)
+    (a, b), (c, d) = pairs = number[1:3, 1, 1], number[2:0:-1, 2, 1]
+    assert all(_is_linked(state, stars, *pair) for pair in pairs)
+    none = EdgeMoves(np.zeros(N, dtype=bool), np.full(N, -1), np.full(N, -np.inf))
+    joined = none._replace(other=np.full(N, -1), gain=np.full(N, -np.inf))
+    joined.other[[a, c]], joined.gain[[a, c]] = (b, d), 0.0
+    is_dirty, nothing = np.zeros(len(state.complex.cells), dtype=bool), np.empty(0, dtype=np.int64)
+    out, quota = np.array([a, c]), (-2, 0, -np.inf)
+    made = make_exchanges(state, stars, none, joined, nothing, out, quota, is_dirty)
+    assert made == (0, 1)
+    left = compact_state(state, is_dirty).state.complex
+    cells = left.cells[: int(left.n_cells[0])].copy()
+    assert naive.euler(naive.faces_of(boundary_facets(cells))) == 0
+    assert manifold_problems(tetopt.Mesh(1.0 * left.ticks, cells)) == []
 
 
 @pytest.mark.parametrize("is_bounded", [False, True])

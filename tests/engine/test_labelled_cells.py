@@ -12,6 +12,7 @@ from tetopt.energy.discretization import combine_energies
 from tetopt.energy.sampling import channel_grid, from_ticks
 from tetopt.engine.complex import cell_squares, energies, node_stars, remeasure
 from tetopt.engine.density import Limits, _put_middle, best_splits, exchange, roomy, worth_of_split
+from tetopt.engine.fast import Run
 from tetopt.engine.flips import flip
 from tetopt.engine.label_state import with_labels
 from tetopt.engine.labelling import label_voxels
@@ -400,3 +401,15 @@ def test_the_minimum_dihedral_angle_within_a_mask():
     target = labels_alone(patches(2, 12, 20), mask=ball_image((12,) * 3, (5.5,) * 3, 5.2))
     mesh = mesh_image(target, 300).mesh
     assert quality(mesh.points, mesh.cells).min_dihedral >= 12.0
+
+
+def test_labels_meet_as_before_where_cells_were_removed():
+    """Of the boundary of a mask: nodes that keep one label slide no more on the way to another."""
+    target = labels_alone(CASES["quarters"], mask=ball_image((20,) * 3, (9.5,) * 3, 8.0))
+    run = Run(target, tetopt.octree_mesh(target, 500), 0.85, is_graded=True)
+    run.give_labels()
+    is_outer = (run.state.complex.across[: run.n_cells] < 0).any(axis=1)
+    before = sum(map(bool, stated_labels(run.state)))
+    assert run._take_out(is_outer & (run.state.complex.labels[: run.n_cells] == 1)) > 0
+    assert stated_labels(run.state) == meeting_labels(run.state)
+    assert sum(map(bool, stated_labels(run.state))) < before

@@ -156,6 +156,28 @@ def test_what_is_not_manifold_as_the_twin(n):
         assert len(bad) > 1
 
 
+@both_dimensions
+def test_a_cell_that_would_pinch_two_labels_as_all_places_have_it(n):
+    """At the cell's own nodes and edges; the labels stay."""
+    rng, answers = np.random.default_rng(5), []
+    for seed in range(2):
+        points, cells = mesh = box(n, 20, seed) if seed else lattice(n, 2)
+        labels = rng.integers(0, 2, len(cells))
+        labels[points[cells].mean(axis=1)[:, 0] > np.median(points[:, 0])] = 2
+        dual = dual_of(mesh, whole(labels, 3, volumes(points, cells)))
+        for cell in range(len(cells)):
+            tried = labels.copy()
+            tried[cell] = 2
+            faces, is_two = labelling._nonmanifold(dual, tried)
+            own = set(cells[cell].tolist()) | {-1}
+            expected = not any(set(face) <= own for face in faces[is_two].tolist())
+            answers.append(expected)
+            tried[cell] = labels[cell]
+            assert labelling._is_manifold(dual, tried, cell, 2, labelling._work(dual)) == expected
+            assert (tried == labels).all()
+    assert 0.1 < np.mean(answers) < 0.9
+
+
 def dual_and_energy(rng, mesh):
     """The dual of random content, the labels of most voxels, and the energy of labels by the
     twin.

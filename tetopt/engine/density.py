@@ -339,13 +339,15 @@ def _is_clean(stars: NodeStars, node: int, is_dirty: NDArray) -> bool:
 
 @unit
 def _can_collapse(state: State, stars: NodeStars, a: int, b: int, is_dirty: Bools1) -> bool:
-    """True if nothing has changed around a and, between labels, around b and next to either.
+    """True if nothing has changed around a and, on a mask's surface or between labels, around b and
+    next to either.
 
-    A removed cell also takes facets between labels from its neighbours.
+    Two collapses, each allowed alone, may close a tunnel of four edges. A removed cell also takes
+    facets of a surface from its neighbours.
     """
     if not _is_clean(stars, a, is_dirty):
         return False
-    if state.complex.meeting[a, 1] < 0:
+    if state.complex.meeting[a, 1] < 0 and not state.complex.is_frozen[a, 3]:
         return True
     for node in (a, b):
         for r in range(stars.start[node], stars.start[node + 1]):

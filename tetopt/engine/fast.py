@@ -32,7 +32,7 @@ from tetopt.engine.complex import (
 )
 from tetopt.engine.density import Limits, compact_state, exchange
 from tetopt.engine.flips import _evaluate_cells, _evaluate_triangles, flip
-from tetopt.engine.label_state import mend_pinches, with_labels
+from tetopt.engine.label_state import meet_everywhere, mend_pinches, with_labels
 from tetopt.engine.labelling import LabelVoxels, label_voxels
 from tetopt.engine.loop import (
     MIN_DIHEDRAL,
@@ -53,9 +53,10 @@ from tetopt.engine.sliding import _fill_offsets, fill_offsets
 from tetopt.engine.smooth import _attract, attract, blocks, sweep
 from tetopt.engine.state import angle_limit_of, content_energies, state_of, with_min_dihedral
 from tetopt.errors import InputError
-from tetopt.geometry.check import outside_fraction
+from tetopt.geometry.check import check_unfolded, outside_fraction
 from tetopt.geometry.manifold import OUTSIDE_LABEL
 from tetopt.geometry.simplex import regular_edge, volumes
+from tetopt.geometry.topology import compact, split_nodes
 from tetopt.image import Image, transform_vectors
 from tetopt.interop.notebook import with_bar
 from tetopt.mesh import Mesh
@@ -105,6 +106,7 @@ def optimize(
     callback: Callable[[IterationRecord], None] | None = None,
     stop: Callable[[], bool] | None = None,
     keep: Callable[[Mesh, Ints | None], None] | None = None,
+    cell_labels: Ints | None = None,
 ) -> MeshingResult:
     """Move and reconnect the nodes of a mesh to lower E.
 
@@ -158,6 +160,9 @@ def optimize(
     keep : callable, optional
         Called with the mesh and the labels of its cells, if they have any, as soon as the run is
         cut short: lifting cells takes more time.
+    cell_labels : (M,) int, optional
+        Label of each cell of `mesh`, for a content without labels. The cells of the result have
+        labels, too; nodes and facets between two labels stay unchanged to the last bit.
 
     Returns
     -------
@@ -173,8 +178,9 @@ def optimize(
     ------
     InputError
         An option out of range; a mesh that is invalid for sampling (see `tetopt.cell_moments`), is
-        folded, has a facet in more than two cells, or a cell too flat for a shape energy; or
-        energies that overflow.
+        folded, has a facet in more than two cells, or a cell too flat for a shape energy; energies
+        that overflow; or labels of cells beside those of the content, or beside a mask on whose
+        surface nodes slide.
 
     See Also
     --------
@@ -197,7 +203,7 @@ def optimize(
     content = plain(image)
     outside_fraction(mesh, content.given)
     sizes = (Sizes() if sizes is None else sizes).prepared(content.image.ndim)
-    run = Run(content, mesh, k_D, shape_power, boundary, is_graded=nodes is not None)
+    run = Run(content, mesh, k_D, shape_power, boundary, nodes is not None, cell_labels)
     min_dihedral = min_dihedral if run.n == 3 else 0.0
     # Iterations that may exchange nodes: shape alone does not determine where to add nodes.
     n_early = int(EXCHANGING_FRACTION * iterations) if k_D > 0.0 or sizes.has_target else 0
@@ -386,13 +392,26 @@ class Run:
         power: float = SHAPE_POWER,
         boundary: Boundary = "slide",
         is_graded: bool = False,
+        cell_labels: Ints | None = None,
     ) -> None:
-        """Take the arguments of `tetopt.engine.state.state_of`."""
+        """Take the arguments of `tetopt.engine.state.state_of`, and labels of cells to keep.
+
+        With these, cells of different labels have nodes of their own, which stay where they are.
+        """
         self.content, self.image, self.n = content, content.image, content.image.ndim
+        self.kept_labels: Ints | None = None
+        if cell_labels is not None:
+            check_cell_labels(cell_labels, content, mesh, boundary)
+            self.kept_labels, part = np.unique(cell_labels, return_inverse=True)
+            before, cells, is_shared = split_nodes(mesh.cells, part)
+            mesh = Mesh(mesh.points[before], cells)
         self.grid = channel_grid(content, mesh.points)
         self.state: State = state_of(content, mesh, self.grid, k_D, power, boundary, is_graded)
-        ticks = self.state.complex.ticks
-        is_kept = self.is_still if boundary == "fixed" else np.zeros(len(ticks), dtype=bool)
+        if cell_labels is not None:
+            self.state.complex.labels[: len(part)] = part
+            self.state.complex.is_frozen[is_shared, :3] = True
+        ticks, is_exact = self.state.complex.ticks, boundary == "fixed" or cell_labels is not None
+        is_kept = self.is_still if is_exact else np.zeros(len(ticks), dtype=bool)
         self.kept = dict(
             zip(map(tuple, ticks[is_kept].tolist()), mesh.points[is_kept], strict=True)
         )
@@ -647,6 +666,8 @@ class Run:
         if is_gone.any():
             made = compact_state(without_cells(self.state, is_gone))
             self._renumber(made.state, made.source)
+            if self.has_labels:  # neighbours may have lost the last cell of a label
+                meet_everywhere(self.state)
         return int(is_gone.sum())
 
     def _overlapping(self, state: State) -> Bools:
@@ -694,6 +715,8 @@ class Run:
     def labels(self) -> Ints | None:
         """The label of each cell, (M,); None without labels."""
         members = self.content.memberships
+        if self.kept_labels is not None:
+            return self.kept_labels[self.state.complex.labels[: self.n_cells]]
         if members is None or not self.has_labels:
             return None
         return members.labels[self.state.complex.labels[: self.n_cells]]
@@ -712,8 +735,15 @@ class Run:
         return points
 
     def mesh(self) -> Mesh:
-        """The current mesh."""
-        return Mesh(self.points(), self.cells)
+        """The current mesh; nodes of several labels at one place are one node."""
+        points, cells = self.points(), self.cells
+        if self.kept_labels is not None:
+            _, first, number = np.unique(
+                self.state.complex.ticks, axis=0, return_index=True, return_inverse=True
+            )
+            kept, cells = compact(first[number.ravel()][cells], len(points))
+            points = points[kept]
+        return Mesh(points, cells)
 
 
 def _edges(points: Floats, cells: Ints) -> Floats:
@@ -722,6 +752,24 @@ def _edges(points: Floats, cells: Ints) -> Floats:
     total = np.bincount(around, np.repeat(volumes(points, cells), n + 1), len(points))
     mean = total / np.maximum(np.bincount(around, minlength=len(points)), 1)
     return regular_edge(mean, n)
+
+
+def check_cell_labels(cell_labels: Ints, content: Content, mesh: Mesh, boundary: str) -> None:
+    """Raise InputError for labels of cells that do not fit a mesh, its content or its boundary."""
+    if np.shape(cell_labels) != (len(mesh.cells),):
+        raise InputError(
+            f"cell_labels: expected {len(mesh.cells)} labels, one for each cell, got an array of "
+            f"shape {np.shape(cell_labels)}"
+        )
+    if content.memberships is not None:
+        raise InputError("cell_labels: the content has labels, too; give only one of them")
+    has_several = len(np.unique(cell_labels)) > 1
+    if has_several and content.region is not None and boundary != "fixed":
+        raise InputError(
+            "labels and cell sets of the initial mesh: within a mask, only with `boundary` fixed; "
+            "or give `labels`"
+        )
+    check_unfolded(mesh)
 
 
 def check_options(

@@ -63,7 +63,7 @@ def with_labels(
     state = state._replace(
         objective=objective, sides=state.sides._replace(levels=levels, channel=members.channel)
     )
-    _meet_everywhere(state, node_stars(state))
+    meet_everywhere(state)
     return state
 
 
@@ -86,7 +86,7 @@ def mend_pinches(
     ):
         contents = cell_contents(image, members, mesh, voxels)
         labels[:] = mend_labels(mesh.points, mesh.cells, across, contents, labels, aim)
-        _meet_everywhere(state, node_stars(state))
+        meet_everywhere(state)
 
 
 def cell_contents(image: Image, members: Memberships, mesh: Mesh, voxels: LabelVoxels) -> Contents:
@@ -156,6 +156,11 @@ def crowded_nodes(cells: Ints, of_cell: Ints) -> int:
     """
     pairs = np.unique(np.column_stack([cells.ravel(), np.repeat(of_cell, cells.shape[1])]), axis=0)
     return int((np.bincount(pairs[:, 0]) > MOST_MEETING).sum())
+
+
+def meet_everywhere(state: State) -> None:
+    """Store the labels of the cells around each node."""
+    _meet_everywhere(state, node_stars(state))
 
 
 @unit

@@ -393,7 +393,7 @@ def _give_cells(
     which interfaces remain manifold go first. These cells are marked in `is_kept`, (M,), as mending
     would give most others away again.
     """
-    n_of = np.bincount(labels, minlength=len(dual.bias))
+    n_of, work = np.bincount(labels, minlength=len(dual.bias)), _work(dual)
     for row, label in enumerate(label_of_row):
         own = slice(rows.indptr[row], rows.indptr[row + 1])
         cells, volume = rows.indices[own], rows.data[own]
@@ -406,19 +406,25 @@ def _give_cells(
             continue
         fit = cells[is_fit][np.argsort(-(2.0 * volume - size)[is_fit], kind="stable")]
         best = next(
-            (cell for cell in fit[:TRIED_CELLS] if _is_manifold(dual, labels, cell, label)), fit[0]
+            (cell for cell in fit[:TRIED_CELLS] if _is_manifold(dual, labels, cell, label, work)),
+            fit[0],
         )
         n_of[[labels[best], label]] += -1, 1
         labels[best], is_kept[best] = label, True
 
 
-def _is_manifold(dual: Dual, labels: Ints, cell: int, label: int) -> bool:
+@entry
+def _is_manifold(dual: Dual, labels: Ints1, cell: int, label: int, work: _Work) -> bool:
     """True if interfaces of two labels are manifold at a cell's nodes and edges once it has this
     label.
     """
-    tried, is_near = labels.copy(), np.zeros(len(dual.scale), dtype=bool)
-    tried[cell], is_near[dual.cells[cell]] = label, True
-    return not _nonmanifold(dual, tried, is_near)[1].any()
+    old, faces, is_one = labels[cell], _closure(dual, np.array([cell])), True
+    labels[cell] = label
+    for f in range(len(faces)):
+        fault, n_labels = _fault(dual, labels, faces[f, 0], faces[f, 1], work)
+        is_one = is_one and (fault == 0.0 or n_labels != 2)
+    labels[cell] = old
+    return is_one
 
 
 def _components(

@@ -67,6 +67,18 @@ def compact(cells: Ints, n_nodes: int) -> tuple[Ints, Ints]:
     return np.flatnonzero(is_used), (np.cumsum(is_used) - 1)[cells]
 
 
+def split_nodes(cells: Ints, part: Ints) -> tuple[Ints, Ints, Bools]:
+    """Give the cells of each part nodes of their own; `part` (M,) numbers them from 0.
+
+    Returns the previous number of each node, (N',), the cells with the new nodes, and a mask of
+    the nodes that several parts had, (N',).
+    """
+    n_parts = int(part.max(initial=0)) + 1
+    pairs, number = np.unique(cells * n_parts + part[:, None], return_inverse=True)
+    before = pairs // n_parts
+    return before, number.reshape(cells.shape), np.bincount(before)[before] > 1
+
+
 def facets(cells: NDArray[np.integer]) -> Facets:
     """Distinct facets of positively oriented cells (M, n+1).
 

@@ -64,6 +64,7 @@ def mesh_task(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
     job = task.plan.job
     content = task.source.content
     options = task.plan.engine_options
+    options |= {} if task.regions is None else {"cell_labels": task.regions}
     ends = None if job.max_seconds is None else begin + job.max_seconds
     limit = _memory_limit(task, content)
     before = peak_bytes(), resident_bytes()
@@ -74,6 +75,7 @@ def mesh_task(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
         return max(before[0], before[1] + bytes_of(content, nodes))
 
     def keep(mesh: Mesh, labels: Ints | None) -> None:
+        labels = labels if task.regions is None else task.labels_of(labels)
         if labels is None and task.source.labels is not None:
             labels = cell_labels(task.source.labels, mesh)
         beside = islice(kept_places(job.output), 1)
@@ -102,6 +104,9 @@ def mesh_task(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
 
     start_stage("start", START_WORDS)
     result = search_mesh(content, _aim(task), attempt, task.source.required, **options)
+    regions = None if task.regions is None else result.labels
+    if regions is not None:
+        result = result._replace(labels=task.labels_of(regions))
     if result.curving is not None:
         note(curving_in_words(result.curving))
     elif (
@@ -117,7 +122,8 @@ def mesh_task(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
     return_freed()  # by the search
     n_nodes = max(result.nodes or 0, len(result.initial.points))
     memory = {"predicted_bytes": most_bytes(n_nodes)}
-    return Meshed(result, result.initial, seconds, memory, early=early[-1] if early else None)
+    early_file = early[-1] if early else None
+    return Meshed(result, result.initial, seconds, memory, early_file, regions)
 
 
 def _check_initial(task: Task, initial: Mesh) -> None:
@@ -129,7 +135,7 @@ def _check_initial(task: Task, initial: Mesh) -> None:
         return
 
     def build(early: SolverOptions) -> Model:
-        return model_with(task, initial, early, task.source.about)
+        return model_with(task, initial, early, task.source.about, regions=task.regions)
 
     check_early(job.output, job, initial.ndim, task.source.low, build)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numba
+import numpy as np
 
 from tetopt.errors import InputError, prefix_errors
 from tetopt.geometry.check import check_place
@@ -24,6 +25,7 @@ from tetopt.job.plan import (
 from tetopt.job.request import job_request
 from tetopt.job.source import read_source
 from tetopt.job.task import Task
+from tetopt.model.sets import regions_of
 
 
 def read(job: Job) -> Task:
@@ -66,7 +68,9 @@ def read(job: Job) -> Task:
 
 def read_planned(plan: Plan) -> Task:
     """Read the files of a plan, and fill in the defaults that depend on them."""
-    start = None if plan.job.start is None else read_mesh(plan.job.start, plan.job)
+    start = regions = None
+    if plan.job.start is not None:
+        start = read_mesh(plan.job.start, plan.job)
     source = read_source(plan.job, plan.job.label_names, loaded=start)
     if start is not None:
         image = source.contrasts[0]
@@ -76,15 +80,23 @@ def read_planned(plan: Plan) -> Task:
         warn_of_other_image(start, path, source.paths[0], image, is_registered=None)
         if plan.job.order is None and start.order == 2 and format_of(plan.job.output).has_quadratic:
             plan = plan._replace(job=changed_options(plan.job, order=2))
-        if source.labels is not None and not source.table.names:
+        if not source.table.names and (source.labels is not None or start.labels is not None):
             source = source.with_table(label_table(None, start))
+        if source.labels is None:
+            regions = regions_of(start.labels, start.sets, len(start.mesh.cells))
+        if regions is not None:
+            n_regions = len(np.unique(regions))
+            fixed = f"; nodes between these {n_regions} regions are fixed" * (n_regions > 1)
+            note(f"{path}: its labels and cell sets stay{fixed}")
+        elif start.labels is not None:
+            note(f"{path}: its labels are dropped for those of the image")
     plan, sizes, by_label = with_numbers(plan, source.content, source.table)
     if by_label is not None:
         tell_label_sizes(by_label)
     elif (needed := nodes_of_targets(plan, source.content, sizes)) is not None:
         note(f"sizes require about {needed} nodes")
     # With the files' current checksums.
-    return Task(plan, source, start, sizes, job_request(plan.bare), by_label)
+    return Task(plan, source, start, sizes, job_request(plan.bare), by_label, regions)
 
 
 def set_threads(threads: int | None) -> None:

@@ -13,6 +13,7 @@ from tetopt.mesh import Mesh
 from tetopt.model.file import MeshFile
 from tetopt.start.label_sizes import SizesByLabel
 from tetopt.start.sizes import Sizes
+from tetopt.system.arrays import Ints
 
 Shapes = tuple[Quality | None, Quality | None]
 """Quality of the initial mesh and of the result, if measured."""
@@ -35,6 +36,9 @@ class Task(NamedTuple):
         Everything that determines the outputs: options, checksums of files, the version.
     by_label : SizesByLabel, optional
         Sizes of labels, if sizes by label are requested.
+    regions : (M,) int64, optional
+        Regions of the mesh to start from that the run keeps (`tetopt.model.sets.regions_of`):
+        those of its labels and cell sets, unless the job has labels.
 
     Examples
     --------
@@ -50,6 +54,21 @@ class Task(NamedTuple):
     sizes: Sizes | None
     request: dict[str, Any]
     by_label: SizesByLabel | None = None
+    regions: Ints | None = None
+
+    def labels_of(self, regions: Ints | None) -> Ints | None:
+        """Return the labels of regions of the mesh to start from, if they have labels.
+
+        Parameters
+        ----------
+        regions : (M,) int64, optional
+
+        Returns
+        -------
+        (M,) int64, optional
+        """
+        of_start = None if self.started is None else self.started.labels
+        return None if regions is None or of_start is None else of_start[regions]
 
     @property
     def start_name(self) -> str:
@@ -72,6 +91,8 @@ class Meshed(NamedTuple):
         Bounds of the memory, in bytes, as in run.json.
     early : Path, optional
         The file that has the mesh already, without measurements, if the run was cut short.
+    regions : (M,) int64, optional
+        The region of each cell, if the task has regions.
 
     Examples
     --------
@@ -87,3 +108,4 @@ class Meshed(NamedTuple):
     seconds: dict[str, float]
     memory: dict[str, float]
     early: Path | None = None
+    regions: Ints | None = None

@@ -43,7 +43,7 @@ from tetopt.model.model import Model
 from tetopt.model.sets import Sets, box_of, label_set_names, surviving_sets
 from tetopt.report.summary import run_summary
 from tetopt.start.sizes import edge_ratios
-from tetopt.system.arrays import Arrays, Json
+from tetopt.system.arrays import Arrays, Ints, Json
 from tetopt.system.budget import peak_bytes, return_freed
 from tetopt.system.files import kept_places, output_place, save_bytes
 
@@ -54,17 +54,18 @@ def model_with(
     solver: SolverOptions,
     about: Json,
     fields: Arrays | None = None,
+    regions: Ints | None = None,
 ) -> Model:
     """Build the model of a mesh with the options; `fields` of its cells are computed if not
-    given.
+    given, and `regions` are those of its cells, if they are kept.
     """
     source = task.source
     started = task.started
     if fields is None:
-        fields = source.fields(mesh)
+        fields = source.fields(mesh, task.labels_of(regions))
     own = Sets({}, {})
     if started is not None:
-        own = surviving_sets(started.mesh, started.sets, mesh)
+        own = surviving_sets(started.mesh, started.sets, mesh, regions)
         _warn_of_losses(started, own, source.labels is not None)
     loaded = MeshFile(mesh, fields, {}, n_turned=0, sets=own)
     return solver_model(loaded, source.image, solver, about, box_of(source.contrasts[0]))
@@ -114,14 +115,16 @@ def save_outcome(task: Task, outcome: Meshed, failed: dict[str, str]) -> tuple[M
     fields = _measured_fields(source, result, failed)
     try:
         with warnings_heard():
-            whole = model_with(task, result.mesh, job, about, fields)
+            whole = model_with(task, result.mesh, job, about, fields, outcome.regions)
         model = with_chosen_sets(whole, job.output, job)
         save_for_solver(job.output, model, job)
     except Exception as error:  # the mesh may have taken hours
 
         def bare() -> Model:
             with warnings.catch_warnings(action="ignore"):
-                return model_with(task, result.mesh, SolverOptions(), about, fields)
+                return model_with(
+                    task, result.mesh, SolverOptions(), about, fields, outcome.regions
+                )
 
         kept = early
         early = None
@@ -223,7 +226,7 @@ def _counts(task: Task, result: MeshingResult, model: Model) -> dict[str, Callab
         measures["dropped_volumes"] = lambda: {
             str(label): volume for label, volume in result.dropped.items()
         }
-    if (labels := result.labels) is not None:
+    if source.labels is not None and (labels := result.labels) is not None:
         measures["nodes_of_many_labels"] = lambda: crowded_nodes(mesh.cells, labels)
     return measures
 

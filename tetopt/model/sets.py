@@ -697,13 +697,27 @@ def rows_of(mesh: Mesh, nodes: Ints) -> Ints:
     return rows[np.lexsort(rows.T[::-1])]
 
 
-def surviving_sets(before: Mesh, sets: Sets, mesh: Mesh) -> Sets:
+def regions_of(labels: Ints | None, sets: Sets, n_cells: int) -> Ints | None:
+    """Return the first cell of each cell's region, (M,): cells of one label in the same cell sets;
+    None without either.
+    """
+    columns = [] if labels is None else [labels]
+    columns += [np.isin(np.arange(n_cells), rows) for rows in sets.cells.values()]
+    if not columns:
+        return None
+    _, first, region = np.unique(
+        np.column_stack(columns), axis=0, return_index=True, return_inverse=True
+    )
+    return first[region.ravel()]
+
+
+def surviving_sets(before: Mesh, sets: Sets, mesh: Mesh, regions: Ints | None = None) -> Sets:
     """Return the facet sets of the mesh `before` whose facets all exist in `mesh`, as rows of
-    `mesh`.
+    `mesh`, and the cell sets if `mesh` kept its regions.
 
     Facets are the same if their nodes have the same positions. If an optimisation kept the
-    boundary, these are the sets on the boundary. Cell sets do not survive, because the cells
-    change.
+    boundary, these are the sets on the boundary. `regions` (M,) are the regions of the cells of
+    `mesh` (`regions_of`); otherwise the cells change.
     """
     place = {point.tobytes(): number for number, point in enumerate(mesh.points)}
     now = np.array([place.get(point.tobytes(), -1) for point in before.points])
@@ -711,8 +725,10 @@ def surviving_sets(before: Mesh, sets: Sets, mesh: Mesh) -> Sets:
         name: rows_of(mesh, now[facet_triples(before.cells, rows)])
         for name, rows in sets.facets.items()
     }
+    cells = {} if regions is None else sets.cells
     return Sets(
-        {name: rows for name, rows in survivors.items() if len(rows) == len(sets.facets[name])}, {}
+        {name: rows for name, rows in survivors.items() if len(rows) == len(sets.facets[name])},
+        {name: np.flatnonzero(np.isin(regions, rows)) for name, rows in cells.items()},
     )
 
 
