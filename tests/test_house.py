@@ -25,7 +25,7 @@ DOCUMENTS = [
 # More than 8 parameters: public functions, whose signature is a contract.
 WIDE = {
     "tetopt.fem.elasticity.compression": 9,
-    "tetopt.engine.fast.optimize": 14,
+    "tetopt.engine.fast.optimize": 15,
     "tetopt.engine.meshing.mesh_image": 15,
     "tetopt.engine.paper.optimize_paper": 12,
     "tetopt.model.build.build_model": 15,
