@@ -177,7 +177,7 @@ def test_what_requirements_allow_is_counted_over_all_labels_the_worst_first():
         "1 with more pieces of cells than of voxels (matters for what is connected): 7 (3 for 1)"
     }
     crumbs = tuple(each._replace(size_in_cells=1.9) for each in lost)
-    rows = [rows[1]._replace(pieces=LabelPieces(154, 14, crumbs * 70))]
+    rows = [rows[1]._replace(pieces=LabelPieces(154, 14, crumbs, 9))]
     assert beyond_requirements({"labels": rows}) == {}  # the table has both numbers
 
 

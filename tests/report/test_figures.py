@@ -274,8 +274,26 @@ def test_nothing_is_drawn_where_a_mesh_leaves_the_image_uncovered(n):
         polygons = np.concatenate([path.vertices for path in collections_in(axes)[0].get_paths()])
         ends = polygons.min(axis=0), polygons.max(axis=0)
         assert_allclose(ends, [[0.0, 0.0], [4.0, 7.0]], atol=1e-9)
-        assert axes.get_xlim() == (0.0, 10.0)  # the whole image stays in view
+        assert axes.get_xlim() == pytest.approx((0.0, 4.7))  # a tenth of the mesh's side around it
+        assert axes.get_ylim() == pytest.approx((0.0, 7.0))
     assert flat.get_facecolor() == to_rgba(UNCOVERED_COLOUR)
+
+
+@each_dimension
+def test_a_slice_of_a_label_map_has_the_labels_colours(n):
+    """Not greys of means of numbers."""
+    image = spaced(n)
+    labels = Image(np.where(image.data > np.median(image.data), 7.0, 3.0), image.affine)
+    mesh, table = lattice(labels), LabelTable({}, {3: (0.1, 0.2, 0.3), 7: (0.6, 0.7, 0.8)})
+    over, flat = slice_figure(labels, [("", mesh)], table=table).axes
+    own = [table.colours[3], table.colours[7]]
+    pixels = over.images[0].get_array().reshape(-1, over.images[0].get_array().shape[-1])
+    assert len(np.unique(pixels, axis=0)) == 2
+    assert_allclose(np.unique(pixels, axis=0)[:, :3], own)
+    cells = middle_view(labels).section(mesh)[1]
+    faces = collections_in(flat)[0].get_facecolors()
+    expected = np.where(cell_labels(labels, mesh)[cells] == 7, 0.6, 0.1)
+    assert_allclose(faces[:, 0], expected)
 
 
 # --------------------------------------------------------------------------------------------------

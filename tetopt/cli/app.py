@@ -41,13 +41,15 @@ COMMANDS = {
     "convert": "convert",
     "surface": "surface",
     "view": "view",
-    "phantom": "phantom",
     "fem": "fem",
     "segment": "segment",
     "compare": "compare",
-    "warm-up": "warm_up",
     "demo": "mesh",
+    "phantom": "phantom",
+    "warm-up": "warm_up",
 }
+ASIDE = ("demo", "phantom", "warm-up")  # below the commands on a user's own files
+ASIDE_PANEL = "To try, and to prepare"
 
 # of runs, those that most need
 RUN_OPTIONS = (
@@ -252,7 +254,8 @@ def _app(arguments: Sequence[str]) -> typer.Typer:
                 about["epilog"] = f"{HELP_ALL} shows all options."
             app.command(name, cls=_Command, **about)(loaded_command(name))
         else:
-            app.command(name, help=help_line(name))(lambda: None)
+            panel = ASIDE_PANEL if name in ASIDE else None
+            app.command(name, help=help_line(name), rich_help_panel=panel)(lambda: None)
     return app
 
 

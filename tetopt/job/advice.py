@@ -15,11 +15,16 @@ from tetopt.engine.sliding import MOST_MEETING
 from tetopt.io.text import count_text, list_names
 from tetopt.job.events import note, report_violation, warning
 from tetopt.job.options import Method
-from tetopt.measure.fidelity import LabelFidelity, LabelInterface, LabelPieces, MaskFidelity
+from tetopt.measure.fidelity import (
+    LEAST_CELLS,
+    LabelFidelity,
+    LabelInterface,
+    LabelPieces,
+    MaskFidelity,
+)
 from tetopt.measure.judge import (
     FOREGROUND,
     LABEL_VOXELS,
-    LEAST_CELLS,
     MORE_NODES,
     Requirements,
     faulty_labels,
@@ -285,6 +290,8 @@ def _faults(
     """
     n_all, n_pieces = row.components, row.mesh_components
     lost, n_kept = list(filter(is_shown, row.lost_components)), n_all - len(row.lost_components)
+    if isinstance(row, LabelPieces) and row.large_components is not None:
+        n_kept = row.large_components - len(lost)
     if not near[0] <= ratio <= near[1]:
         what = "with less than {:g} or more than {:g} times the volume of voxels".format(*near)
         what = f"{what} (matters for stiffness and mass)"

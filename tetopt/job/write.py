@@ -240,6 +240,7 @@ def draw(task: Task, outcome: Meshed, model: Model) -> None:
     source = task.source
     image = source.contrasts[0]
     own = continue_image(image, source.content.continuation)
+    is_labels = source.labels is not None and np.array_equal(image.data, source.labels.data)
     figures.save_run_figures(
         pictures[:3],
         own,
@@ -249,6 +250,7 @@ def draw(task: Task, outcome: Meshed, model: Model) -> None:
         image,
         source.mask,
         model.order,
+        source.table if is_labels else None,
     )
     of_cell = model.cell_data.get(LABEL_FIELD)
     # none for the mask of a mesh to start from
@@ -257,7 +259,7 @@ def draw(task: Task, outcome: Meshed, model: Model) -> None:
             figures.boundary_figure(image, source.mask, mesh, source.mask_word), pictures[3]
         )
     if source.labels is not None:
-        other = None if np.array_equal(image.data, source.labels.data) else image
+        other = None if is_labels else image
         figure = figures.label_figure(
             source.labels, mesh, of_cell, other, source.table, model.order
         )

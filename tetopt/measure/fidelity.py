@@ -58,6 +58,8 @@ ROW_KEYS = {  # of a label's numbers in run.json, if their names there differ fr
     "of_voxels": "thickness_voxels",
     "of_cells": "thickness_mesh",
 }
+# cells around it that a label or a component of one must be as large as to have a cell of its own
+LEAST_CELLS = 2.0
 
 
 class FacetSurface(NamedTuple):
@@ -150,6 +152,8 @@ class LabelPieces(NamedTuple):
     lost_components : tuple of LostComponent
         Components of the voxels that cells should represent, none of which lies in a cell with the
         label, the largest first.
+    large_components : int, optional
+        Components of the voxels as large as `LEAST_CELLS` mean cells around them.
 
     Examples
     --------
@@ -160,6 +164,7 @@ class LabelPieces(NamedTuple):
     components: int = 0
     mesh_components: int = 0
     lost_components: tuple[LostComponent, ...] = ()
+    large_components: int | None = None
 
 
 class LabelOverlap(NamedTuple):
@@ -582,6 +587,7 @@ def label_extents(voxels: OwnedVoxels, mesh: Mesh, row_of_cell: Ints) -> list[La
             own, is_met | ~is_covered, voxels.affine, box, of_voxel
         )
         number = own if n_components == 1 else scipy.ndimage.label(own)[0]
+        sizes = np.bincount(number[own], of_voxel[own])
         measured.append(
             LabelFidelity(
                 int(voxels.labels[row]),
@@ -593,12 +599,13 @@ def label_extents(voxels: OwnedVoxels, mesh: Mesh, row_of_cell: Ints) -> list[La
                     n_cells=int(n_cells[row]),
                     n_empty_cells=int(n_empty[row]),
                     is_lost=bool(n_cells[row] == 0 and n_painted[row] == 0),
-                    size_in_cells=float(np.bincount(number[own], of_voxel[own]).max()),
+                    size_in_cells=float(sizes.max()),
                 ),
                 pieces=LabelPieces(
                     components=n_components,
                     mesh_components=_n_components(mesh.cells[row_of_cell == row]),
                     lost_components=lost,
+                    large_components=int((sizes >= LEAST_CELLS).sum()),
                 ),
                 overlap=LabelOverlap(dice=float(dice[row])),
             )

@@ -35,7 +35,7 @@ from tetopt.geometry.manifold import OUTSIDE_LABEL
 from tetopt.geometry.simplex import dihedral_angles, edge_pairs, squared_edges
 from tetopt.geometry.topology import components
 from tetopt.image import Image, transform_vectors
-from tetopt.measure.fidelity import LabelFidelity, OwnedVoxels, label_extents
+from tetopt.measure.fidelity import LEAST_CELLS, LabelFidelity, OwnedVoxels, label_extents
 from tetopt.mesh import Mesh
 from tetopt.system.arrays import Bools, Floats, Ints
 
@@ -43,8 +43,6 @@ from tetopt.system.arrays import Bools, Floats, Ints
 MASK_DICE = 0.9
 # a label with as many voxels must have cells that contain some, of about their volume
 LABEL_VOXELS = 200
-# cells around it that a label or a component of one must be as large as to have a cell of its own
-LEAST_CELLS = 2.0
 LARGE_COMPONENTS = f"of {COMPONENT_VOXELS} voxels or more"
 LEAST_VOLUME, MOST_VOLUME = 0.6, 1.5  # of a label's cells, over its voxels'
 MORE_NODES = "allow more nodes"

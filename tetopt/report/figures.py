@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -50,6 +51,7 @@ DETAIL_VOXELS = 25  # along the side of an enlarged region: single voxels remain
 SLICE_WIDTH_INCHES = 4.2  # of the widest slice in a figure of several planes: two fill a page
 SLICES_HEIGHT_INCHES = 12.0  # of all its planes, one above the other, which fit on a page
 LETTER_INCHES = 0.075  # width of a letter in a legend, in 9 points
+FRAME_FRACTION = 0.1  # of a mesh's larger side in a slice: the image that is shown around it
 NUMBER_RADIUS_FRACTION = 0.014  # of a slice's width: the radius of a label's number in 5 points
 
 
@@ -68,21 +70,22 @@ def save_run_figures(
     whole: Image | None = None,
     mask: Image | None = None,
     order: int = 1,
+    table: LabelTable | None = None,
 ) -> None:
     """Write three PNGs of a run: slice with mesh before and after, rho histograms before and after,
     energies.
 
     `paths` are their names, and `start` names the initial mesh; cells have this `order`. If `image`
-    is extended beyond a mask, `whole` is the image to show.
+    is extended beyond a mask, `whole` is the image to show; the colours of a label map are those of
+    the `table`.
     """
     first, last = result.history[0], result.history[-1]
     fit = f"{last.E_D / first.E_D:.3f} of the initial E_D" if first.E_D > 0.0 else "constant image"
     before = f"{start}, {nodes_in_words(initial, order)}"
     after = f"optimised, {fit}"
     meshes = [(before, initial), (after, result.mesh)]
-    save_figure(
-        slice_figure(image if whole is None else whole, meshes, means_of=image, mask=mask), paths[0]
-    )
+    shown = image if whole is None else whole
+    save_figure(slice_figure(shown, meshes, means_of=image, mask=mask, table=table), paths[0])
     save_figure(histogram_figure(meshes), paths[1])
     save_figure(energy_figure(result.history), paths[2])
 
@@ -92,29 +95,41 @@ def slice_figure(
     meshes: Sequence[tuple[str, Mesh]],
     means_of: Image | None = None,
     mask: Image | None = None,
+    table: LabelTable | None = None,
 ) -> Figure:
-    """Draw a slice of the volume with the section of each mesh, and below it the mean of each cell.
+    """Draw a slice of the volume with the section of each mesh, and below it the mean of each cell,
+    or, of a label map with this `table`, the label of most of its voxels.
 
     It is the middle slice across the axis nearest to the world's z (an axial slice), or the mesh's
-    middle one if the mesh does not reach it. A 2-D image is shown whole. Black and white are those
+    middle one if the mesh does not reach it, as far as the meshes reach. Black and white are those
     of the voxels in the last mesh and its mask. The means are those of `means_of`, by default of
     the image itself. In their row, parts of the image that a mesh does not cover are light blue.
     """
     view = SliceView(image, None, _slice_through(meshes[-1][1], image))
-    figure = Figure(figsize=(5.2 * len(meshes), 10.0 * view.aspect + 1.0), layout="constrained")
+    sections = [view.section(mesh) for _, mesh in meshes]
+    window = view.window([polygons for polygons, _ in sections])
+    width, height = window[1] - window[0]
+    figure = Figure(figsize=(5.2 * len(meshes), 10.0 * height / width + 1.0), layout="constrained")
     grid = figure.subplots(2, len(meshes), squeeze=False)
     limits = limits_within(image, meshes[-1][1], [view], mask)
-    for column, (title, mesh) in enumerate(meshes):
-        polygons, cells = view.section(mesh)
+    values = np.unique(image.data).astype(np.int64) if table is not None else np.empty(0, int)
+    colours = label_colours(values, {} if table is None else table.colours)
+    for column, ((title, mesh), (polygons, cells)) in enumerate(zip(meshes, sections, strict=True)):
         over, flat = grid[:, column]
-        view.show_pixels(over, limits)
+        if table is None:
+            view.show_pixels(over, limits)
+            means = cell_moments(image if means_of is None else means_of, mesh).mean
+            fill_cells(flat, polygons, means[cells], "gray", limits)
+            flat.set_title("mean of the image in each cell", fontsize=10)
+        else:
+            view.show_labels(over, colours[np.searchsorted(values, view.pixels)])
+            rows = np.searchsorted(values, cell_labels(image, mesh)[cells])
+            flat.add_collection(PolyCollection(list(polygons), facecolors=colours[rows]))
+            flat.set_title("label of most voxels in each cell", fontsize=10)
         draw_edges(over, polygons)
         over.set_title(title + _curved_words(mesh), fontsize=11)
-        means = cell_moments(image if means_of is None else means_of, mesh).mean
-        fill_cells(flat, polygons, means[cells], "gray", limits)
-        flat.set_title("mean of the image in each cell", fontsize=10)
         for axes in (over, flat):
-            view.frame(axes)
+            view.frame(axes, window)
     return figure
 
 
@@ -254,7 +269,7 @@ def label_figure(
     for (left, right, *_), view, numbers, (polygons, cells) in zip(
         grid, views, pixels, cuts, strict=True
     ):
-        left.imshow(colours[numbers.T], origin="lower", extent=view.extent, interpolation="nearest")
+        view.show_labels(left, colours[numbers])
         if np.count_nonzero(shown) > LISTED_LABELS:
             _write_numbers(left, view, numbers, values, colours, NUMBER_RADIUS_FRACTION * width)
         line = min(0.2, 10.0 / np.sqrt(max(len(polygons), 1)))  # points
@@ -480,6 +495,11 @@ class SliceView:
             vmax=limits[1],
         )
 
+    def show_labels(self, axes: Axes, colours: Floats) -> None:
+        """Draw the pixels in these colours, (*shape, 3 or 4)."""
+        look: Any = {"origin": "lower", "extent": self.extent, "interpolation": "nearest"}
+        axes.imshow(np.swapaxes(colours, 0, 1), **look)
+
     def section(self, mesh: Mesh) -> tuple[Floats, Ints]:
         """Return the polygons (K, 3 or 4, 2) of the mesh in the slice, in picture mm, and their
         cells (K,).
@@ -526,12 +546,25 @@ class SliceView:
         flat = (index[..., self.axes] + 0.5) * self.steps
         return np.where(self.flip, self.size - flat, flat)
 
-    def frame(self, axes: Axes) -> None:
-        """Frame the whole slice in one scale, with the patient's sides as letters instead of
-        ticks.
+    def window(self, polygons: Sequence[Floats]) -> Floats:
+        """Return the corners of the part of the slice around polygons (K, 3 or 4, 2), (2, 2) mm."""
+        points = np.concatenate([each.reshape(-1, 2) for each in polygons])
+        size = np.array(self.size)
+        if len(points) == 0:
+            return np.stack([0.0 * size, size])
+        low, high = points.min(axis=0), points.max(axis=0)
+        margin = FRAME_FRACTION * (high - low).max()
+        return np.stack([np.maximum(low - margin, 0.0), np.minimum(high + margin, size)])
+
+    def frame(self, axes: Axes, window: Floats | None = None) -> None:
+        """Frame the slice, or a window of it, in one scale, with the patient's sides as letters
+        instead of ticks.
         """
-        axes.set_xlim(0.0, self.size[0])
-        axes.set_ylim(0.0, self.size[1])
+        (x_low, y_low), (x_high, y_high) = (0.0, 0.0), self.size
+        if window is not None:
+            (x_low, y_low), (x_high, y_high) = window.tolist()
+        axes.set_xlim(x_low, x_high)
+        axes.set_ylim(y_low, y_high)
         axes.set_aspect("equal")
         axes.set_xticks([])
         axes.set_yticks([])
