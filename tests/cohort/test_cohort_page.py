@@ -196,5 +196,5 @@ def test_a_bar_says_what_lies_beyond_it(tmp_path):
         r"up to (0.\d+ l|\d+ ml): 1 subject, 1 flagged \(sub-0001 3.05 ml\)", lowest
     )
     assert re.fullmatch(r"1.\d+ l or more: 1 subject, 1 flagged \(sub-0020 9 l\)", highest)
-    assert left == "≤ " + lowest[len("up to ") : lowest.index(":")]
-    assert right == "≥ " + highest[: highest.index(" or more")]
+    assert left.startswith("≤ " + lowest[len("up to ") : lowest.index(":")] + " (")
+    assert right == "≥ " + highest[: highest.index(" or more")] + " (9 l)"

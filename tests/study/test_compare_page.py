@@ -151,19 +151,33 @@ def texts_of(page, tag):
 
 
 def numbers_of(page, report):
-    """The page's first table: of each mesh, by its title, the texts of each cell by group and
-    title of the column.
+    """The page's first tables, one or two: of each mesh, by its title, the texts of each cell by
+    group and title of the column.
     """
-    groups, titles, *rows = (
-        [
-            [html.unescape(text).strip() for text in re.findall(r">([^<]+)", cell) if text.strip()]
-            for cell in texts_of(row, "t[hd]")
-        ]
-        for row in texts_of(texts_of(page, "table")[0], "tr")
-    )
     columns = columns_of(report)
-    assert [texts[0] for texts in titles[1:]] == [column.heading for column in columns]
-    assert [texts[0] for texts in groups[1:]] == [*dict.fromkeys(each.group for each in columns)]
+    groups, titles, rows = [], [], {}
+    for table in texts_of(page, "table"):
+        if len(titles) == len(columns):
+            break
+        above, heads, *lines = (
+            [
+                [
+                    html.unescape(text).strip()
+                    for text in re.findall(r">([^<]+)", cell)
+                    if text.strip()
+                ]
+                for cell in texts_of(row, "t[hd]")
+            ]
+            for row in texts_of(table, "tr")
+        )
+        assert len(heads) <= 17
+        groups, titles = groups + above[1:], titles + heads[1:]
+        for title, *cells in lines:
+            known = rows.setdefault(title[0], [title])
+            known += [] if len(cells) == 1 and len(known) > 1 else cells
+    rows = rows.values()
+    assert [texts[0] for texts in titles] == [column.heading for column in columns]
+    assert [texts[0] for texts in groups] == [*dict.fromkeys(each.group for each in columns)]
     keys = [(column.group, column.title) for column in columns]
     return {
         title: dict(zip(keys, cells, strict=True)) if len(cells) > 1 else cells[0]

@@ -216,7 +216,8 @@ function binsOf(c) {
     const isOpen = { low: k === 0 && isCutBelow, high: k === BINS - 1 && isCutAbove };
     const [least, most] = ends.map((end) => written(end, column.unit));
     const words = isOpen.low ? `up to ${most}` : isOpen.high ? `${least} or more` : `${least} to ${most}`;
-    return { words, ends, isOpen, holds: (value) => isNumber(value) && value >= first && value < last };
+    const outermost = k === 0 ? values[0] : values[values.length - 1];
+    return { words, ends, isOpen, outermost, holds: (value) => isNumber(value) && value >= first && value < last };
   });
 }
 
@@ -248,9 +249,9 @@ function chartOf(c) {
     svg.append(bar);
   });
   const ends = (digits) => {
-    const [{ ends: [low, below], isOpen: lowest }, { ends: [above, high], isOpen: highest }] = [bins[0], bins[bins.length - 1]];
-    return [[lowest.low, "≤ ", below, low], [highest.high, "≥ ", above, high]].map(([isOpen, sign, cut, end]) =>
-      isOpen ? sign + written(cut, column.unit, digits) : written(end, column.unit, digits));
+    const [{ ends: [low, below], isOpen: lowest, outermost: least }, { ends: [above, high], isOpen: highest, outermost: largest }] = [bins[0], bins[bins.length - 1]];
+    return [[lowest.low, "≤ ", below, low, least], [highest.high, "≥ ", above, high, largest]].map(([isOpen, sign, cut, end, outermost]) =>
+      isOpen ? `${sign}${written(cut, column.unit, digits)} (${written(outermost, column.unit, digits)})` : written(end, column.unit, digits));
   };
   const isNear = !isText && ends(3)[0].replace("≤ ", "") === ends(3)[1].replace("≥ ", "");
   const feet = isText ? bins.slice(0, 4).map((bin) => bin.words) : ends(isNear ? 5 : 3);

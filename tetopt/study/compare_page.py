@@ -5,13 +5,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import groupby
+from itertools import chain, groupby
 from pathlib import Path
 from typing import Any
 
 from tetopt.report.page import package_text, render_page, write_page
 from tetopt.study.compare_report import Report
-from tetopt.study.compare_table import columns_of, number_text, rows_of
+from tetopt.study.compare_table import Column, columns_of, number_text, rows_of
+
+PAGE_COLUMNS = 16  # of a table that fits into 1,400 pixels
 
 
 def save_compare_page(path: Path, report: Report, pictures: Sequence[tuple[Path, str]]) -> None:
@@ -26,16 +28,16 @@ def save_compare_page(path: Path, report: Report, pictures: Sequence[tuple[Path,
     pictures : sequence of (PNG path, caption)
     """
     columns = columns_of(report)
-    groups = [
-        (name, len(list(members)))
-        for name, members in groupby(columns, key=lambda column: column.group)
-    ]
+    tables: list[list[list[Column]]] = [[]]
+    for _, members in groupby(columns, key=lambda column: column.group):
+        group = list(members)
+        if sum(map(len, tables[-1])) + len(group) > PAGE_COLUMNS:
+            tables.append([])
+        tables[-1].append(group)
     content = render_page(
         "study/compare.html",
         report=report,
-        columns=columns,
-        groups=groups,
-        rows=rows_of(report, columns),
+        tables=[(groups, rows_of(report, [*chain(*groups)])) for groups in tables],
         remarks=remarks(report),
         pictures=pictures,
         number_text=number_text,
