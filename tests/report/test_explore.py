@@ -25,7 +25,7 @@ from tetopt.geometry.simplex import centroids, orient_cells
 from tetopt.geometry.topology import boundary_facets, facets
 from tetopt.model.label_names import LabelTable
 from tetopt.report import explore
-from tetopt.report.exhibit import exhibit, first_axis, opened_on, warp_factors
+from tetopt.report.exhibit import exhibit, first_axis, loaded_side, opened_on, warp_factors
 from tetopt.report.explore import colour_table, explorer_html, save_explorer
 
 
@@ -582,7 +582,13 @@ def test_the_first_cut_shows_the_most(mesh):
     for across in range(3):
         u = np.full((len(mesh.points), 3), -2.0)
         u[:, across] = 1.0
-        assert first_axis(exhibit(mesh, {}, point_data={"displacement": u})) == across
+        shown = exhibit(mesh, {}, point_data={"displacement": u})
+        assert first_axis(shown) == across
+    assert loaded_side(exhibit(mesh, {})) == [0.0, 0.0, 0.0]
+    pressed = np.zeros((len(mesh.points), 3))
+    pressed[mesh.points[:, 2] == mesh.points[:, 2].min(), 2] = 1.0
+    side = loaded_side(exhibit(mesh, {}, point_data={"displacement": pressed}))
+    assert side[2] == -1.0
 
 
 @pytest.mark.deep

@@ -674,7 +674,7 @@ def test_titles_say_how_many_nodes_and_how_good(monkeypatch, run):
             assert axes.get_title() == title
             assert len(collections_in(axes)[0].get_paths()) == len(mesh.cells)
         assert len(energies.axes[0].lines) == n_lines
-    save_run_figures("abc", image, initial, result, order=2)
+    save_run_figures("abc", image, initial, result._replace(order=2))
     assert saved[-3].axes[0].get_title() == f"lattice, {nodes_in_words(initial, 2)}"
 
 

@@ -245,11 +245,10 @@ def draw(task: Task, outcome: Meshed, model: Model) -> None:
         pictures[:3],
         own,
         outcome.initial,
-        outcome.result,
+        outcome.result._replace(order=model.order),
         task.start_name,
         image,
         source.mask,
-        model.order,
         source.table if is_labels else None,
     )
     of_cell = model.cell_data.get(LABEL_FIELD)

@@ -219,6 +219,18 @@ def first_axis(shown: Exhibit) -> int:
     return int(np.argmin(np.abs(next(iter(shown.displacements.values()))).sum(axis=0)))
 
 
+def loaded_side(shown: Exhibit) -> list[float]:
+    """Return the direction of the side that moves most from the middle of the mesh, its largest
+    component 1; zeros without a displacement.
+    """
+    middle = shown.mesh.points.mean(axis=0)
+    side = np.zeros(3)
+    for u in list(shown.displacements.values())[:1]:
+        lengths = np.sqrt((u[: len(shown.mesh.points)] ** 2).sum(axis=1))
+        side = (lengths[:, None] * (shown.mesh.points - middle)).sum(axis=0)
+    return np.asarray(side / (np.abs(side).max() or 1.0)).tolist()
+
+
 def _nodal(
     mesh: Mesh, point_data: dict[str, NDArray]
 ) -> tuple[dict[str, NDArray], dict[int, Floats], list[str]]:

@@ -68,12 +68,14 @@ function explore(gl, data, notes) {
   const labelling = fields.findIndex((field) => field.name === data.labelField && field.categories.length > 1);
   const hidden = new Set();
 
-  // The initial, oblique view of the cut.
+  // The initial, oblique view of the cut; of a deformation, from the loaded side.
   function facing() {
     const { axis, isTurned } = state;
-    if (axis === 2) return { yaw: -1.2, pitch: isTurned ? -0.85 : 0.85 };
-    if (axis === 1) return { yaw: isTurned ? -1.0 : 1.0, pitch: 0.4 };
-    return { yaw: isTurned && axis === 0 ? Math.PI - 0.6 : 0.6, pitch: 0.35 };
+    const [x, y, z] = data.loaded;
+    if (axis === 2) return { yaw: x || y ? Math.atan2(y, x) + 0.4 : -1.2, pitch: isTurned ? -0.85 : 0.85 };
+    const [up, left] = [z < -0.5 ? -1 : 1, (axis === 1 ? x : y) < -0.5 ? -1 : 1];
+    if (axis === 1) return { yaw: (isTurned ? -1 : 1) * (Math.PI / 2 - 0.57 * left), pitch: 0.4 * up };
+    return { yaw: isTurned && axis === 0 ? Math.PI - 0.6 * left : 0.6 * left, pitch: 0.35 * up };
   }
 
   // -- drawing

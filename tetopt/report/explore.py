@@ -25,6 +25,7 @@ from tetopt.report.exhibit import (
     Exhibit,
     Field,
     first_axis,
+    loaded_side,
     warp_factors,
 )
 from tetopt.report.page import (
@@ -91,6 +92,7 @@ def explorer_html(shown: Exhibit) -> str:
         "reactions": reactions,
         "factors": warp_factors(shown),
         "axis": first_axis(shown),
+        "loaded": loaded_side(shown),
     }
     markup = {
         "policy": policy_html(),

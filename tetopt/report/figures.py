@@ -69,19 +69,18 @@ def save_run_figures(
     start: str = "lattice",
     whole: Image | None = None,
     mask: Image | None = None,
-    order: int = 1,
     table: LabelTable | None = None,
 ) -> None:
     """Write three PNGs of a run: slice with mesh before and after, rho histograms before and after,
     energies.
 
-    `paths` are their names, and `start` names the initial mesh; cells have this `order`. If `image`
+    `paths` are their names, and `start` names the initial mesh. If `image`
     is extended beyond a mask, `whole` is the image to show; the colours of a label map are those of
     the `table`.
     """
     first, last = result.history[0], result.history[-1]
     fit = f"{last.E_D / first.E_D:.3f} of the initial E_D" if first.E_D > 0.0 else "constant image"
-    before = f"{start}, {nodes_in_words(initial, order)}"
+    before = f"{start}, {nodes_in_words(initial, result.order)}"
     after = f"optimised, {fit}"
     meshes = [(before, initial), (after, result.mesh)]
     shown = image if whole is None else whole
@@ -124,7 +123,9 @@ def slice_figure(
         else:
             view.show_labels(over, colours[np.searchsorted(values, view.pixels)])
             rows = np.searchsorted(values, cell_labels(image, mesh)[cells])
-            flat.add_collection(PolyCollection(list(polygons), facecolors=colours[rows]))
+            look: Any = {"facecolors": colours[rows], "edgecolors": "black", "linewidths": 0.2}
+            flat.add_collection(PolyCollection(list(polygons), **look))
+            flat.set_facecolor(UNCOVERED_COLOUR)
             flat.set_title("label of most voxels in each cell", fontsize=10)
         draw_edges(over, polygons)
         over.set_title(title + _curved_words(mesh), fontsize=11)

@@ -392,7 +392,7 @@ def label_differences(rows: Sequence[LabelFidelity], names: Mapping[int, str]) -
     for row in rows:
         if (surface := row.surface) is None:
             continue
-        n_voxels, n_cells, _ = row.pieces
+        n_voxels, n_cells, *_ = row.pieces
         cavities, of_cells = surface.cavities, surface.mesh_cavities
         holes = n_voxels + cavities - surface.euler // 2
         volume, more = row.extent.volume, row.extent.mesh_volume - row.extent.volume

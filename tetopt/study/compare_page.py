@@ -13,7 +13,7 @@ from tetopt.report.page import package_text, render_page, write_page
 from tetopt.study.compare_report import Report
 from tetopt.study.compare_table import Column, columns_of, number_text, rows_of
 
-PAGE_COLUMNS = 16  # of a table that fits into 1,400 pixels
+TABLE_COLUMNS = 16  # of a table that fits into 1,400 pixels
 
 
 def save_compare_page(path: Path, report: Report, pictures: Sequence[tuple[Path, str]]) -> None:
@@ -31,7 +31,7 @@ def save_compare_page(path: Path, report: Report, pictures: Sequence[tuple[Path,
     tables: list[list[list[Column]]] = [[]]
     for _, members in groupby(columns, key=lambda column: column.group):
         group = list(members)
-        if sum(map(len, tables[-1])) + len(group) > PAGE_COLUMNS:
+        if sum(map(len, tables[-1])) + len(group) > TABLE_COLUMNS:
             tables.append([])
         tables[-1].append(group)
     content = render_page(
