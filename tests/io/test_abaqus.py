@@ -15,7 +15,7 @@ from refusals import refusal
 
 from tetopt import Mesh
 from tetopt.geometry.quadratic import quadratic
-from tetopt.io.abaqus import abaqus, input_sets
+from tetopt.io.abaqus import abaqus
 from tetopt.model.loads import Load, facet_forces, spring_constants
 from tetopt.model.materials import materials
 from tetopt.model.model import Model, element_facets, elements, in_space, in_units
@@ -294,22 +294,3 @@ def test_steps_that_a_file_cannot_tell_apart_are_refused():
     ):
         with refusal(match):
             abaqus(loaded_model(words)._replace(is_nonlinear=nonlinear))
-
-
-# Reading
-
-
-def test_sets_are_read_back(model, tmp_path):
-    (tmp_path / "a.inp").write_bytes(abaqus(model))
-    read = input_sets(tmp_path / "a.inp", model.mesh)
-    assert (list(read.facets), list(read.cells)) == (
-        list(model.sets.facets),
-        list(model.sets.cells),
-    )
-    for kind, others in zip(read, model.sets, strict=True):
-        for name, members in kind.items():
-            assert_array_equal(members, others[name])
-    turned = Mesh(model.mesh.points, model.mesh.cells[::-1])
-    assert input_sets(tmp_path / "a.inp", turned) is None
-    (tmp_path / "b.inp").write_text("** by hand\n" + abaqus(model).decode())
-    assert input_sets(tmp_path / "b.inp", model.mesh) is None

@@ -16,7 +16,6 @@ import tetopt
 from tetopt.cli import main
 from tetopt.geometry.surface import extract_surface
 from tetopt.io import formats
-from tetopt.io.abaqus import input_sets
 from tetopt.io.formats import FORMATS, file_bytes, save_mesh, save_model
 from tetopt.io.surfaces import save_surface
 from tetopt.io.text import plain
@@ -91,7 +90,7 @@ def found(path, model):
     """
     suffix = path.suffix
     if suffix == ".inp":
-        file, sets = meshio.read(path), input_sets(path, model.mesh)
+        file, sets = meshio.read(path), tetopt.load_mesh(path).sets
         return len(file.points), len(file.cells[0].data), *sets
     if suffix in (".feb", ".xdmf", ".mfem", ".mesh"):
         read = READERS[suffix](path.read_bytes(), model)

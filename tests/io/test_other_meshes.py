@@ -226,11 +226,13 @@ def test_values_belong_to_numbers(is_binary, here):
     ]
     write_22(here / "a.msh", mesh, numbers, views, is_binary)
     loaded = load_mesh("a.msh")
+    order = np.argsort(numbers)  # of the cells as they are read
     assert_array_equal(loaded.mesh.points, mesh.points)
-    assert_array_equal(loaded.mesh.cells, mesh.cells)
-    assert_array_equal(loaded.cell_data["x"], x[:, 0])
-    assert_array_equal(loaded.cell_data["part"][few], x[few])
-    assert np.isnan(np.delete(loaded.cell_data["part"], few, axis=0)).all()
+    assert_array_equal(loaded.mesh.cells, mesh.cells[order])
+    assert_array_equal(loaded.cell_data["x"], x[order, 0])
+    is_in = np.isin(order, few)
+    assert_array_equal(loaded.cell_data["part"][is_in], x[order][is_in])
+    assert np.isnan(loaded.cell_data["part"][~is_in]).all()
     assert "skin" not in loaded.cell_data
     assert_array_equal(loaded.point_data["y"][[1, 3]], [1.5, 3.5])
     assert np.isnan(np.delete(loaded.point_data["y"], [1, 3])).all()
@@ -312,3 +314,139 @@ def test_a_mesh_of_a_part_of_the_image_is_in_mm(part, origin, here, capsys):
     exit_code("quality i.nii.gz a.vtu")
     said = capsys.readouterr().err
     assert "--mesh-units" not in said or (part, origin) == (0.1, 0.0)  # as if in cm
+
+
+# --------------------------------------------------------------------------------------------------
+# Other programs' files
+
+ELEMENTS = {"C3D4": 1, "C3D4H": 1, "C3D10M": 2, "DC3D10": 2, "CPS3": 1, "CPE6": 2, "S3R": 1}
+
+
+def lines_of(rows, separator=", "):
+    return "".join(separator.join(map(str, row)) + "\n" for row in rows)
+
+
+@pytest.mark.parametrize("kind", ELEMENTS)
+def test_abaqus_of_others(kind, here):
+    """Numbers with gaps, broken lines, generated sets, sets of sets, surfaces, two sections."""
+    n, order = 3 if "3D" in kind else 2, ELEMENTS[kind]
+    mesh = box_mesh(n)
+    points, cells = nodes_of(mesh, order)
+    at = 10 * np.arange(len(points)) + 5
+    numbers = 100 + 2 * np.arange(len(cells))
+    rows = "".join(
+        f"{number}, "
+        + ", ".join(map(str, at[cell][:4]))
+        + ",\n" * (len(cell) > 4)
+        + ", ".join(map(str, at[cell][4:]))
+        + "\n"
+        for number, cell in zip(numbers, cells, strict=True)
+    )
+    last = numbers[len(cells) // 2 - 1]
+    low = np.flatnonzero(points[:, 0] == 0.0)
+    (here / "a.inp").write_text(
+        "*Heading\n by hand\n** a comment\n*Part, name=p\n*Node\n"
+        + lines_of(zip(at, *points.T[: max(n, 2)].tolist(), strict=True))
+        + f"*Element, type={kind}\n{rows}"
+        + f"*Elset, elset=One, generate\n100, {last}, 2\n*Elset, elset=Two\n"
+        + lines_of([[x] for x in numbers[len(cells) // 2 :]])
+        + "*Elset, elset=Both\nOne, Two\n*Nset, nset=held\n"
+        + lines_of([[x] for x in at[low]])
+        + ("*Surface, type=ELEMENT, name=Skin\nOne, S1\n" if n == 3 else "")
+        + "*Solid Section, elset=One, material=m\n,\n*Solid Section, elset=Two, material=m\n,\n"
+        + "*End Part\n*Material, name=m\n*Elastic\n7., 0.3\n"
+    )
+    loaded = load_mesh("a.inp")
+    assert_allclose(loaded.mesh.points, mesh.points)
+    assert_array_equal(loaded.mesh.cells, mesh.cells)
+    assert loaded.order == order
+    half = len(cells) // 2
+    sets = loaded.sets
+    assert_array_equal(sets.cells["One"], np.arange(half))
+    assert_array_equal(sets.cells["Both"], np.arange(len(cells)))
+    assert_array_equal(loaded.labels, 1 + (np.arange(len(cells)) >= half))
+    assert len(sets.facets["held"]) == 8 if n == 3 else 2
+    assert n == 2 or len(sets.facets["Skin"]) > 0
+    assert "young" not in loaded.cell_data  # in an unknown unit
+
+
+@pytest.mark.parametrize(
+    ("extra", "word"),
+    [
+        ("*Include, input=other.inp\n", "INCLUDE"),
+        ("*Instance, name=i, part=p\n 0., 0., 9.\n*End Instance\n", "INSTANCE"),
+        ("*Node\n1, 9., 9., 9.\n", "repeat"),
+        ("*Element, type=C3D8\n9, 1, 2, 3, 4, 1, 2, 3, 4\n", "hexahedr"),
+    ],
+)
+def test_abaqus_that_is_not_one_flat_mesh_is_refused(extra, word, here):
+    points, cells = nodes_of(box_mesh(3), 1)
+    numbers = np.arange(1, len(points) + 1)
+    nodes = lines_of(zip(numbers, *points.T.tolist(), strict=True))
+    rows = lines_of(zip(range(1, len(cells) + 1), *(cells + 1).T.tolist(), strict=True))
+    (here / "a.inp").write_text(f"*Node\n{nodes}*Element, type=C3D4\n{rows}{extra}")
+    with refusal(word):
+        load_mesh("a.inp")
+
+
+@pytest.mark.parametrize("suffix", [".mesh", ".xdmf"])
+@pytest.mark.parametrize("n", [2, 3])
+def test_meshes_by_meshio(suffix, n, here):
+    import meshio
+
+    mesh = box_mesh(n)
+    labels = 1 + np.arange(len(mesh.cells)) % 3
+    kind = {2: "triangle", 3: "tetra"}[n]
+    name = {".mesh": "medit:ref", ".xdmf": "subdomains"}[suffix]
+    points = mesh.points if suffix == ".mesh" else nodes_of(mesh, 1)[0]
+    options = {"data_format": "XML"} if suffix == ".xdmf" else {}
+    file = meshio.Mesh(points, [(kind, mesh.cells)], cell_data={name: [labels]})
+    file.write(f"a{suffix}", **options)
+    loaded = load_mesh(f"a{suffix}")
+    assert_allclose(loaded.mesh.points, mesh.points)
+    assert_array_equal(loaded.mesh.cells, mesh.cells)
+    assert_array_equal(loaded.labels, labels)
+
+
+@pytest.mark.parametrize("version", ["2.5", "4.0"])
+def test_febio_of_others(version, here):
+    mesh = box_mesh(3)
+    half = len(mesh.cells) // 2
+    section = "Geometry" if version == "2.5" else "Mesh"
+    text = f'<febio_spec version="{version}"><{section}><Nodes name="all">'
+    for k, x in enumerate(mesh.points.tolist()):
+        text += f'<node id="{k + 3}">{",".join(map(str, x))}</node>'
+    text += "</Nodes>"
+    for name, first, cells in (("a", 0, mesh.cells[:half]), ("b", half, mesh.cells[half:])):
+        text += f'<Elements type="tet4" mat="1" name="{name}">'
+        for k, cell in enumerate(cells):
+            text += f'<elem id="{first + k + 1}">{",".join(map(str, cell + 3))}</elem>'
+        text += "</Elements>"
+    members = "".join(f'<e id="{k}"/>' for k in (1, 2)) if version == "2.5" else "1,2"
+    corners = ",".join(str(x) for x in mesh.cells[0][[1, 2, 3]] + 3)
+    text += f'<ElementSet name="few">{members}</ElementSet>'
+    text += f'<Surface name="skin"><tri3 id="1">{corners}</tri3></Surface>'
+    (here / "a.feb").write_text(f"{text}</{section}></febio_spec>")
+    loaded = load_mesh("a.feb")
+    assert_allclose(loaded.mesh.points, mesh.points)
+    assert_array_equal(loaded.mesh.cells, mesh.cells)
+    assert_array_equal(loaded.sets.cells["few"], [0, 1])
+    assert len(loaded.sets.facets["skin"]) == 1
+    assert_array_equal(loaded.labels, 1 + (np.arange(len(mesh.cells)) >= half))
+
+
+@pytest.mark.parametrize("name", ["a.inp", "a.feb", "a.mesh", "a.xdmf"])
+@pytest.mark.parametrize(
+    "text", ["", "nonsense", "*Node\n1, x, 2\n", "<a><b/></a>", "Dimension 3\nVertices\n9\n"]
+)
+def test_files_that_hold_no_mesh(name, text, here):
+    (here / name).write_text(text)
+    with refusal(name):
+        load_mesh(name)
+
+
+def test_swapped_files_are_told(here, capsys):
+    points, cells = nodes_of(box_mesh(3), 1)
+    grid_of(points, cells, 3).save("m.vtu")
+    assert exit_code("convert x.inp m.vtu") == 2
+    assert "MESH comes first" in " ".join(capsys.readouterr().err.split())

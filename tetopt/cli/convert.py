@@ -14,6 +14,7 @@ from tetopt.commands.voxel_fields import is_image_name, write_on_image
 from tetopt.errors import InputError
 from tetopt.io.formats import FORMATS, format_of
 from tetopt.io.images import OUTPUT_SUFFIXES
+from tetopt.io.meshes import MESH_SUFFIXES
 from tetopt.job.events import Event, listen_with
 from tetopt.job.options import (
     LabelChoice,
@@ -63,6 +64,11 @@ def convert_command(
     output = paths[-1]
     is_image = is_image_name(paths[-1])
     _check_options(output, voxels if not is_image else None, part, choice, solver)
+    if output.exists() and not numbers.force and output.suffix.lower() in MESH_SUFFIXES:
+        raise InputError(
+            f"{output}: exists, and is the file to write: MESH comes first (are {mesh_path} and "
+            f"{output} swapped?); `force` replaces it"
+        )
     output = check_output(output, OUTPUT_SUFFIXES if is_image else tuple(FORMATS), numbers.force)
     numbers.check()
     with listen_with(_show):

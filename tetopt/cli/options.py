@@ -36,14 +36,19 @@ from tetopt.system.files import check_output, name_files, save_json
 
 ImageArgument = Annotated[Path, Option("IMAGE", IMAGE_FILES, is_argument=True)]
 MeshArgument = Annotated[
-    Path, Option("MESH", "VTU, VTK or gmsh MSH file of tetrahedra or triangles.", is_argument=True)
+    Path,
+    Option(
+        "MESH",
+        "VTU, VTK, MSH, INP, FEB, MESH or XDMF file of tetrahedra or triangles.",
+        is_argument=True,
+    ),
 ]
 FilesArgument = Annotated[
     list[Path],
     Option(
         "[IMAGE] MESH",
-        "VTU, VTK or gmsh MSH file of tetrahedra or triangles; an image before it is that of "
-        "`image`.",
+        "VTU, VTK, MSH, INP, FEB, MESH or XDMF file of tetrahedra or triangles; an image before it "
+        "is that of `image`.",
         is_argument=True,
     ),
 ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -15,10 +16,10 @@ from tetopt.contents.align import SMALL_COMPONENT_FRACTION
 from tetopt.errors import InputError
 from tetopt.geometry.check import check_unfolded
 from tetopt.geometry.topology import components
-from tetopt.io.abaqus import input_sets
 from tetopt.io.formats import format_of
 from tetopt.io.frd import read_frd
 from tetopt.io.images import sha256
+from tetopt.io.meshes import load_mesh
 from tetopt.io.text import count_text, list_names
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.events import note, progress, warning, warnings_heard
@@ -265,11 +266,14 @@ def _sets_with_input(loaded: MeshFile, path: Path) -> Sets:
     """Return the mesh's sets and those of the solver's input file, if it exists and belongs to
     this mesh; note it.
     """
-    from_input = input_sets(path, loaded.mesh) if path.is_file() else None
-    if from_input is None:
+    is_of_mesh = False
+    with suppress(InputError):
+        of_input = load_mesh(path)
+        is_of_mesh = np.array_equal(of_input.mesh.cells, loaded.mesh.cells)
+    if not is_of_mesh:
         note(f"{path}: missing, or not the input file of this mesh; its sets are not added")
         return loaded.sets
-    sets, renamed = merged_sets(loaded.sets, from_input)
+    sets, renamed = merged_sets(loaded.sets, of_input.sets)
     for old, new in renamed.items():
         note(f'{path}: renamed set "{old}" to "{new}" (name already in use)')
     return sets

@@ -30,6 +30,7 @@ LENGTH_UNITS = {"mm": 1.0, "m": 1000.0, "cm": 10.0, "um": 1e-3}  # in mm
 MOST_LENGTHS = 400.0
 # of the boxes of mesh and image: a unit is possible, or it is likely
 LEAST_OVERLAP, LIKELY_OVERLAP = 1e-3, 0.5
+MM_OVERLAP = 0.2  # along each axis: with more, the mesh is that of a part, in mm
 OUTSIDE_VOXELS = 1.0  # beyond the image's box, from which a node lies outside
 # how far nodes of a file with few digits may lie beyond the box of a mesh that need not fill it
 BOX_ROUNDING_VOXELS = 1e-3
@@ -321,7 +322,7 @@ def outside_fraction(mesh: Mesh, image: Image) -> float:
         )
     if not has_voxel or not 1.0 / MOST_LENGTHS < length < MOST_LENGTHS:
         raise InputError(f"the mesh is {length:.2g} times as long as the image; {remedy}")
-    if is_other and fits[unit] > LIKELY_OVERLAP and fits["mm"] < fits[unit] / MOST_LENGTHS:
+    if is_other and fits[unit] > LIKELY_OVERLAP and fits["mm"] < MM_OVERLAP**mesh.ndim:
         warn(f"the mesh is {length:.2g} times as long as the image; {remedy}")
     return outside
 

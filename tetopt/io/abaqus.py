@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
 import textwrap
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +10,6 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 from tetopt.io.tags import check_apart, named_materials, without_data
 from tetopt.io.text import blocks, comment_lines, plain, rows
-from tetopt.mesh import Mesh
 from tetopt.model.fields import node_field
 from tetopt.model.loads import (
     Load,
@@ -30,9 +27,7 @@ from tetopt.model.model import (
     mass_densities,
     traction_forces,
 )
-from tetopt.model.sets import Sets
 from tetopt.system.arrays import Floats, Ints
-from tetopt.system.incoming import regular_file
 
 ALL_ELEMENTS = "all_cells"  # the set for which results are requested
 SPRING_PREFIX = "spring-"  # of sets of one spring each; springs are elements after the cells
@@ -327,36 +322,3 @@ def _shorten_number(value: float) -> float:
         return value
     texts = (f"{value:.{digits}g}" for digits in range(16, 0, -1))
     return float(next(text for text in texts if len(text) <= NUMBER_CHARACTERS))
-
-
-# Reading
-
-
-def input_sets(path: Path, mesh: Mesh) -> Sets | None:
-    """Read the sets of an input file of tetopt's, except materials and "all_cells"; None for
-    other files and meshes.
-    """
-    text = regular_file(path, "Abaqus file").read_text("utf-8", "replace")
-    facets = {}
-    cells = {}
-    own = {ALL_ELEMENTS}
-    if not text.startswith("** tetopt"):
-        return None
-    for block in text.split("\n*")[1:]:
-        card, _, body = block.partition("\n")
-        if match := re.fullmatch(r"ELEMENT, TYPE=C3D(\d+), .*", card):
-            corners = _integers(body).reshape(-1, 1 + int(match[1]))[:, 1 : 2 + mesh.ndim] - 1
-            if not np.array_equal(corners, mesh.cells):
-                return None
-        elif match := re.fullmatch(r"ELSET, ELSET=(\S+)", card):
-            cells[match[1]] = _integers(body) - 1
-        elif match := re.fullmatch(r"SURFACE, NAME=(\S+), TYPE=ELEMENT", card):
-            cell, face = _integers(body.replace("S", "")).reshape(-1, 2).T
-            facets[match[1]] = np.column_stack([cell - 1, np.argsort(FACE_NUMBERS)[face - 1]])
-        elif match := re.fullmatch(r"SOLID SECTION, ELSET=(\S+), .*", card):
-            own.add(match[1])
-    return Sets(facets, {name: members for name, members in cells.items() if name not in own})
-
-
-def _integers(text: str) -> Ints:
-    return np.array(text.replace(",", " ").split(), dtype=np.int64)

@@ -23,13 +23,12 @@ MERGE_FRACTION = 1e-6
 # of the shortest edge at both nodes, so that no two nodes of a tiny cell are merged
 MERGE_EDGE_FRACTION = 1e-3
 # Other programs' names of cell data with labels, in lower case, the most specific ones first.
-LABEL_NAMES = (
-    *("label", "labels", "medit:ref", "gmsh:physical", "tissue", "tissues", "tissue_type"),
-    *("regionid", "region_id", "modelregionid", "region", "regions", "materialid", "materialids"),
-    *("material_id", "material", "materials", "subdomain", "subdomains", "subdomain_id"),
-    *("domain", "domains", "domain_id", "cellentityids", "attribute", "attributes", "partid"),
-    *("elemtag", "cell_tags", "cell_markers", "segmentation", "seg", "tag", "tags", "ref"),
-)
+LABEL_NAMES = """
+label labels medit:ref gmsh:physical tissue tissues tissue_type regionid region_id modelregionid
+region regions materialid materialids material_id material materials subdomain subdomains
+subdomain_id domain domains domain_id cellentityids attribute attributes partid part_id elemtag
+cell_tags cell_markers segmentation seg tag tags ref
+"""
 
 
 def without_ghosts(raw: Raw) -> Raw:
@@ -165,7 +164,7 @@ def with_labels(
         for each, labels in fields.items()
         if labels.any() and not ("young" in cell_data and each == "material")
     }
-    names = [known[each] for each in LABEL_NAMES if each in known]
+    names = [known[each] for each in LABEL_NAMES.split() if each in known]
     if not names:
         return cell_data, ()
     words = f'labels are those of cell field "{names[0]}"'

@@ -69,6 +69,7 @@ ELEMENT_TYPES = {(1, 1): 1, (2, 1): 2, (3, 1): 4, (1, 2): 8, (2, 2): 9, (3, 2): 
 TET10_ORDER = np.array([0, 1, 2, 3, 4, 5, 6, 7, 9, 8])
 VIEW_SHAPES = ((3,), (9,))  # of a row: views can hold vectors and tensors
 LABEL_COMMENT = "physical groups of cells are the labels; label 0 is {}"
+MATERIAL_COMMENT = r"(material_\d+): young (\S+) \w+, nu ([^,\s]+)(?:, density (\S+) kg/m3)?"
 NUMBER_COMMENT = "physical group {} is label {}"
 TEXTS = (MASK_TEXT, "violated", PLACE_TEXT)  # in the comments
 # with 200,000, gmsh takes minutes to open a 2.2 file, and meshio hours for a 4.1 file
@@ -80,7 +81,8 @@ class OwnComments(NamedTuple):
 
     space: str
     texts: dict[str, str]  # "units", "image", "image_sha256", "mask", "violated", if known
-    constants: dict[str, tuple[float, float]]  # young and nu of each material defined by entities
+    # young, nu and density (NaN for none) of each material defined by entities
+    constants: dict[str, tuple[float, ...]]
     cells: dict[str, list[int]]  # entities of each of these materials and of each cell set
     facets: dict[str, list[int]]  # entities of each facet set
     zero: int | None = None  # the group of label 0, if groups are labels
@@ -94,7 +96,7 @@ def own_comments(lines: list[str]) -> OwnComments | None:
     if not coordinates or not lines[0].startswith("tetopt"):
         return None
     texts: dict[str, str] = {}
-    constants: dict[str, tuple[float, float]] = {}
+    constants: dict[str, tuple[float, ...]] = {}
     entities: dict[str, dict[str, list[int]]] = {"cells": {}, "facets": {}}
     zero = None
     labels = {}
@@ -105,8 +107,8 @@ def own_comments(lines: list[str]) -> OwnComments | None:
             texts |= {"image": match[1]} | (
                 {} if match[2] == "unknown" else {"image_sha256": match[2]}
             )
-        elif match := re.fullmatch(r"(material_\d+): young (\S+) \w+, nu (\S+)", line):
-            constants[match[1]] = float(match[2]), float(match[3])
+        elif match := re.fullmatch(MATERIAL_COMMENT, line):
+            constants[match[1]] = tuple(float(each or "nan") for each in match.groups()[1:])
         elif match := re.fullmatch(r"entity of (cells|facets) (\d+): (.*)", line):
             for name in match[3].split():
                 entities[match[1]].setdefault(name, []).append(int(match[2]))

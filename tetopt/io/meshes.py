@@ -1,8 +1,9 @@
-"""Reading of meshes from VTK's formats and gmsh's MSH."""
+"""Reading of meshes by suffix, and their cleaning."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +22,10 @@ from tetopt.interop.conversions import (
 from tetopt.io.clean import piece_words, with_labels, with_merged_nodes, without_ghosts
 from tetopt.io.raw import Raw, by_corners
 from tetopt.io.read_gmsh import read_msh
+from tetopt.io.read_solver import read_feb, read_inp, read_medit, read_xdmf
 from tetopt.io.read_vtk import read_vtk
 from tetopt.io.text import plain
-from tetopt.io.vtk import VTK_SUFFIXES, box_in, sets_in
+from tetopt.io.vtk import box_in, sets_in
 from tetopt.mesh import Mesh
 from tetopt.model.fields import half_turned_fields, is_stress, scaled_fields
 from tetopt.model.file import (
@@ -40,7 +42,6 @@ from tetopt.model.sets import SET_NAME, Sets, free_name, rows_of
 from tetopt.system.arrays import Arrays, Ints
 from tetopt.system.incoming import regular_file
 
-MESH_SUFFIXES = (*VTK_SUFFIXES, ".msh", ".msh2")
 # of an edge: a mid-edge node closer to its middle is rounded, as in files with few digits
 STRAIGHT_FRACTION = 1e-6
 
@@ -48,7 +49,7 @@ STRAIGHT_FRACTION = 1e-6
 def load_mesh(
     path: str | Path, *, label_field: str | None = None, mesh_units: str | None = None
 ) -> MeshFile:
-    """Read triangles or tetrahedra, linear or quadratic, from a VTK or gmsh file.
+    """Read triangles or tetrahedra, linear or quadratic, from a file of a known suffix.
 
     Cells that VTK marks as ghosts are left out, nodes that coincide within rounding are merged,
     and labels are taken from a cell field with a known name, such as "RegionId"; notes list this.
@@ -56,7 +57,8 @@ def load_mesh(
     Parameters
     ----------
     path : str or Path
-        Its suffix is one of `tetopt.io.meshes.MESH_SUFFIXES`: .vtu, .vtk, .msh, .msh2.
+        Its suffix is one of `tetopt.io.meshes.MESH_SUFFIXES`: .vtu, .vtk, .msh, .msh2, .inp
+        (Abaqus, CalculiX), .feb (FEBio), .mesh (medit), .xdmf.
     label_field : str, optional
         Name of the cell field with the labels.
     mesh_units : {"m", "cm", "mm", "um"}, optional
@@ -143,10 +145,11 @@ def _read(path: Path) -> Raw:
         raise InputError(f"{path}: cannot read .pvtu; save the mesh as .vtu in ParaView")
     if suffix not in MESH_SUFFIXES:
         raise InputError(
-            f"{path}: expected a {', '.join(MESH_SUFFIXES[:-1])} or {MESH_SUFFIXES[-1]} mesh"
+            f"{path}: expected a {', '.join(MESH_SUFFIXES[:-1])} or {MESH_SUFFIXES[-1]} mesh; save "
+            "it as .vtu (ParaView), or as .msh (gmsh)"
         )
     try:
-        return read_msh(path) if suffix in (".msh", ".msh2") else _read_vtk(path)
+        return MESH_READERS[suffix](path)
     except InputError as error:
         raise InputError(f"{path}: {plain(str(error))}") from error
 
@@ -292,3 +295,16 @@ def _decode_text(values: NDArray) -> NDArray:
         return np.array([values.tobytes().decode()])
     except UnicodeDecodeError:
         return values
+
+
+MESH_READERS: dict[str, Callable[[Path], Raw]] = {
+    ".vtu": _read_vtk,
+    ".vtk": _read_vtk,
+    ".msh": read_msh,
+    ".msh2": read_msh,
+    ".inp": read_inp,
+    ".feb": read_feb,
+    ".mesh": read_medit,
+    ".xdmf": read_xdmf,
+}
+MESH_SUFFIXES = tuple(MESH_READERS)

@@ -151,23 +151,24 @@ def _msh(text: bytes) -> Raw:
     groups = _groups(raw.cells, tags, _physical_names(text), groups_of)
     comments = own_comments(_section(text, "Comments").decode("utf-8", "replace").splitlines())
     raw = _label_cells(raw._replace(groups=groups), comments)
-    return raw if comments is None else _of_ours(raw, comments)
+    return raw if comments is None else of_ours(raw, comments)
 
 
 def _raw(numbers: Ints, points: Floats, blocks: list[_Elements]) -> Raw:
-    """Return the nodes, with their numbers, and the elements by type."""
+    """Return the nodes, with their numbers, and the elements by type, ascending by number."""
     cells = {}
     tags: dict[str, Arrays] = {"gmsh:physical": {}, "gmsh:geometrical": {}}
     for kind in dict.fromkeys(block.kind for block in blocks):
         those = [block for block in blocks if block.kind == kind]
-        cells[kind] = places_of(numbers, np.concatenate([block.nodes for block in those]))
+        order = np.argsort(np.concatenate([block.numbers for block in those]), kind="stable")
+        cells[kind] = places_of(numbers, np.concatenate([block.nodes for block in those])[order])
         if (cells[kind] < 0).any():
             raise InputError("damaged: its elements use nodes that it does not have")
         if kind == "tetra10":
             cells[kind] = cells[kind][:, TET10_ORDER]
         for name, by_kind in tags.items():
             values = [getattr(block, name.removeprefix("gmsh:")) for block in those]
-            by_kind[kind] = np.concatenate(values)
+            by_kind[kind] = np.concatenate(values)[order]
     return Raw(points, cells, tags, {}, {}, [], "ras")
 
 
@@ -179,7 +180,7 @@ def _with_views(
     """
     cell_data, point_data = dict(raw.cell_data), dict(raw.point_data)
     numbers = {
-        kind: np.concatenate([block.numbers for block in blocks if block.kind == kind])
+        kind: np.sort(np.concatenate([block.numbers for block in blocks if block.kind == kind]))
         for kind in raw.cells
     }
     for name, listed, values in _views(text, "ElementData", order):
@@ -354,18 +355,21 @@ def _kind_of_cells(raw: Raw) -> str:
     return max(raw.cells, key=lambda name: CELL_DIMENSIONS.get(name, -1))
 
 
-def _of_ours(raw: Raw, comments: OwnComments) -> Raw:
+def of_ours(raw: Raw, comments: OwnComments) -> Raw:
     """Apply the comments of a file of tetopt's: groups and views become cell sets and materials."""
     kind = _kind_of_cells(raw)
     members = _members(raw, kind, comments.cells)
-    constants = np.full((2, len(raw.cells[kind])), np.nan)
+    constants = np.full((3, len(raw.cells[kind])), np.nan)
     for name in comments.constants.keys() & members.keys():
         constants[:, members[name]] = np.array(comments.constants[name])[:, None]
-    is_painted = bool(comments.constants) and np.isfinite(constants).all()
-    painted = {"young": {kind: constants[0]}, "nu": {kind: constants[1]}} if is_painted else {}
+    painted = {
+        name: {kind: values}
+        for name, values in zip(("young", "nu", "density"), constants, strict=True)
+        if np.isfinite(values).all()
+    }
     sets = [Group(name, kind, of_set) for name, of_set in members.items()]
     # in 2.2 a facet is in only one group
-    for side in {group.kind for group in raw.groups} - {kind}:
+    for side in raw.cells.keys() - {kind}:
         sets += [
             Group(name, side, of_set)
             for name, of_set in _members(raw, side, comments.facets).items()

@@ -24,7 +24,7 @@ from tetopt.model.label_names import TABLE_TEXT, labels_of, table_of_words
 from tetopt.model.loads import FACET_FORCES, SHOWN_LOAD_DIGITS, Load, facet_forces, load_words
 from tetopt.model.mappings import MODULUS_UNITS
 from tetopt.model.materials import Materials
-from tetopt.model.sets import Sets, facet_triples
+from tetopt.model.sets import Sets, facet_triples, label_set_names
 from tetopt.model.skfem import skfem_mesh
 from tetopt.system.arrays import Arrays, Floats, Ints, Json
 
@@ -386,6 +386,9 @@ def header_lines(model: Model) -> list[str]:
             f"materials: bins, error of the modulus {error.mean:.3%} (mean by volume), "
             f"{error.largest:.3%} (largest)"
         )
+    if (labels := model.labels) is not None:
+        names = label_set_names(np.unique(labels).tolist(), model.label_names)
+        lines += [f"label {label}: {name}" for label, name in names.items()]
     # A line break in a file's name would end the comment.
     return [" ".join(line.split()) for line in lines]
 
