@@ -5,7 +5,9 @@ that is too much.
 from __future__ import annotations
 
 import re
+import warnings
 from contextlib import closing
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -97,9 +99,12 @@ def test_words_have_units():
 def test_a_limit_counts_what_there_is(monkeypatch, n_bytes, limit, words):
     monkeypatch.setattr(budget, "available_bytes", lambda: 1000)
     monkeypatch.setattr(budget, "resident_bytes", lambda: 400)
-    budget.check_memory(n_bytes, "a", "b", limit=limit)
-    with pytest.raises(tetopt.InputError, match=f"^a: needs about 0.001 MB .*{words}.*; b$"):
-        budget.check_memory(n_bytes + 1, "a", "b", limit=limit)
+    with budget.limit_memory(limit):
+        budget.check_memory(n_bytes, "a", "b")
+        with pytest.raises(tetopt.InputError, match=f"^a: needs about 0.001 MB .*{words}.*; b$"):
+            budget.check_memory(n_bytes + 1, "a", "b")
+        if limit is not None:
+            budget.check_memory(n_bytes + 1, "a", "b", can_stop=True)
     for n_used, is_over in ((600, False), (601, True)):
         assert budget.MemoryLimit(1000, n_used).is_reached() == is_over
 
@@ -169,12 +174,12 @@ def test_a_whole_process_holds_what_it_reads():
 
 @pytest.mark.full
 def test_a_run_ends_before_the_limit_with_the_mesh_reached(here, monkeypatch):
-    """`--max-gb`: the image alone is refused at once, else what is reached is written, and said
-    why.
+    """`--max-gb`: the image alone, or the initial mesh, is refused at once, else what is reached
+    is written, and said why.
     """
     tetopt.save_image("a.nii.gz", sample_image(3))
     words = "mesh a.nii.gz -o a.vtu --json a.json --nodes 60 --iterations 2 --force --max-gb"
-    only = "GB of memory in total, but only 1 MB is allowed; mesh a part of it (--crop)"
+    only = "GB of memory in total, but only 1 MB is allowed; use --crop"
     assert_refuses(f"{words} 0.001", only)
     for value in ("0", "-1", "nan"):
         assert_refuses(f"{words} {value}", "--max-gb: expected more than 0")
@@ -184,10 +189,14 @@ def test_a_run_ends_before_the_limit_with_the_mesh_reached(here, monkeypatch):
     assert numbers["options"]["max_gb"] == 100.0
     assert 0 < numbers["memory"]["peak_bytes"]
     assert 0 < numbers["memory"]["predicted_bytes"]
-    now = budget.resident_bytes
-    monkeypatch.setattr("tetopt.job.mesh_stage.check_memory_of", lambda *_: None)
-    monkeypatch.setattr(budget.MemoryLimit, "is_reached", lambda self: now() > self.n_bytes)
-    said = run_command(f"{words} 0.001", code=None).err
+    with monkeypatch.context() as patch:
+        patch.setattr("tetopt.start.octree.OCTREE_NODE_BYTES", 1e9)
+        monkeypatch.setattr(budget, "available_bytes", lambda: 1 << 50)
+        said = run_command(f"{words} 10", code=2).err
+    assert "60 nodes: needs" in said
+    assert "only 10 GB is allowed" in said
+    monkeypatch.setattr(budget.MemoryLimit, "is_reached", lambda self: True)
+    said = run_command(f"{words} 100", code=None).err
     assert "memory limit reached: the current mesh is kept" in said
     assert numbers_in("a.json")["ended"] == "max_gb"
     assert tetopt.check_mesh(tetopt.load_mesh("a.vtu").mesh) == []
@@ -268,10 +277,10 @@ def test_the_time_left_is_told_from_the_third_iteration_on():
     """
     assert left_words(records(1.0, 9.0, 15.0), 10, None) == ""
     for most, seconds, words in (
-        (10, None, ", about 35 s left"),
-        (10, 25.0, ", about 6 s left"),
-        (10, 18.0, ", about 0 s left"),
-        (103, None, ", about 8 min left"),
+        (10, None, ", about 35 s left, then measuring"),
+        (10, 25.0, ", about 6 s left, then measuring"),
+        (10, 18.0, ", about 0 s left, then measuring"),
+        (103, None, ", about 8 min left, then measuring"),
         (3, None, ""),
     ):
         assert left_words(records(1.0, 9.0, 15.0, 19.0), most, seconds) == words
@@ -302,3 +311,34 @@ def test_warm_up_tells_how_compiling_goes(monkeypatch, capsys):
     with pytest.raises(InterruptedError):
         warm_up.warm_up_command()
     assert "compiling the kernels, 1 of 2 (stored for later runs)" in capsys.readouterr().err
+
+
+LAYERS = np.linalg.norm(np.indices((16, 16, 16)) - 7.5, axis=0)
+CONTENTS = {
+    "plain": {},
+    "labels": {"labels": "l.nii.gz"},
+    "thick slices": {"labels": "z.nii.gz", "images": "z.nii.gz"},
+    "a thin wall": {"mask": "m.nii.gz"},
+}
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("kind", CONTENTS)
+def test_a_run_writes_the_same_bytes_in_half_of_the_memory_or_is_refused(here, monkeypatch, kind):
+    thick = np.diag([1.0, 1.0, 3.0, 1.0])
+    tetopt.save_image("a.nii.gz", tetopt.Image(LAYERS))
+    tetopt.save_image("l.nii.gz", tetopt.Image(1.0 * (LAYERS < 6.0)))
+    tetopt.save_image("z.nii.gz", tetopt.Image(1.0 * (LAYERS < 6.0), thick))
+    tetopt.save_image("m.nii.gz", tetopt.Image(1.0 * (abs(LAYERS - 5.0) < 1.0)))
+    options = {"images": "a.nii.gz", "nodes": 80, "iterations": 1, "force": True, **CONTENTS[kind]}
+    made, n_refused = set(), 0
+    for free in (1e12, 4e8, 2e8):
+        monkeypatch.setattr(budget, "available_bytes", lambda free=free: int(free))
+        with warnings.catch_warnings(action="ignore"):
+            try:
+                tetopt.run(tetopt.Job(output="a.vtu", **options))
+            except budget.MemoryShortage:
+                n_refused += 1
+            else:
+                made.add(Path("a.vtu").read_bytes())
+    assert (len(made), n_refused) == (1, 1)

@@ -2,6 +2,7 @@
 
 import sys
 import threading
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from itertools import product
@@ -19,6 +20,7 @@ from tetopt import Image, InputError, Sizes, lattice_mesh, mesh_image, optimize_
 from tetopt.contents.content import plain
 from tetopt.engine.aim import Aim, needed_corners
 from tetopt.engine.meshing import search_mesh, sizes_of_order
+from tetopt.errors import Note
 from tetopt.geometry.quadratic import node_count
 from tetopt.start.clip import lattice_within
 
@@ -300,3 +302,15 @@ def test_options_that_cannot_be(optimize, options):
 def test_an_argument_of_another_name_is_named(arguments, words):
     with pytest.raises(TypeError, match=f"^mesh_image.* {words}"):
         mesh_image(IMAGE, **arguments)
+
+
+@pytest.mark.parametrize("target_error", [0.5, 0.9])
+def test_a_search_that_ends_far_below_its_error_says_so(target_error):
+    """The coarsest mesh explains most of a ramp; not if the error is met as nearly as it may be."""
+    ramp = tetopt.Image(np.indices((12, 12, 12))[0] * 1.0)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        result = mesh_image(ramp, target_error=target_error, iterations=2)
+    said = [each for each in caught if "far below" in str(each.message)]
+    assert [each.category for each in said] == [Note] * (result.fraction < 0.85 * target_error)
+    assert len(said) == 1

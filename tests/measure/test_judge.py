@@ -22,7 +22,13 @@ from tetopt.engine.loop import IterationRecord, MeshingResult
 from tetopt.geometry.check import manifold_problems
 from tetopt.geometry.simplex import centroids
 from tetopt.geometry.topology import components
-from tetopt.measure.judge import Cover, MaskComponents, Requirements, judge, measure
+from tetopt.measure.judge import (
+    Cover,
+    MaskComponents,
+    Requirements,
+    judge,
+    measure,
+)
 from tetopt.start.carve import part_of
 
 
@@ -111,6 +117,12 @@ def parts_of_a_block():
     }
 
 
+def a_tunnel_through_a_block():
+    points, cells = lattice()
+    is_inner = np.abs(points[:, :2] - 5.5).max(axis=1) < 0.1
+    return part_of(tetopt.Mesh(points, cells), ~is_inner[cells].any(axis=1)), {"mask": block()}
+
+
 def blocks_that_share_an_edge():
     points, cells = lattice()
     at = points[cells].mean(axis=1) - 5.5
@@ -133,6 +145,7 @@ CASES = {
     "overlap": twice_the_voxels,
     "mask": beyond_the_mask,
     "components": parts_of_a_block,
+    "euler": a_tunnel_through_a_block,
     "manifold": blocks_that_share_an_edge,
     "labels": a_label_without_a_cell,
     "error": large_cells,
@@ -202,7 +215,7 @@ def whole():
         ),
         ({"min_dihedral": np.array([60.0])}, {"min_dihedral": 60.0}, None),
         ({"box": (0.1, 0.0)}, {}, "up to 0.1 voxels"),
-        ({"box": (0.1, 0.1)}, {}, None),  # as the user's own was
+        ({"box": (0.1, 0.1)}, {}, "so do those of the initial mesh"),
         (
             {"cover": Cover("the image", 0, 1.01, 1.0, 3, 1e-9)},
             {},
@@ -217,6 +230,9 @@ def whole():
             {},
             "2 .* components, the mask 1; .* 2, 9",
         ),
+        ({"euler": (-18, 0)}, {"region": "tube"}, "of -18, .* tube 0: holes"),
+        ({"euler": (2, -2, 0, 1)}, {}, "of 2, .* mask -2: "),
+        ({"euler": (0, -2, 0, 2)}, {}, None),
         ({"manifold": (["b"], ["i"], True)}, {}, "^b; i; mend the initial mesh"),
         ({"error": 0.03}, {"target_error": 0.02}, "0.03 .* more than 0.02, .*`nodes_max`"),
         (
@@ -265,13 +281,31 @@ def test_what_a_run_cannot_reach_it_says(whole):
     assert ("error" in short.violated) == is_left
 
 
+def drilled(hole, n=3):
+    """A block of a mask with a hole through it, or a cavity in it, of so many voxels a side."""
+    data = np.ones((SIDE,) * n)
+    at = slice((SIDE - hole) // 2, (SIDE + hole) // 2)
+    data[(at, at)] = 0.0
+    return tetopt.Image(data)
+
+
+@pytest.mark.parametrize("n", [2, 3])
+@pytest.mark.parametrize(("hole", "is_violated"), [(1, False), (4, True)])
+def test_a_hole_that_cells_fill_is_no_fault_where_it_is_smaller_than_they_are(n, hole, is_violated):
+    mask = drilled(hole, n)
+    mesh = tetopt.lattice_mesh(mask, blocks=(SIDE // 2,) * n)
+    assert ("euler" in judged(mesh, content(mask, mask=mask))) == is_violated
+    alike = measure(mesh, content(mask, mask=drilled(0, n)))["euler"]
+    assert alike == (2, 2)
+
+
 @pytest.mark.full
 @pytest.mark.parametrize(
     ("name", "requirements"),
     [
         ("dihedral_angles", ["min_dihedral"]),
         ("beyond_box", ["box"]),
-        ("cell_of_voxel", ["overlap", "mask", "components"]),
+        ("cell_of_voxel", ["overlap", "mask", "components", "euler"]),
         ("manifold_problems", ["manifold"]),
     ],
 )

@@ -281,6 +281,15 @@ def test_a_mask_that_finer_octrees_hardly_keep_better_has_the_nearest_number_of_
     assert_same_mesh(*meshes)
 
 
+def test_a_run_whose_time_is_over_tries_no_finer_octrees(monkeypatch):
+    content = shell(26, 9.0)
+    whole = octree_mesh(content, 300)
+    short = mesh_image(content, 300, max_seconds=1e-9).initial
+    monkeypatch.setattr(octree, "FINER_STEPS", 0)
+    # from which carving has removed what the mask has not
+    assert len(short.points) <= len(octree_mesh(content, 300).points) < len(whole.points)
+
+
 def test_the_same_mesh_at_half_of_the_free_memory_or_a_refusal(monkeypatch):
     """Of a wall, for which finer octrees are tried: each of their steps that memory ends, ends all.
 

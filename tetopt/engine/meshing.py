@@ -49,13 +49,15 @@ from tetopt.engine.loop import (
     UNIFORM_K_D,
     Boundary,
     MeshingResult,
+    deadline,
 )
 from tetopt.engine.paper import optimize_paper
-from tetopt.errors import InputError
+from tetopt.errors import InputError, Note, warn
 from tetopt.geometry.check import check_place
 from tetopt.geometry.quadratic import node_count
 from tetopt.image import Image
 from tetopt.measure.judge import (
+    ERROR_REACHED,
     Requirements,
     judge,
     measure,
@@ -69,7 +71,7 @@ from tetopt.start.memory import LABEL_BYTES, PROCESS_BYTES, READ_BYTES, REGION_B
 from tetopt.start.octree import is_near, nearest_octree, nodes_of_sizes, octree_mesh
 from tetopt.start.sizes import Sizes
 from tetopt.system.arrays import whole_number
-from tetopt.system.budget import at_most, check_memory
+from tetopt.system.budget import at_most, check_memory, limit_memory
 
 # an optimisation ready to start; takes further options of `optimize`
 Optimisation = Callable[..., MeshingResult]
@@ -242,13 +244,14 @@ def search_mesh(
     aim: Aim,
     attempt: Conduct = lambda optimisation, *_: optimisation(),
     required: Requirements = Requirements(),  # noqa: B008 - a tuple
+    most_bytes: float | None = None,
     **options: Any,
 ) -> MeshingResult:
     """Return the mesh of an aim, by as many runs as `next_corners` asks for; only the best mesh so
     far is kept.
 
-    `attempt` makes each run, and `required` has words for the verdict; `options` are those of
-    `mesh_image`, which raises the same errors.
+    `attempt` makes each run, and `required` has words for the verdict; no initial mesh takes more
+    than `most_bytes`; `options` are those of `mesh_image`, which raises the same errors.
     """
     begin, seconds = time.perf_counter(), 0.0  # in runs
     content = plain(image)
@@ -257,9 +260,12 @@ def search_mesh(
     aim, options = _complete_aim(content, aim._replace(mode=mode)), _with_defaults(mode, options)
     content = content._replace(is_flat=content.is_flat and aim.order == 1)
     runs, starts, best = list[SearchRun](), list[NDArray](), list[MeshingResult]()
+    is_over = deadline(begin, options.get("max_seconds"), options.get("stop"))
     ended = ""
     while (corners := next_corners(aim, runs)) is not None:
-        initial, n_dropped, dropped = _initial(content, aim, corners)
+        with limit_memory(most_bytes):
+            initial, n_dropped, dropped = _initial(content, aim, corners, is_over)
+            check_memory_of(content, max(corners, len(initial.points)))
         # Limits on sizes may take more nodes than the error, or allow fewer; a mask's octree is
         # only roughly near.
         count = len(initial.points)
@@ -270,7 +276,6 @@ def search_mesh(
             for points, run in zip(starts, runs, strict=True)
         ):
             break
-        check_memory_of(content, max(corners, count))
         optimisation = partial(_optimise, content, aim, options, begin, initial, corners)
         begin_of_run = time.perf_counter()
         result = attempt(optimisation, initial, aim, runs)
@@ -294,12 +299,22 @@ def search_mesh(
         mesh, curving = curve_mesh(result.mesh, content, result.labels)
         result = result._replace(mesh=mesh, curving=curving)
     result = _with_verdict(result, content, aim, required, options)
+    if aim.target_error is not None and (result.fraction or 0.0) < ERROR_REACHED * aim.target_error:
+        warn(
+            f"target_error: {result.fraction:.4g} of the variance is unexplained, far below "
+            f"{aim.target_error:g}: none of {len(runs)} runs came nearer with fewer nodes",
+            Note,
+        )
     return result._replace(seconds_start=time.perf_counter() - begin - seconds, seconds_run=seconds)
 
 
-def _initial(content: Content, aim: Aim, corners: int) -> tuple[Mesh, int, Counter[int]]:
+def _initial(
+    content: Content, aim: Aim, corners: int, is_over: Callable[[], bool]
+) -> tuple[Mesh, int, Counter[int]]:
     """Build the initial mesh with a number of corners, carved within a mask; also return the number
     and volumes of dropped components.
+
+    Once `is_over` returns True, no finer octrees are tried.
     """
     if aim.start is not None:
         return aim.start, 0, Counter()
@@ -307,7 +322,8 @@ def _initial(content: Content, aim: Aim, corners: int) -> tuple[Mesh, int, Count
         # The longest edge of order 2 may allow no octree with so few corners: exchanges remove as
         # many as they can.
         is_exact = aim.order == 1 and aim.target_error is None
-        initial = (octree_mesh if is_exact else nearest_octree)(content, corners, aim.sizes)
+        make = octree_mesh if is_exact else nearest_octree
+        initial = make(content, corners, aim.sizes, is_over)
     else:
         initial = lattice_within(
             content.image, content.region, aim.kind, nodes=corners or None, spacing=aim.spacing
@@ -402,17 +418,22 @@ def check_target_error(target_error: float) -> None:
         )
 
 
-def check_memory_of(content: Content, nodes: int, limit: float | None = None) -> None:
-    """Raise InputError for more nodes than fit into memory, or into `limit` bytes in total."""
+def check_memory_of(content: Content, nodes: int) -> None:
+    """Raise InputError for an image that does not fit into memory or the user's limit, or more
+    nodes than fit into memory: a run ends at the limit.
+    """
     shape = " x ".join(map(str, content.image.shape))
     what = f"an image of {shape} voxels" + (
         f" of {content.n_channels} channels" if content.n_channels > 1 else ""
     )
     bare, need = bytes_of(content, 0), bytes_of(content, nodes)
-    check_memory(bare, what, "mesh a part of it (`crop`), or raise the memory limit", limit)
+    check_memory(bare, what, "mesh a part of it (`crop`), or raise the memory limit")
     each = (need - bare) / max(nodes, 1) or 1.0
     check_memory(
-        need, f"{nodes} nodes on {what}", lambda room: at_most((room - bare) / each, "nodes"), limit
+        need,
+        f"{nodes} nodes on {what}",
+        lambda room: at_most((room - bare) / each, "nodes"),
+        can_stop=True,
     )
 
 

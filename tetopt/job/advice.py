@@ -43,7 +43,8 @@ POCKETS = "voxels without a label, enclosed or bright"  # label 0 where a backgr
 Wanted = Literal["smaller", "larger"]
 # Requirements whose sentences ask for smaller cells.
 SMALLER_CELLS: Mapping[str, Wanted] = dict.fromkeys(
-    ("min_dihedral", "overlap", "mask", "components", "manifold", "labels", "error"), "smaller"
+    ("min_dihedral", "overlap", "mask", "components", "euler", "manifold", "labels", "error"),
+    "smaller",
 )
 THICK_SLICES = 2.0  # times a voxel's shortest edge: so far apart, cells lie between slices
 

@@ -27,7 +27,15 @@ from tetopt.engine.loop import IterationRecord, MeshingResult
 from tetopt.engine.meshing import Optimisation, check_memory_of, search_mesh
 from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import squared_edges
-from tetopt.job.events import KERNEL_WORDS, ended_words, note, progress, start_stage, time_words
+from tetopt.job.events import (
+    KERNEL_WORDS,
+    ended_words,
+    note,
+    progress,
+    start_stage,
+    time_words,
+    warnings_heard,
+)
 from tetopt.job.options import SolverOptions, has_model
 from tetopt.job.plan import kind_of
 from tetopt.job.solver_files import check_early, keep_early
@@ -44,6 +52,7 @@ from tetopt.system.arrays import Ints
 from tetopt.system.budget import (
     BYTES_PER_GB,
     MemoryLimit,
+    limit_memory,
     memory_words,
     peak_bytes,
     resident_bytes,
@@ -66,6 +75,8 @@ def mesh_task(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
     options = task.plan.engine_options
     options |= {} if task.regions is None else {"cell_labels": task.regions}
     ends = None if job.max_seconds is None else begin + job.max_seconds
+    left = None if ends is None else ends - time.perf_counter()
+    options |= {"max_seconds": left, "stop": stop}
     limit = _memory_limit(task, content)
     before = peak_bytes(), resident_bytes()
     begins = list[float]()
@@ -103,7 +114,9 @@ def mesh_task(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
         return result
 
     start_stage("start", START_WORDS)
-    result = search_mesh(content, _aim(task), attempt, task.source.required, **options)
+    most = None if limit is None else limit.n_bytes
+    with warnings_heard():
+        result = search_mesh(content, _aim(task), attempt, task.source.required, most, **options)
     regions = None if task.regions is None else result.labels
     if regions is not None:
         result = result._replace(labels=task.labels_of(regions))
@@ -148,7 +161,8 @@ def _memory_limit(task: Task, content: Content) -> MemoryLimit | None:
     if job.max_gb is None:
         return None
     n_bytes = job.max_gb * BYTES_PER_GB
-    check_memory_of(content, 0, n_bytes)
+    with limit_memory(n_bytes):
+        check_memory_of(content, 0)
     return MemoryLimit(n_bytes, next_bytes(job.nodes or 0, content.image.ndim))
 
 
@@ -237,7 +251,7 @@ def left_words(
     left = pace * (iterations - last.iteration)
     if most_seconds is not None:
         left = min(left, max(most_seconds - last.seconds, 0.0))
-    return f", about {time_words(left)} left"
+    return f", about {time_words(left)} left, then measuring"
 
 
 def _say_run(task: Task, number: int, result: MeshingResult) -> None:

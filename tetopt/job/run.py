@@ -37,6 +37,7 @@ from tetopt.model.mappings import parse_any_mapping
 from tetopt.model.model import Model
 from tetopt.report.summary import model_summary
 from tetopt.system.arrays import Json
+from tetopt.system.budget import BYTES_PER_GB, limit_memory
 from tetopt.system.files import outputs_of_run, save_json
 
 
@@ -136,7 +137,8 @@ def run(job: Job, on: Listener | None = None, stop: Callable[[], bool] | None = 
     """
     begin = time.perf_counter()
     with listen_with(on), outputs_of_run(vars(job).values()):
-        task = read(job)
+        with limit_memory(None if job.max_gb is None else job.max_gb * BYTES_PER_GB):
+            task = read(job)
         outcome = mesh_task(task, stop or (lambda: False), begin)
         start_stage("write", "writing and measuring the mesh")
         failed: dict[str, str] = {}

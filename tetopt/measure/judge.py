@@ -24,6 +24,7 @@ from tetopt.contents.labels import (
     BACKGROUND_LABEL,
     COMPONENT_VOXELS,
     LostComponent,
+    component_runs,
     voxel_components,
 )
 from tetopt.contents.memberships import supersampling
@@ -32,10 +33,17 @@ from tetopt.energy.sampling import cell_of_voxel
 from tetopt.errors import InputError, warn
 from tetopt.geometry.check import BOX_ROUNDING_VOXELS, beyond_box, manifold_problems
 from tetopt.geometry.manifold import OUTSIDE_LABEL
-from tetopt.geometry.simplex import dihedral_angles, edge_pairs, squared_edges
-from tetopt.geometry.topology import components
+from tetopt.geometry.simplex import dihedral_angles, edge_pairs, regular_edge, squared_edges
+from tetopt.geometry.topology import boundary_facets, components
 from tetopt.image import Image, transform_vectors
-from tetopt.measure.fidelity import LEAST_CELLS, LabelFidelity, OwnedVoxels, label_extents
+from tetopt.measure.fidelity import (
+    LEAST_CELLS,
+    LabelFidelity,
+    OwnedVoxels,
+    euler_characteristic,
+    label_extents,
+)
+from tetopt.measure.interfaces import voxel_euler
 from tetopt.mesh import Mesh
 from tetopt.system.arrays import Bools, Floats, Ints
 
@@ -161,6 +169,7 @@ def measure(
             "overlap": lambda: n_voxels - int((straight() >= 0).sum()),
             "mask": lambda: _dice(owner() >= 0, inside),
             "components": lambda: _mask_components(content, inside, mesh, owner()),
+            "euler": lambda: _euler_numbers(content, inside, mesh, owner()),
         }
     elif is_filled or initial is not None:
         measures["cover"] = lambda: _cover(
@@ -193,9 +202,10 @@ def judge(rows: dict[str, Any], required: Requirements) -> dict[str, str]:
 
     `min_dihedral`: tetrahedra with a smaller dihedral angle. `box`: nodes beyond the
     image's box. `cover`: voxels or volume lost or gained. Within a mask, instead of the last,
-    `overlap`: voxels that lie in two cells; `mask`: a Dice with the mask below 0.9; and
-    `components`: more connected components than the mask, or components of the mask, or parts far
-    from any cell, of 50 voxels or more without a cell. `manifold`: edges or nodes at which the
+    `overlap`: voxels that lie in two cells; `mask`: a Dice with the mask below 0.9; `components`:
+    more connected components than the mask, or components of the mask, or parts far from any cell,
+    of 50 voxels or more without a cell; and `euler`: more or fewer holes or cavities than the mask
+    has with and without details smaller than cells. `manifold`: edges or nodes at which the
     boundary, within a mask or of the user's own mesh, or the interface of two labels is not a
     manifold. `labels`: labels of 200 voxels or more without a cell at one of them, or with
     0.6 to 1.5 times their volume exceeded, or components of 50 voxels or more without a cell; not
@@ -281,6 +291,15 @@ def _say_components(parts: MaskComponents, required: Requirements) -> str:
             f"parts of the {word} {LARGE_COMPONENTS} with no cell near: {_list_components(far)}"
         )
     return "; ".join([*texts, required.remedy]) if texts else ""
+
+
+def _say_euler(numbers: tuple[int, ...], required: Requirements) -> str:
+    ours, *others = numbers
+    words = (
+        f"the mesh's surface has an Euler number of {ours}, that of the {required.region} "
+        f"{others[0]}: holes are torn or lost, or cavities; {required.remedy}"
+    )
+    return "" if min(others) <= ours <= max(others) else words
 
 
 def _say_manifold(problems: tuple[list[str], list[str], bool], required: Requirements) -> str:
@@ -387,6 +406,7 @@ SENTENCES: dict[str, Callable[[Any, Requirements], str]] = {
     "overlap": _say_overlap,
     "mask": _say_mask,
     "components": _say_components,
+    "euler": _say_euler,
     "manifold": _say_manifold,
     "labels": _say_labels,
     "error": _say_error,
@@ -433,6 +453,29 @@ def _mask_components(
     n_mask, lost = voxel_components(inside, is_met, affine)
     bare = _bare_parts(mesh, inside & ~is_met, affine)
     return MaskComponents(n_mask, tuple(n_cells.tolist()), lost, bare)
+
+
+def _euler_numbers(
+    content: Content, inside: Bools, mesh: Mesh, owner: NDArray[np.integer]
+) -> tuple[int, ...]:
+    """Euler numbers of the closed surfaces of a mesh, of the components of its mask that have a
+    cell and, if they differ, of these without details smaller than cells.
+    """
+    planes, image = _own_voxels(content)[0], content.given
+    inside = inside[planes].copy()
+    rows = inside.reshape(-1, inside.shape[-1])
+    for _, row, begin, end in component_runs(inside, owner[planes] >= 0)[1]:
+        rows[row, begin:end] = False
+    cells = mesh.cells
+    is_flat = mesh.ndim == 2
+    ours = (1 + is_flat) * euler_characteristic(cells if is_flat else boundary_facets(cells))
+    if ours == (own := voxel_euler(inside)):
+        return ours, own
+    reach = 0.5 * regular_edge(mesh.cell_volumes.mean(), mesh.ndim) / image.spacing
+    size, voxels = 1 + 2 * np.rint(np.maximum(reach, 1.0)).astype(int), inside.view(np.uint8)
+    closed = scipy.ndimage.grey_closing(voxels, size)
+    opened = (scipy.ndimage.grey_opening(each, size) for each in (voxels, closed))
+    return ours, own, *(voxel_euler(each > 0) for each in (closed, *opened))
 
 
 def _bare_parts(mesh: Mesh, is_bare: Bools, affine: Floats) -> tuple[LostComponent, ...]:

@@ -19,7 +19,7 @@ roots.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from math import prod
 from typing import NamedTuple
 
@@ -106,7 +106,12 @@ NODES_OF_LEAF = 9  # its corners and its centre, in 3-D
 TIE_SPREAD = 0.05  # of a block's error: decides between blocks that are alike
 
 
-def octree_mesh(image: Image | Content, nodes: int, sizes: Sizes | None = None) -> Mesh:
+def octree_mesh(
+    image: Image | Content,
+    nodes: int,
+    sizes: Sizes | None = None,
+    is_over: Callable[[], bool] = lambda: False,
+) -> Mesh:
     """Make a graded mesh of the image's box, or of the mask's region.
 
     Blocks of voxels are divided where that lowers E_D most, and filled with conforming cells
@@ -122,6 +127,8 @@ def octree_mesh(image: Image | Content, nodes: int, sizes: Sizes | None = None) 
         a small number; it has up to eight times as many where a mask is thinner than its cells.
     sizes : Sizes, optional
         Targets and limits for the blocks' edges.
+    is_over : callable, optional
+        Once it returns True, no finer octree is tried for a mask's thin walls.
 
     Returns
     -------
@@ -150,7 +157,7 @@ def octree_mesh(image: Image | Content, nodes: int, sizes: Sizes | None = None) 
     content, nodes = plain(image), whole_number("nodes", nodes)
     limits = _block_limits(content, nodes, sizes)
     _check_enough(content, nodes, sizes, limits)
-    mesh = _octree_within(content, nodes, limits)
+    mesh = _octree_within(content, nodes, limits, is_over)
     count = len(mesh.points)
     # Exchanges correct the number within a mask or with targets.
     if is_near(count, nodes) or content.inside is not None or limits.target is not None:
@@ -299,15 +306,22 @@ def is_for_walls(count: int, nodes: int) -> bool:
     return count > (1.0 - LARGEST_MISS) * FINER_RATIO * nodes + LARGEST_MISS_NODES
 
 
-def nearest_octree(image: Image | Content, nodes: int, sizes: Sizes | None = None) -> Mesh:
+def nearest_octree(
+    image: Image | Content,
+    nodes: int,
+    sizes: Sizes | None = None,
+    is_over: Callable[[], bool] = lambda: False,
+) -> Mesh:
     """Like `octree_mesh`, but accept any number of nodes if the image or the sizes allow no
     nearer one.
     """
     content = plain(image)
-    return _octree_within(content, nodes, _block_limits(content, nodes, sizes))
+    return _octree_within(content, nodes, _block_limits(content, nodes, sizes), is_over)
 
 
-def _octree_within(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
+def _octree_within(
+    content: Content, nodes: int, limits: _BlockLimits, is_over: Callable[[], bool]
+) -> Mesh:
     """The octree within the limits with the nearest number of nodes, clipped at the mask's surface.
 
     Where that would lose walls thinner than its cells, it has more nodes, if these keep them or
@@ -315,7 +329,7 @@ def _octree_within(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
     """
     if content.region is None:
         return _octree_of_box(content, nodes, limits)
-    tried = _finer_octrees(content, nodes, limits, content.region)
+    tried = _finer_octrees(content, nodes, limits, content.region, is_over)
     first = next(tried)
     least = min(tried, key=lambda octree: octree.lost, default=first)
     return (least if least.lost <= max(MOST_LOST, LESS_LOST * first.lost) else first).mesh
@@ -329,9 +343,15 @@ class _Tried(NamedTuple):
 
 
 def _finer_octrees(
-    content: Content, nodes: int, limits: _BlockLimits, region: Region
+    content: Content,
+    nodes: int,
+    limits: _BlockLimits,
+    region: Region,
+    is_over: Callable[[], bool],
 ) -> Iterator[_Tried]:
-    """Octrees of ever more nodes, while they lose walls, but less than all before."""
+    """Octrees of ever more nodes, while they lose walls, but less than all before, until `is_over`
+    returns True.
+    """
     # The leaves that the region touches have about as many nodes, to a few per cent, as the clipped
     # mesh.
     limits, least, n_stalled = _lighter(content, nodes, limits), np.inf, 0
@@ -352,7 +372,7 @@ def _finer_octrees(
         yield _Tried(mesh, lost)
         n_stalled = n_stalled + 1 if STALLED_FRACTION * least < lost < SMALL_LOSS else 0
         least = min(least, lost)
-        if lost <= MOST_LOST or n_stalled == STALLED_STEPS:
+        if lost <= MOST_LOST or n_stalled == STALLED_STEPS or is_over():
             return
 
 

@@ -11,8 +11,9 @@ import ctypes
 import os
 import re
 import sys
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from math import floor, inf, log10
 from pathlib import Path
 from typing import NamedTuple
@@ -30,6 +31,7 @@ MAXRSS_UNIT_BYTES = 1 if sys.platform == "darwin" else 1024
 PROC_FOLDER = Path("/proc")
 GROUP_FOLDER = Path("/sys/fs/cgroup")
 UNLIMITED_BYTES = 1 << 60  # control groups write "no limit" as a number near 2^63
+_LIMIT: ContextVar[float] = ContextVar("limit", default=inf)  # the user's, bytes
 
 
 class MemoryShortage(InputError):
@@ -51,10 +53,10 @@ def at_most(count: float, noun: str = "") -> str:
 
 
 def check_memory(
-    n_bytes: float, what: str, advice: str | Callable[[float], str], limit: float | None = None
+    n_bytes: float, what: str, advice: str | Callable[[float], str], *, can_stop: bool = False
 ) -> None:
-    """Raise `MemoryShortage` if the next step needs more memory than is available, or than `limit`,
-    bytes.
+    """Raise `MemoryShortage` if the next step needs more memory than is available, or than the
+    user's limit (`limit_memory`) leaves.
 
     Parameters
     ----------
@@ -64,22 +66,33 @@ def check_memory(
         The step with its sizes; begins the message.
     advice : str or callable
         The remedy; ends the message. A function returns it for the bytes that the step may take.
-    limit : float, optional
-        The user's limit on the total memory of this process.
+    can_stop : bool
+        True for a step that ends itself at the user's limit.
     """
     free = available_bytes()
-    room = inf if limit is None else limit - resident_bytes()
+    limit = inf if can_stop else _LIMIT.get()
+    room = limit - resident_bytes()
     remedy = advice(min(free, room)) if callable(advice) else advice
     if n_bytes > free:
         raise MemoryShortage(
             f"{what}: needs about {memory_words(n_bytes)} of memory, but only "
             f"{memory_words(free)} is free; {remedy}"
         )
-    if limit is not None and n_bytes > room:
+    if n_bytes > room:
         raise MemoryShortage(
             f"{what}: needs about {memory_words(n_bytes + limit - room)} of memory in total, but "
             f"only {memory_words(limit)} is allowed; {remedy}"
         )
+
+
+@contextmanager
+def limit_memory(n_bytes: float | None) -> Iterator[None]:
+    """Limit the total memory of this process, within a context; None sets no limit."""
+    token = _LIMIT.set(inf if n_bytes is None else n_bytes)
+    try:
+        yield
+    finally:
+        _LIMIT.reset(token)
 
 
 class MemoryLimit(NamedTuple):
