@@ -110,7 +110,7 @@ def test_a_verdict_is_not_without_what_requirements_allow():
     assert beyond.startswith("labels: of 3, ")
     assert f"2 ({ratio:.3g})" in beyond
     assert beyond.endswith("1 with components without a cell: 3 (1 of 2, voxels: 1)")
-    assert verdict.startswith("all requirements are met, but not all labels fit (above); a.vtu: ")
+    assert verdict.startswith("all requirements are met, but not all labels fit: ")
 
 
 def test_commands_tell_that_the_run_of_a_mesh_violated_requirements():

@@ -57,6 +57,7 @@ WATER_DENSITY = 1000.0  # kg/m3
 # and in MPa it lies below the third number.
 PASCAL_RANGE = (1e3, 1e5)
 MEGAPASCAL_MOST = 0.05
+NAME_UNIT = 'if it is in another unit, name it, as in `young` "3.5 kPa"'
 GRAM_DENSITY_MOST = 20.0  # kg/m3: gold has about this many g/cm3, and only gases have so few kg/m3
 # mm/s2: from the moon's to ten times the earth's gravity if taken as m/s2
 METRE_GRAVITY = (1.0, 100.0)
@@ -331,12 +332,12 @@ def odd_units(model: Model) -> Iterator[str]:
         if PASCAL_RANGE[0] <= low and high <= PASCAL_RANGE[1]:
             yield (
                 f"young is {low:.4g} to {high:.4g} kPa, stiffer than soft tissue (0.1 to a few "
-                'hundred kPa): if it is in Pa, name the unit, as in `young` "3500 Pa"'
+                f"hundred kPa): {NAME_UNIT}"
             )
         elif high < MEGAPASCAL_MOST:
             yield (
-                f"young is at most {high:.4g} kPa, softer than any tissue (0.1 kPa or more): if it "
-                'is in another unit, name it, as in `young` "0.003 MPa"'
+                f"young is at most {high:.4g} kPa, softer than any tissue (0.1 kPa or more): "
+                f"{NAME_UNIT}"
             )
         if (
             table.density is not None

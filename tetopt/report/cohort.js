@@ -251,7 +251,7 @@ function chartOf(c) {
   const ends = (digits) => {
     const [{ ends: [low, below], isOpen: lowest, outermost: least }, { ends: [above, high], isOpen: highest, outermost: largest }] = [bins[0], bins[bins.length - 1]];
     return [[lowest.low, "≤ ", below, low, least], [highest.high, "≥ ", above, high, largest]].map(([isOpen, sign, cut, end, outermost]) =>
-      isOpen ? `${sign}${written(cut, column.unit, digits)} (${written(outermost, column.unit, digits)})` : written(end, column.unit, digits));
+      isOpen ? sign + [...new Set([cut, outermost].map((value) => written(value, column.unit, digits)))].join(" (") + (written(cut, column.unit, digits) === written(outermost, column.unit, digits) ? "" : ")") : written(end, column.unit, digits));
   };
   const isNear = !isText && ends(3)[0].replace("≤ ", "") === ends(3)[1].replace("≥ ", "");
   const feet = isText ? bins.slice(0, 4).map((bin) => bin.words) : ends(isNear ? 5 : 3);

@@ -20,7 +20,6 @@ from tetopt.mesh import Mesh
 from tetopt.start.sizes import LONG_EDGE, SHORT_EDGE_FRACTION, EdgeRatios
 from tetopt.system.arrays import Floats
 
-CHANGED_FRACTION = 0.2  # of a label's size: larger changes get a line of text
 WORST_ROWS = 5  # thin labels and pairs shown; run.json has all
 WORST_LABELS = 12  # the same of labels
 LONGEST_NAME = 24  # of a label with its number, characters
@@ -385,9 +384,7 @@ def _label_words(label: int, names: Mapping[int, str]) -> str:
 
 
 def label_differences(rows: Sequence[LabelFidelity], names: Mapping[int, str]) -> list[str]:
-    """Describe labels whose cells differ from their voxels in topology, or strongly in size: one
-    line per label.
-    """
+    """Describe labels whose cells differ from their voxels in holes or cavities: one line each."""
     lines: list[str] = []
     for row in rows:
         if (surface := row.surface) is None:
@@ -395,11 +392,7 @@ def label_differences(rows: Sequence[LabelFidelity], names: Mapping[int, str]) -
         n_voxels, n_cells, *_ = row.pieces
         cavities, of_cells = surface.cavities, surface.mesh_cavities
         holes = n_voxels + cavities - surface.euler // 2
-        volume, more = row.extent.volume, row.extent.mesh_volume - row.extent.volume
-        parts = []
-        if abs(more) > CHANGED_FRACTION * volume:
-            parts.append(f"{abs(more) / volume:.0%} {'smaller' if more < 0.0 else 'larger'}")
-        parts += _surplus(n_cells + of_cells - surface.mesh_euler // 2 - holes, "hole")
+        parts = _surplus(n_cells + of_cells - surface.mesh_euler // 2 - holes, "hole")
         parts += _surplus(of_cells - cavities, "cavity")
         if parts and row.extent.n_cells:
             name = f" ({names[row.label]})" if row.label in names else ""
