@@ -98,6 +98,40 @@ def test_pieces_that_stay_apart_are_told(command, here, capsys):
     assert "2 pieces" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("n", [2, 3])
+@pytest.mark.parametrize("by", [0.0, 0.3])
+def test_cells_that_touch_without_common_nodes_are_told(n, by, here):
+    """A finer box beside or in a coarser one: corners are merged, other nodes hang."""
+    coarse, fine = (lattice_mesh(image_of(n), blocks=(k,) * n) for k in (1, 2))
+    parts = [nodes_of(mesh, 1) for mesh in (coarse, fine)]
+    points = np.vstack([parts[0][0], parts[1][0] + (12.0 - by) * (np.arange(3) == 0)])
+    cells = np.vstack([parts[0][1], parts[1][1] + len(parts[0][0])])
+    grid_of(points, cells, n).save("a.vtu")
+    assert any("touch or overlap" in note for note in load_mesh("a.vtu").notes)
+    grid_of(*parts[1], n).save("a.vtu")
+    assert load_mesh("a.vtu").notes == ()
+
+
+def test_labels_by_majority_are_told(here, capsys):
+    image = image_of(3)
+    save_image("i.nii.gz", image)
+    save_image("l.nii.gz", Image((np.indices((12, 12, 12))[0] > 5).astype(np.uint8), image.affine))
+    points, cells = nodes_of(box_mesh(3), 1)
+    for data, is_told in (({}, True), ({"label": np.ones(len(cells))}, False)):
+        grid_of(points, cells, 3, **data).save("a.vtu")
+        assert_done("quality i.nii.gz a.vtu --labels l.nii.gz")
+        assert ("majority of voxels" in capsys.readouterr().out) == is_told
+
+
+def test_a_mesh_of_a_part_without_a_mask_is_told(here, capsys):
+    save_image("i.nii.gz", image_of(3))
+    points, cells = nodes_of(box_mesh(3), 1)
+    for part, is_told in ((cells, False), (cells[:50], True)):
+        grid_of(points, part, 3).save("a.vtu")
+        assert_done("convert i.nii.gz a.vtu b.vtu --young h**2+1 --force")
+        assert ("--mask" in capsys.readouterr().err) == is_told
+
+
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize(("bits", "is_left"), [(1, True), (32, True), (33, True), (2, False)])
 def test_ghosts_are_left_out(bits, is_left, order, here):

@@ -55,6 +55,10 @@ def quality_command(
         _add_fit(table, judgement.fit, source, judgement.left_out, every)
     print_table(table)
     print_fidelity(judgement.measured, judgement.loaded.mesh.ndim, judgement.mask_word, every)
+    if labels is not None and judgement.loaded.labels is None:
+        print_line(
+            "labels of cells: by majority of voxels, as the mesh has none: what cells could follow"
+        )
     if check and not judgement.numbers["problems"]:
         print_line(f"checked: conforming, oriented{_check_words(judgement)}")
     wrong = judgement.tell()

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from tetopt.contents.content import Content, continuation, continue_image
 from tetopt.contents.labels import check_labels
 from tetopt.errors import InputError, prefix_errors
+from tetopt.geometry.check import filled_fraction
 from tetopt.image import Image
 from tetopt.job.aligned import (
     Align,
@@ -26,6 +27,7 @@ from tetopt.job.aligned import (
     read_mask,
     warn_of_other_world,
 )
+from tetopt.job.events import note
 from tetopt.job.mesh_file import table_of_segmentation, warn_of_other_image
 from tetopt.job.options import BoxPart, LabelledPart, MaskedPart, stated_part
 from tetopt.measure.fidelity import cell_labels
@@ -41,6 +43,7 @@ from tetopt.model.label_names import (
 )
 from tetopt.system.arrays import Json
 
+FILLED_FRACTION = 1.0 - 1e-6  # of the image's box, by a mesh that was built to fill it
 AFFINE_MM = 1e-4  # affines that differ by less are equal: files round them to 32 bits
 
 
@@ -149,6 +152,11 @@ def image_voxels(
     )
     content = _within(whole, part, beside, loaded)
     _warn_of_mask(loaded, content, part)
+    if content.own_mask is None and filled_fraction(loaded.mesh, whole) < FILLED_FRACTION:
+        note(
+            f"{mesh}: has no mask and does not fill the image's box: cells at its boundary count "
+            "voxels outside, too; pass `mask`"
+        )
     return content, is_other
 
 

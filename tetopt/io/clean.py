@@ -7,7 +7,7 @@ from scipy.spatial import KDTree
 
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import cell_edges
-from tetopt.geometry.topology import connected_sets
+from tetopt.geometry.topology import boundary_facets, connected_sets
 from tetopt.io.raw import Raw
 from tetopt.io.text import list_names
 from tetopt.mesh import Mesh
@@ -22,6 +22,9 @@ GHOST_BITS = 1 | 8 | 32
 MERGE_FRACTION = 1e-6
 # of the shortest edge at both nodes, so that no two nodes of a tiny cell are merged
 MERGE_EDGE_FRACTION = 1e-3
+# To find cells that touch others without common nodes: as many facets of the boundary, and nearest
+# cells of each; a point outside a facet, in sizes of it
+PROBED_FACETS, PROBED_CELLS, PROBE_FRACTION = 4000, 32, 0.01
 # Other programs' names of cell data with labels, in lower case, the most specific ones first.
 LABEL_NAMES = """
 label labels medit:ref gmsh:physical tissue tissues tissue_type regionid region_id modelregionid
@@ -113,18 +116,43 @@ def _shortest_edges(points: Floats, corners: Ints, middles: Ints) -> Floats:
     return shortest
 
 
-def piece_words(mesh: Mesh) -> tuple[str, ...]:
-    """Return a remark on a mesh whose pieces share no nodes; none for a single piece."""
+def apart_words(mesh: Mesh) -> tuple[str, ...]:
+    """Return remarks on pieces that share no nodes, and on cells that touch or overlap without
+    common nodes.
+    """
     n = mesh.ndim
     starts, ends = mesh.cells[:, :n].ravel(), mesh.cells[:, 1:].ravel()
     count, number = connected_sets(starts, ends, len(mesh.points))
-    if count == 1:
-        return ()
     sizes = np.bincount(number[mesh.cells[:, 0]], mesh.cell_volumes)
-    return (
+    pieces = (
         f"{count} pieces share no nodes, so that no force passes between them; the largest has "
-        f"{sizes.max() / sizes.sum():.1%} of the volume",
+        f"{sizes.max() / sizes.sum():.1%} of the volume"
     )
+    touching = (
+        "cells touch or overlap others without common nodes, so that no force passes there: at "
+        f"{(share := _covered_fraction(mesh)):.1%} of the boundary's facets"
+    )
+    return (*[pieces] * (count > 1), *[touching] * (share > 0.0))
+
+
+def _covered_fraction(mesh: Mesh) -> float:
+    """Return the fraction of some boundary facets with another cell just outside their centre."""
+    outer = boundary_facets(mesh.cells)
+    corners = mesh.points[outer[:: -(-len(outer) // PROBED_FACETS)]]
+    sides = corners[:, 1:] - corners[:, :1]
+    if mesh.ndim == 3:
+        normals = np.cross(sides[:, 0], sides[:, 1])
+        normals /= np.sqrt(np.linalg.norm(normals, axis=1, keepdims=True)) + np.finfo(float).tiny
+    else:
+        normals = sides[:, 0, ::-1] * [1.0, -1.0]
+    probes = corners.mean(axis=1) + PROBE_FRACTION * normals
+    tree = KDTree(mesh.points[mesh.cells].mean(axis=1))
+    near = tree.query(probes, k=min(PROBED_CELLS, len(mesh.cells)))[1].reshape(len(probes), -1)
+    first, *others = np.moveaxis(mesh.points[mesh.cells[near]], 2, 0)
+    edges = np.stack([other - first for other in others], axis=-1)
+    weights = np.linalg.solve(edges, (probes[:, None] - first)[..., None])[..., 0]
+    is_inside = (weights > 0.0).all(axis=2) & (weights.sum(axis=2) < 1.0)
+    return float(is_inside.any(axis=1).mean())
 
 
 def with_labels(

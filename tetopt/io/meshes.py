@@ -19,7 +19,7 @@ from tetopt.interop.conversions import (
     rows_by_kind,
     simplices_of,
 )
-from tetopt.io.clean import piece_words, with_labels, with_merged_nodes, without_ghosts
+from tetopt.io.clean import apart_words, with_labels, with_merged_nodes, without_ghosts
 from tetopt.io.raw import Raw, by_corners
 from tetopt.io.read_gmsh import read_msh
 from tetopt.io.read_solver import read_feb, read_inp, read_medit, read_xdmf
@@ -131,7 +131,7 @@ def load_mesh(
             *of_edges,
             *of_labels,
             *moved,
-            *(() if MASK_TEXT in field_data else piece_words(mesh)),
+            *(() if {MASK_TEXT, "options"} & field_data.keys() else apart_words(mesh)),
         ),
         2 if kind in raw.middles else 1,
         {name: values[np.concatenate([used, middles])] for name, values in point_data.items()},
