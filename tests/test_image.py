@@ -140,14 +140,22 @@ def test_data_that_is_no_image_is_refused(data, message):
         Image(data)
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_the_first_voxel_that_is_not_finite_is_named(value):
+@pytest.mark.parametrize("value", [np.inf, -np.inf])
+def test_the_first_voxel_that_is_infinite_is_named(value):
     data = np.zeros((3, 4))
     data[1, 2] = data[2, 3] = value
-    with pytest.raises(
-        InputError, match=r"2 voxels are NaN or infinite, the first at index \(1, 2\)"
-    ):
+    with pytest.raises(InputError, match=r"2 voxels are infinite, the first at index \(1, 2\)"):
         Image(data)
+
+
+def test_a_voxel_may_have_no_value():
+    image = Image(np.array([[1.0, np.nan], [3.0, 2.0]]))
+    assert image.data.dtype == np.float32
+    assert (image.has_gaps, image.range) == (True, (1.0, 3.0))
+    assert image.with_zeros().data.tolist() == [[1.0, 0.0], [3.0, 2.0]]
+    whole = image.with_zeros()
+    assert not whole.has_gaps
+    assert whole.with_zeros() is whole
 
 
 @pytest.mark.parametrize(

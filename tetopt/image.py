@@ -39,7 +39,8 @@ class Image:
     Parameters
     ----------
     data : (s_0, ..., s_{n-1}) array of real numbers
-        Intensities, n = 2 or 3. Kept as float32 if that is lossless, else as float64; read-only.
+        Intensities, n = 2 or 3; NaN where there is no value. Kept as float32 if that is lossless,
+        else as float64; read-only.
     affine : (n+1, n+1) array, optional
         Homogeneous map from index to world coordinates in mm, by default the identity (1 mm voxel).
         Float64, read-only.
@@ -47,8 +48,8 @@ class Image:
     Raises
     ------
     InputError
-        Wrong number of axes, an empty axis, complex, RGB, masked or non-finite data, or an affine
-        that is singular or has the wrong size.
+        Wrong number of axes, an empty axis, complex, RGB, masked or infinite data, no value at
+        all, or an affine that is singular or has the wrong size.
 
     See Also
     --------
@@ -77,10 +78,15 @@ class Image:
 
     @cached_property
     def range(self) -> tuple[float, float]:
-        """The smallest and largest intensity, cached like the next three, as each takes a pass
+        """The smallest and largest intensity, cached like the next four, as each takes a pass
         over all voxels.
         """
-        return float(self.data.min()), float(self.data.max())
+        return _range_of(self.data)
+
+    @cached_property
+    def has_gaps(self) -> bool:
+        """True if a voxel has no value (NaN)."""
+        return bool(np.isnan(self.data.min()))
 
     @cached_property
     def mean(self) -> float:
@@ -168,6 +174,10 @@ class Image:
         return transform_vectors(
             shifted, np.asarray(np.linalg.inv(self.affine[:-1, :-1]), dtype=np.float64)
         )
+
+    def with_zeros(self) -> Image:
+        """Return the image with 0 where it has no value, as a mask or labels have there."""
+        return Image(np.nan_to_num(self.data), self.affine) if self.has_gaps else self
 
     def box(self, start: Sequence[int], stop: Sequence[int]) -> Image:
         """Return a box of indices as an image; every voxel keeps its place in the world.
@@ -271,17 +281,23 @@ def _check_data(data: ArrayLike) -> NDArray[np.floating]:
         raise InputError(
             f"image data: expected at least one voxel along every axis, got shape {data.shape}"
         )
-    is_bad = ~np.isfinite(data)
+    is_bad = np.isinf(data)
     if is_bad.any():
         first = tuple(int(i) for i in np.argwhere(is_bad)[0])
         raise InputError(
-            f"image data: {np.count_nonzero(is_bad)} voxels are NaN or infinite, the first at "
+            f"image data: {np.count_nonzero(is_bad)} voxels are infinite, the first at "
             f"index {first}; replace them first, for example with the background's value"
         )
     values = _as_lossless_float(data)
-    check_intensities(float(values.min()), float(values.max()))
+    if np.isnan(values).all():
+        raise InputError("image data: expected a value in some voxel, got NaN in all")
+    check_intensities(*_range_of(values))
     values.setflags(write=False)
     return values
+
+
+def _range_of(values: NDArray[np.floating]) -> tuple[float, float]:
+    return float(np.fmin.reduce(values, axis=None)), float(np.fmax.reduce(values, axis=None))
 
 
 def check_kind(dtype: np.dtype) -> None:
@@ -310,7 +326,7 @@ def _as_lossless_float(data: NDArray) -> NDArray[np.floating]:
     with np.errstate(over="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         single = np.array(data, dtype=np.float32, order="C")
-    if np.array_equal(single, data):
+    if np.array_equal(single, data) or np.array_equal(single, data, equal_nan=True):
         return single
     return np.array(data, dtype=np.float64, order="C")
 

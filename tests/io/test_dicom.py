@@ -15,7 +15,7 @@ from readers import read_warned
 from refusals import assert_refused
 
 import tetopt
-from tetopt.io.images import load_image
+from tetopt.io.images import image_files, load_image, sha256
 from tetopt.io.label_tables import load_label_table
 from tetopt.io.read_dicom import _unevenness
 
@@ -282,11 +282,29 @@ def test_a_folder_above_series_lists_them(tmp_path, capfd):
     assert_refused(tmp_path, "no DICOM series")
     (tmp_path / "scan").mkdir()
     for name, count in (("t1", 4), ("flair", 3)):
-        slices_of(tmp_path / "scan" / name, RAMP[:count])
+        for file in slices_of(tmp_path / "scan" / name, RAMP[:count]).iterdir():
+            data = pydicom.dcmread(file)
+            data.SeriesInstanceUID = f"1.{count}"
+            data.save_as(file)
     (tmp_path / "report.txt").write_text("nothing to see")
     words = r"choose one of its subfolders: scan.flair \(3 files\), scan.t1 \(4 files\)$"
     assert_refused(tmp_path, words)
     assert capfd.readouterr().err == ""  # no library's own warning
+
+
+def test_one_series_in_subfolders_is_read_together(tmp_path):
+    slices_of(tmp_path / "x")
+    before = sorted((tmp_path / "x").iterdir())
+    for k, file in enumerate(before):
+        folder = tmp_path / "a" / f"b{k % 3}"
+        folder.mkdir(parents=True, exist_ok=True)
+        file.rename(folder / f"IM{k // 3}")
+    (tmp_path / "x").rmdir()
+    assert_placed(tmp_path / "a")
+    assert len(image_files(tmp_path / "a")) == len(before)
+    first = sha256(tmp_path / "a")
+    (tmp_path / "a/b0/IM0").write_bytes(b"")
+    assert sha256(tmp_path / "a") != first
 
 
 def test_a_volume_of_several_is_chosen():
@@ -316,6 +334,24 @@ def test_each_frame_has_its_own_scale():
     assert_placed(
         path, np.array([a * plane + b for (a, b), plane in zip(scales, RAMP, strict=True)])
     )
+
+
+@pytest.mark.parametrize(
+    "tags",
+    [{"PixelPaddingValue": -2000}, {"PixelPaddingValue": -2000, "PixelPaddingRangeLimit": -1990}],
+)
+def test_padding_that_a_ct_states(tmp_path, tags):
+    pixels = RAMP.copy()
+    pixels[:, 0, :3] = -2000
+    if len(tags) > 1:
+        pixels[2, 0, 0] = -1995
+    slices_of(tmp_path, pixels, Modality="CT", RescaleIntercept=-1024, RescaleSlope=1, **tags)
+    image, said = read_warned(tmp_path)
+    assert "padding" in said[0]
+    assert image.range[0] > -1024
+    is_padding = pixels.T < -1000
+    assert_array_equal(image.data[~is_padding], pixels.T[~is_padding] - 1024.0)
+    slices_of(tmp_path, pixels, Modality="MR", RescaleIntercept=0, RescaleSlope=1, **tags)
 
 
 def test_slices_have_their_own_scales(tmp_path):

@@ -166,12 +166,6 @@ def test_damaged_pairs(tmp_path):
     assert "24 more bytes after them" in read_warned(path)[1][0]
     path.write_text("ENVI\nsamples = 3\n")
     assert_refused(path, f"{DAMAGED}, or not an image of this kind")
-    for endianness in "<>":
-        header = nibabel.AnalyzeHeader(endianness=endianness)
-        header.set_data_shape((3, 4, 5))
-        path.write_bytes(header.binaryblock)
-        for each in (path, voxels):
-            assert_refused(each, "an Analyze 7.5 image, whose format does not tell left from")
 
 
 def test_a_gzip_file_is_unpacked_once(tmp_path, monkeypatch):
@@ -407,7 +401,7 @@ def test_frames_of_a_tiff(tmp_path):
 
 GARBAGE = b"hello " * 200
 WHOLE = nifti(ramp(3, 4, 5))
-NOT_FINITE = [np.where(ramp(3, 4, 5) == 34, bad, 1.0) for bad in (np.nan, np.inf, -np.inf)]
+NOT_FINITE = [np.where(ramp(3, 4, 5) == 34, bad, 1.0) for bad in (np.inf, -np.inf)]
 COLOURS = np.stack([ROWS] * 3, axis=-1)
 COLOURS[2, 4, 1] += 1  # one pixel, one step off grey
 PAGE = b"\n<!DOCTYPE HTML>\n<html><body>Please log in</body></html>"
@@ -417,7 +411,8 @@ AXES = [
 ]
 KNOWN = (
     ".nii.gz, .nii, .mgz, .mgh, .hdr, .img, .hdr.gz, .img.gz, .nrrd, .nhdr, .mha, .mhd, .zarr, "
-    ".dcm, .png, .tif, .tiff, .jpg, .jpeg, .bmp"
+    ".head, .brik, .brik.gz, .mnc, .gipl, .gipl.gz, .vtk, .vti, .npy, .dcm, .png, .tif, .tiff, "
+    ".jpg, .jpeg, .bmp"
 )
 REFUSED = [
     *((name, None, "no such file or folder") for name in ("a.nii.gz", "a.xyz", "folder/a.nii")),
@@ -469,10 +464,7 @@ REFUSED = [
     ),
     ("a.nii", nifti(ramp(3, 4, 5, dtype=np.complex64)), "complex"),
     ("a.nii", nifti(np.zeros((3, 4, 5), [(c, "u1") for c in "RGB"])), "convert RGB to grey"),
-    *(
-        ("a.nii", nifti(data), r"1 voxels are NaN or infinite, .*\(1, 2, 3\)")
-        for data in NOT_FINITE
-    ),
+    *(("a.nii", nifti(data), r"1 voxels are infinite, .*\(1, 2, 3\)") for data in NOT_FINITE),
     *(
         (
             "a.nii",

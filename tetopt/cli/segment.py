@@ -13,6 +13,7 @@ from tetopt import Content, InputError, Mesh, save_image
 from tetopt.cli.console import print_line, print_table, show_warning
 from tetopt.cli.options import FilesArgument, NumberOptions, mesh_and_image
 from tetopt.commands.beside import image_voxels, read_labels
+from tetopt.io.images import OUTPUT_SUFFIXES
 from tetopt.job.mesh_file import check_overlap, read_mesh
 from tetopt.job.options import MaskedPart, Option
 from tetopt.report.tables import new_table
@@ -42,7 +43,7 @@ def segment_command(
     """
     from tetopt.measure.segmentation import dice, segment, stands_for, threshold_image
 
-    output = check_output(output, (".nii", ".nii.gz"), numbers.force)
+    output = check_output(output, OUTPUT_SUFFIXES, numbers.force)
     numbers.check()
     mesh_path, image_path = mesh_and_image(paths, image_path)
     if image_path is None:

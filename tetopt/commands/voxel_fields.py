@@ -45,7 +45,7 @@ def write_on_image(
     ----------
     mesh : Path
     output : Path
-        NIfTI.
+        NIfTI, MGZ or NRRD.
     options : VoxelOptions
     like : Path, optional
         The image whose voxels get the field, unless `options` name one.
@@ -73,7 +73,8 @@ def write_on_image(
     loaded = read_mesh(mesh, part)
     loaded = loaded if results is None else with_results(loaded, results)
     name, values, at = _field_of(loaded, mesh, options, space)
-    image = _read(loaded, mesh, path, part.registered)
+    is_grid = path is not options.warp
+    image = _read(loaded, mesh, path, part.registered, is_grid=is_grid)
     check_overlap(mesh, loaded.mesh, image)
     numbers: Json = {"mesh": mesh.name, "output": output.name, "field": name, "at": at}
     if options.warp is None:
@@ -107,6 +108,7 @@ def write_on_image(
         )
         save_image(output, moved)
         on_voxels = moved.data.astype(np.float64)
+        inside &= ~np.isnan(on_voxels)
         words += ", nearest voxels" if options.nearest else ", linear between voxels"
         numbers["warp"] = options.warp.name
     least = float(on_voxels[inside].min())
@@ -144,11 +146,13 @@ def _check(output: Path, options: VoxelOptions, like: Path | None, space: str) -
         raise InputError(f"`outside`: expected a finite number, got {outside}")
 
 
-def _read(loaded: MeshFile, mesh: Path, path: Path, is_registered: bool) -> Image:
+def _read(
+    loaded: MeshFile, mesh: Path, path: Path, is_registered: bool, is_grid: bool = False
+) -> Image:
     """Read an image in the mesh's world; raise InputError for another dimension or, unless
     registered, another box.
     """
-    image = read_companion(path)
+    image = read_companion(path, is_grid=is_grid)
     if image.ndim != loaded.mesh.ndim:
         raise InputError(
             f"{path}: expected a {loaded.mesh.ndim}-D image like the mesh, got a {image.ndim}-D one"

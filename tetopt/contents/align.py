@@ -79,7 +79,7 @@ def resample_mask(mask: Image, image: Image, name: str = "mask") -> Image:
     ((16, 16, 16), [0.0, 1.0])
     """
     _check_axes(name, mask, image)
-    inside = _mask_values(name, mask.data)
+    inside = _mask_values(name, mask.with_zeros().data)
     moved = _values_at(Image(inside, mask.affine), image)
     if not (moved >= INSIDE_FRACTION).any():
         if (in_box(image, mask).astype(bool) & (inside >= INSIDE_FRACTION)).any():
@@ -266,7 +266,16 @@ def resample_contrast(other: Image, image: Image, name: str = "contrast") -> Ima
             f"{100 * fraction:.1f} %; "
             f"{_both_boxes(other, image)}"
         )
-    return Image(_resample(other.data, other, image, 1, "nearest"), image.affine)
+    if not other.has_gaps:
+        return Image(_resample(other.data, other, image, 1, "nearest"), image.affine)
+    # A voxel between one with a value and one without has a value if the former is nearer.
+    is_gap = np.isnan(other.data)
+    nearest = scipy.ndimage.distance_transform_edt(
+        is_gap, other.spacing, return_distances=False, return_indices=True
+    )
+    moved = _resample(other.data[tuple(nearest)], other, image, 1, "nearest")
+    moved[_resample(is_gap.astype(np.uint8), other, image, 0, "nearest") > 0] = np.nan
+    return Image(moved, image.affine)
 
 
 class Foreground(NamedTuple):
@@ -356,7 +365,7 @@ def foreground(image: Image, level: float | None = None, labels: Image | None = 
     """Find the foreground, and count its small pieces, as `foreground_mask` does."""
     limit = background_level(image) if level is None else float(level)
     is_labelled = np.zeros(image.shape, dtype=bool) if labels is None else labels.data > 0
-    dark, sizes = _pieces((image.data <= limit) & ~is_labelled)
+    dark, sizes = _pieces(~(image.data > limit) & ~is_labelled)  # NaN, no value, is dark
     is_outer = np.zeros(len(sizes), dtype=bool)
     is_outer[_on_faces(dark)] = True
     sizes[~is_outer] = 0
@@ -423,14 +432,17 @@ def background_level(image: Image) -> float:
         The faces have no dark voxels, or these are not distinct: the level is not below Otsu's
         threshold.
     """
-    data = image.data
-    if data.min() == data.max():
-        raise _no_background(f"every voxel has the value {data.flat[0]:g}")
+    low, high = image.range
+    values = _on_faces(image.data)
+    if 2 * np.count_nonzero(np.isnan(values)) > len(values):  # the background has no values
+        return float(np.nextafter(image.data.dtype.type(low), -np.inf))
+    if low == high:
+        raise _no_background(f"every voxel has the value {low:g}")
     try:
-        (threshold,) = class_thresholds(data.ravel(), 2)
+        data = image.data.ravel()
+        (threshold,) = class_thresholds(data[~np.isnan(data)] if image.has_gaps else data, 2)
     except InputError as error:
         raise _no_background(str(error)) from error
-    values = _on_faces(data)
     dark = values[values <= threshold].astype(np.float64)
     if len(dark) == 0:
         raise _no_background(f"no voxel on the faces of the box is dark ({threshold:.4g} or less)")

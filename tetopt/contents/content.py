@@ -301,8 +301,8 @@ def content(
     Raises
     ------
     InputError
-        Images of different shapes, invalid weights, labels that are not whole numbers from 0, or
-        only images and labels of weight 0.
+        A voxel that counts has no value; images of different shapes, invalid weights, labels that
+        are not whole numbers from 0, or only images and labels of weight 0.
 
     See Also
     --------
@@ -323,6 +323,7 @@ def content(
     weights = [1.0] * len(images) if weights is None else [float(w) for w in weights]
     _check(images, {"labels": labels, "mask": mask}, weights, label_weight)
     labels = None if labels is None else check_labels("labels", labels, is_map=True)
+    mask = None if mask is None else mask.with_zeros()
     whole = images[0]
     images, labels, region, beyond = _within_mask(images, labels, mask)
     result = Content(
@@ -384,10 +385,10 @@ def _within_mask(
     if mask is not None:
         beyond = continuation(mask, whole.spacing)
         region = region_of(_part(mask, beyond.part))
-        images = [continue_image(image, beyond) for image in images]
-        if labels is not None:
-            warn_of_absent("", labels, mask.data >= INSIDE_FRACTION, "mask")
-            labels = images[0] if labels is whole else continue_image(labels, beyond)
+    images = [continue_image(image, beyond) for image in images]
+    if mask is not None and labels is not None:
+        warn_of_absent("", labels, mask.data >= INSIDE_FRACTION, "mask")
+        labels = images[0] if labels is whole else continue_image(labels, beyond)
     if labels is not None and labels.data.max() == BACKGROUND_LABEL:
         where = "" if mask is None else " in the meshed region"
         raise InputError(
@@ -458,7 +459,9 @@ def undivide_voxels(what: Content, values: NDArray) -> NDArray:
 
 def plain(image: Image | Content) -> Content:
     """Content of a single image; a content is returned unchanged; TypeError for anything else."""
-    return image if isinstance(image, Content) else Content(check_image("image", image))
+    if isinstance(image, Content):
+        return image
+    return Content(continue_image(check_image("image", image), None))
 
 
 def own_image(image: Image | Content) -> Image:
@@ -507,15 +510,37 @@ def continue_image(image: Image, mask: Image | Continuation | None) -> Image:
     represent the inside.
 
     Only the voxels around the mask are kept. Without a mask the image is returned unchanged.
+
+    Raises
+    ------
+    InputError
+        A voxel within the mask has no value.
     """
     if mask is None:
+        check_values(image)
         return image
     beyond = continuation(mask, image.spacing) if isinstance(mask, Image) else mask
     part = _part(image, beyond.part)
+    check_values(part, beyond.inside, [each.start for each in beyond.part])
     data, affine = part.data.copy(), part.affine
     del part  # a copy, too
     data[~beyond.inside] = data.ravel()[beyond.nearest]
     return Image(data, affine)
+
+
+def check_values(
+    image: Image, inside: Bools | bool = True, start: Sequence[int] | None = None
+) -> None:
+    """Raise InputError for a voxel without a value (NaN), of those that count; indices are from
+    `start`, that of the first voxel.
+    """
+    if image.has_gaps and len(gaps := np.argwhere(np.isnan(image.data) & inside)):
+        index = (gaps[0] + (0 if start is None else start)).tolist()
+        place = ", ".join(f"{x:.5g}" for x in image.to_world(gaps[0]))
+        raise InputError(
+            f"image: {len(gaps)} voxels that count have no value (NaN), the first at index "
+            f"{index}, ({place}) mm; pass a `mask` without them, or fill them in"
+        )
 
 
 def _part(image: Image, part: tuple[slice, ...]) -> Image:

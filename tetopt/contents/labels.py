@@ -84,15 +84,16 @@ BACKGROUND_COLOUR = "#e6e6e6"  # of that label
 
 
 def check_labels(name: str, labels: Image, *, is_map: bool = False) -> Image:
-    """Return labels as whole numbers from 0 to `LARGEST_LABEL`; round values within 1e-3 of these,
-    with a warning.
+    """Return labels as whole numbers from 0 to `LARGEST_LABEL`, 0 for NaN; round values within 1e-3
+    of these, with a warning.
 
     Raises
     ------
     InputError
         Other values; with `is_map`, also the values of a grey image.
     """
-    data = check_image(name, labels).data
+    labels = check_image(name, labels).with_zeros()
+    data = labels.data
     whole = np.rint(data)
     is_off = whole != data
     # in 32 bits, not exact without 1

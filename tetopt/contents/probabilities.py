@@ -49,6 +49,7 @@ def resample_tissue(tissue: Image, image: Image, name: str = "tissue") -> Image:
     >>> tetopt.resample_tissue(ball, image).shape
     (16, 16, 16)
     """
+    tissue = tissue.with_zeros()
     low, high = tissue.range
     if PERCENT_SCALE < high <= BYTE_SCALE and low >= 0.0 and tissue.is_whole:
         warn(f"{name}: whole numbers up to {high:g} are read as probabilities times 255")
@@ -94,7 +95,7 @@ def tissue_labels(tissues: Sequence[Image]) -> Image:
                 f"{name}: expected the voxels of the first; see tetopt.resample_tissue"
             )
         _check_range(name, tissue)
-        fraction = np.clip(tissue.data, 0.0, 1.0)
+        fraction = np.clip(tissue.with_zeros().data, 0.0, 1.0)
         total += fraction
         labels[fraction > largest] = number
         np.maximum(largest, fraction, out=largest, casting="unsafe")

@@ -33,7 +33,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.contents.content import Content
+from tetopt.contents.content import Content, check_values, continue_image
 from tetopt.errors import InputError
 from tetopt.geometry.topology import Facets, facets
 from tetopt.geometry.vectors import cross, difference, dot, row
@@ -130,6 +130,7 @@ def cell_moments(image: Image, mesh: Mesh) -> CellMoments:
     >>> float(moments.mean.min()), float(moments.mean.max())
     (20.0, 100.0)
     """
+    image = continue_image(image, mask_of_values(image, mesh))
     return _moments(image, mesh, _sample_cells(image, mesh))
 
 
@@ -137,6 +138,7 @@ def cell_moments_and_ranges(image: Image, mesh: Mesh) -> tuple[CellMoments, tupl
     """`cell_moments`, and the least and greatest intensity in each cell, (M,) each; in a cell
     without voxel centre the nearest voxel's.
     """
+    image = continue_image(image, mask_of_values(image, mesh))
     sampled = _sample_cells(image, mesh)
     return _moments(image, mesh, sampled), _ranges(image, mesh, sampled)
 
@@ -214,6 +216,20 @@ def cell_of_voxel(image: Image, mesh: Mesh) -> Ints:
     (16, 16, 16)
     """
     return _visit_voxels(mesh, _place_cells(image, mesh)).owner.reshape(image.shape)
+
+
+def mask_of_values(image: Image, mesh: Mesh) -> Image | None:
+    """Return a mask of the voxels with values; None if all have one.
+
+    Raises
+    ------
+    InputError
+        A voxel in a cell has no value; as for `cell_moments`.
+    """
+    if not image.has_gaps:
+        return None
+    check_values(image, cell_of_voxel(image, mesh) >= 0)
+    return Image(~np.isnan(image.data), image.affine)
 
 
 class Overlap(NamedTuple):

@@ -19,13 +19,15 @@ import nibabel
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.contents.padding import replace_padding
 from tetopt.errors import InputError, Remark, prefix_errors, warn
 from tetopt.image import Image
 from tetopt.io.nifti import NIFTI
-from tetopt.io.read_dicom import DICOM
+from tetopt.io.other_images import ARRAYS, GRIDS, LEGACY, VTI
+from tetopt.io.read_dicom import DICOM, dicom_files
 from tetopt.io.read_itk import ITK
-from tetopt.io.stacks import PICTURES, SLICES, check_spacing
-from tetopt.io.volumes import Reader, Request, collect_notes, one_line, plane_affine
+from tetopt.io.stacks import PICTURES, SLICES, check_spacing, slice_files
+from tetopt.io.volumes import Reader, Request, collect_notes, note, one_line, plane_affine
 from tetopt.io.zarr_images import (
     METADATA_FILES,
     ZARR,
@@ -40,7 +42,8 @@ from tetopt.system.incoming import irregular
 Bounds = Sequence[tuple[int | None, int | None]]
 """One half-open (start, stop) range of voxel indices per axis; None means an open end."""
 
-OUTPUT_SUFFIXES = (".nii", ".nii.gz")
+OUTPUT_SUFFIXES = (".nii", ".nii.gz", ".mgz", ".nrrd")
+NRRD_TYPES = {"u1": "uint8", "i2": "int16", "i4": "int32", "f4": "float"}  # others are double
 
 GZIP_LEVEL = 1  # nibabel's compression level
 MOST_OF_NIFTI_1 = 32767  # voxels along an axis, of 16 bits; NIfTI-2 allows more
@@ -73,7 +76,8 @@ def load_image(
     coordinates are converted to RAS. The slices of a DICOM series, and the frames of a DICOM file,
     are sorted and placed by their own positions, so that the shear of a tilted gantry is kept; each
     is rescaled as it states. A DICOM segmentation gives the numbers of its segments, 0 elsewhere,
-    in slices from its first to its last frame. A picture has 1 mm pixels, index (row, column),
+    in slices from its first to its last frame. Padding of CT gets the value of the air beside it,
+    with a warning (`tetopt.contents.padding`). A picture has 1 mm pixels, index (row, column),
     world x to the right and y up, and y = 0 at the centres of its bottom row.
 
     Parameters
@@ -108,8 +112,8 @@ def load_image(
         or have units that are not lengths; codecs are unknown; chunks without a fill value are
         missing, or all chunks; a stack states no voxel size, or another than `spacing_mm`; slices
         are missing or differ; there are several volumes and no `volume`, or it is out of range;
-        `slice_` or `crop` is invalid; values are RGB, complex, NaN or infinite; an axis is empty;
-        the affine is singular.
+        `slice_` or `crop` is invalid; values are RGB, complex, infinite or all NaN; an axis is
+        empty; the affine is singular.
 
     Warns
     -----
@@ -141,6 +145,8 @@ def load_image(
         parts = (slice_, crop) if is_part else (None, None)
         request = Request(volume, spacing_mm, lambda shape: _box_of(shape, *parts))
         data, affine = reader.read(path, request)
+        data, words = replace_padding(data)
+        note(words)
         if reader.has_spacing:
             check_spacing(spacing_mm, np.linalg.norm(affine[:-1, :-1], axis=0))
         image = Image(data, affine)
@@ -148,8 +154,8 @@ def load_image(
             image = part_of(image, slice_, crop)
         elif slice_ is not None:
             image = image_slice(image, slice_[0], 0)
-    for note in notes:
-        warn(f"{path}: {note}")
+    for words in notes:
+        warn(f"{path}: {words}")
     low = image.data.min()
     if low == image.data.max():
         warn(f"{path}: the image is {low:g} everywhere, so E_D is 0 everywhere", Remark)
@@ -198,7 +204,8 @@ def _sides_words(sides: Sequence[int]) -> str:
 
 
 def save_image(path: str | Path, image: Image) -> None:
-    """Write NIfTI, with the full affine as sform, or OME-Zarr, in mm, whole or not at all.
+    """Write NIfTI, with the full affine as sform, MGZ, NRRD or OME-Zarr, in mm, whole or not at
+    all.
 
     Whole numbers are stored as 8-, 16- or 32-bit integers if they fit, others as float32 or
     float64. An axis with more voxels than NIfTI-1 supports makes it a NIfTI-2 file.
@@ -210,14 +217,14 @@ def save_image(path: str | Path, image: Image) -> None:
     Parameters
     ----------
     path : str or Path
-        Its name ends in .nii, .nii.gz or .zarr.
+        Its name ends in .nii, .nii.gz, .mgz, .nrrd or .zarr.
     image : Image
-        Two- or three-dimensional.
+        Two- or three-dimensional; for MGZ (in single precision), NRRD and Zarr 3-D.
 
     Raises
     ------
     InputError
-        The name has another suffix; the reasons of `save_zarr`.
+        The name has another suffix; a 2-D image not as NIfTI; the reasons of `save_zarr`.
     OSError
         For the reasons of `tetopt.system.files.save_bytes`.
 
@@ -236,11 +243,22 @@ def save_image(path: str | Path, image: Image) -> None:
 
 
 def save_voxels(path: Path, values: NDArray, image: Image) -> None:
-    """Write the values (*shape) or vectors (*shape, K) of an image's voxels as NIfTI, like
-    `save_image`, NaN included.
+    """Write the values (*shape) or vectors (*shape, K) of an image's voxels like `save_image`, NaN
+    included.
 
-    Vectors are along the fifth axis, with the intent "vector".
+    Vectors are along the fifth axis of NIfTI, with the intent "vector", the fourth of MGZ, and the
+    first of NRRD.
     """
+    suffix = path.suffix.lower()
+    if suffix in (".mgz", ".nrrd") and image.ndim == 2:
+        raise InputError(f"{path}: expected .nii or .nii.gz for a 2-D image")
+    if suffix == ".nrrd":
+        save_bytes(path, _nrrd_bytes(values, image))
+        return
+    if suffix == ".mgz":
+        kept = values if values.dtype in (np.uint8, np.int16, np.int32) else np.float32(values)
+        save_bytes(path, _pack(nibabel.MGHImage(kept, image.affine).to_bytes()))
+        return
     n = image.ndim
     affine = np.eye(4)
     is_vector = values.ndim > image.ndim
@@ -253,12 +271,32 @@ def save_voxels(path: Path, values: NDArray, image: Image) -> None:
     if is_vector:
         file.header.set_intent("vector")
     whole = file.to_bytes()
-    if path.suffix.lower() == ".gz":
-        packed = io.BytesIO()
-        with gzip.GzipFile("", "wb", GZIP_LEVEL, packed, mtime=0) as stream:
-            stream.write(whole)
-        whole = packed.getvalue()
-    save_bytes(path, whole)
+    save_bytes(path, _pack(whole) if suffix == ".gz" else whole)
+
+
+def _pack(whole: bytes) -> bytes:
+    packed = io.BytesIO()
+    with gzip.GzipFile("", "wb", GZIP_LEVEL, packed, mtime=0) as stream:
+        stream.write(whole)
+    return packed.getvalue()
+
+
+def _nrrd_bytes(values: NDArray, image: Image) -> bytes:
+    """Return an NRRD file of a volume, in LPS, which all its readers know."""
+    affine = np.diag([-1.0, -1.0, 1.0, 1.0]) @ image.affine
+    *steps, origin = (f"({','.join(map(repr, each))})" for each in affine[:3].T.tolist())
+    kinds = "domain domain domain"
+    if values.ndim > 3:
+        values, kinds = np.moveaxis(values, -1, 0), f"vector {kinds}"
+        steps.insert(0, "none")
+    kind = NRRD_TYPES.get(values.dtype.str[1:], "double")
+    data = values.astype(values.dtype.newbyteorder("<") if kind != "double" else "<f8")
+    head = (
+        f"NRRD0004\ntype: {kind}\ndimension: {values.ndim}\nspace: left-posterior-superior\n"
+        f"sizes: {' '.join(map(str, values.shape))}\nspace directions: {' '.join(steps)}\n"
+        f"kinds: {kinds}\nendian: little\nencoding: gzip\nspace origin: {origin}\n\n"
+    )
+    return head.encode() + _pack(data.tobytes(order="F"))
 
 
 def _for_file(data: NDArray[np.floating]) -> NDArray:
@@ -458,12 +496,15 @@ def image_files(path: Path) -> dict[str, Path]:
     if is_zarr(path):
         return _zarr_files(path)
     _check_regular(path, (None, "a folder"))
-    # A DICOM series is read from the folder itself, not from its subfolders; so is its checksum.
-    files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
+    files = [path]
+    if path.is_dir():  # a DICOM series is in the folder itself or, without any, in subfolders
+        is_here = next(dicom_files(path), None) or slice_files(path)
+        files = sorted(p for p in (path.iterdir() if is_here else path.rglob("*")) if p.is_file())
     with contextlib.suppress(InputError):  # an unreadable header has no other files
         for reader in _named_readers(path):
             files += reader.other_files(path)
-    return {file.name: file for file in files}
+    where = path if path.is_dir() else path.parent
+    return {file.relative_to(where).as_posix(): file for file in files}
 
 
 def _check_regular(path: Path, kinds: Sequence[str | None] = (None,)) -> None:
@@ -504,7 +545,12 @@ def _raise_error(error: OSError) -> None:
 
 # Choice of the reader
 
-READERS = (NIFTI, ITK, ZARR, SLICES, DICOM, PICTURES)  # of folders, the first that recognises it
+CONVERTERS = (  # of some formats that are not read
+    "mrconvert (.mif), dcm2niix (.par), Fiji (.czi, .lif, .nd2: OME-TIFF), numpy (.mat, .h5: "
+    ".npy), or 3D Slicer"
+)
+READERS = (NIFTI, ITK, ZARR, GRIDS, LEGACY, VTI, ARRAYS, SLICES, DICOM, PICTURES)
+# of folders, the first that recognises it
 
 
 def reader_of(path: Path) -> Reader:
@@ -523,7 +569,8 @@ def reader_of(path: Path) -> Reader:
             return reader
         known = ", ".join(suffix for reader in READERS for suffix in reader.suffixes)
         raise InputError(
-            f"unknown image format; expected {known}, or a folder of DICOM files or of slices"
+            f"unknown image format; expected {known}, or a folder of DICOM files or of slices; "
+            f"convert it, for example with {CONVERTERS}"
         )
 
 

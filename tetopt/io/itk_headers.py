@@ -66,7 +66,8 @@ METAIMAGE_NAMES = Names(
 )
 
 
-SPACE_KINDS = ("domain", "space", "???", "none")  # of NRRD's axes; others are components or time
+SPACE_KINDS = ("domain", "space", "???", "none")  # of NRRD's axes
+LIST_KINDS = (*SPACE_KINDS, "list", "time")  # of an axis of volumes; others are components
 
 
 class VoxelHeader(NamedTuple):
@@ -144,16 +145,38 @@ def header_sizes(path: Path) -> tuple[int, ...]:
     InputError for the reasons of `check_header` in the header.
     """
     header = read_header(path)
-    fields = header.fields
+    others = other_axes(header)
+    return tuple(header.sizes[k] for k in sorted(range(len(header.sizes)), key=others.__contains__))
+
+
+def other_axes(header: VoxelHeader) -> dict[int, str]:
+    """Return the axes that are none of space, with their kinds in NRRD, as far as stated."""
     n_axes = len(header.sizes)
-    kinds = fields.get("kinds", "").lower().split()
-    directions = re.findall(r"none|\(", fields.get("spacedirections", "").lower())
-    is_other = [
-        (len(kinds) == n_axes and kinds[k] not in SPACE_KINDS)
-        or (len(directions) == n_axes and directions[k] == "none")
-        for k in range(n_axes)
+    kinds = header.fields.get("kinds", "").lower().split()
+    directions = re.findall(r"none|\(", header.fields.get("spacedirections", "").lower())
+    kinds = kinds if len(kinds) == n_axes else ["???"] * n_axes
+    directions = directions if len(directions) == n_axes else [""] * n_axes
+    return {
+        k: kinds[k] for k in range(n_axes) if kinds[k] not in SPACE_KINDS or directions[k] == "none"
+    }
+
+
+def list_header(path: Path, header: VoxelHeader, axis: int) -> str:
+    """Return an NRRD header for the same voxels in which an axis is a list, which ITK reads as
+    components, wherever it is.
+    """
+    with path.open("rb") as stream:
+        head = stream.read(header.n_bytes).decode("latin-1")
+    lines = [
+        line
+        for line in head.splitlines()
+        if line and line.partition(":")[0].lower().replace(" ", "") not in ("kinds", "datafile")
     ]
-    return tuple(header.sizes[k] for k in sorted(range(n_axes), key=is_other.__getitem__))
+    if not header.files:
+        lines.append(f"line skip: {head.count(chr(10))}")
+    (file,) = header.files or [path]
+    kinds = ("list" if k == axis else "domain" for k in range(len(header.sizes)))
+    return "\n".join([*lines, f"kinds: {' '.join(kinds)}", f"data file: {file.absolute()}", "", ""])
 
 
 def read_header(path: Path) -> VoxelHeader:

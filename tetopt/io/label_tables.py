@@ -119,7 +119,7 @@ def load_label_table(path: str | Path) -> LabelTable:
     if (table := own_label_table(path)).names:
         return table
     if path.name.lower().endswith((*NRRD_SUFFIXES, *NIFTI.suffixes)) or dicom_file(path):
-        raise InputError(f"{path}: expected names of labels or segments in its header, found none")
+        raise InputError(f"{path}: expected names of segments in this file, found none")
     text = text_of(path, "table of labels' names")
     parse = {"<": _of_xml, "{": _of_json}.get(text.lstrip()[:1], _of_text)
     table = _table_of(path, parse(path, text))

@@ -26,6 +26,7 @@ from nibabel.freesurfer.mghformat import MGHError, MGHHeader
 from nibabel.nifti1 import Nifti1PairHeader
 from nibabel.nifti2 import Nifti2PairHeader
 from nibabel.spatialimages import HeaderDataError
+from nibabel.spm99analyze import Spm99AnalyzeHeader
 from nibabel.wrapstruct import WrapStructError
 from numpy.typing import NDArray
 
@@ -52,10 +53,6 @@ from tetopt.system.arrays import Floats, Shape
 from tetopt.system.incoming import irregular
 
 NIFTI_HEAD_BYTES = 1024  # read from a file: the longest header has 540
-ANALYZE_BYTES = (
-    b"\x5c\x01\0\0",
-    b"\0\0\x01\x5c",
-)  # 348, the length of an Analyze header, at its start
 EXTENSION_BYTES = 2**26  # 67 MB before the voxels: a NIfTI file's extensions are texts
 PLANES_BYTES = 2**28  # of a file, read at a time for a crop of it
 MGH_FLAG = slice(28, 30)  # the bytes of an MGH header that are 0 if it has no sizes and directions
@@ -65,7 +62,7 @@ CARET = re.compile(rb"<CaretExtension.*?</CaretExtension>", re.DOTALL)  # names 
 PAIR = re.compile(r"(.*)\.(hdr|img)(\.gz)?", re.IGNORECASE | re.DOTALL)
 HEADER_KINDS: dict[str, tuple[Any, ...]] = {
     ".nii": (nibabel.Nifti1Header, nibabel.Nifti2Header),
-    ".hdr": (Nifti1PairHeader, Nifti2PairHeader),
+    ".hdr": (Nifti1PairHeader, Nifti2PairHeader, Spm99AnalyzeHeader),
     ".mgh": (MGHHeader,),
     ".mgz": (MGHHeader,),
 }
@@ -106,7 +103,7 @@ def label_text(path: Path) -> str:
     """
     file, other = _files_of(path)
     header, _ = _header_of(file)
-    if isinstance(header, MGHHeader):
+    if not isinstance(header, nibabel.Nifti1Header):
         return ""
     size = EXTENSION_BYTES if file != other else int(header["vox_offset"])
     match = CARET.search(_begin_of(file, size))
@@ -204,18 +201,17 @@ def _header_of(path: Path) -> tuple[Any, bytes]:
                 continue
             # Extensions are not read: only their length matters.
             header = kind.from_fileobj(io.BytesIO(head[: kind.template_dtype.itemsize]))
-            if kind is not MGHHeader:
+            if isinstance(header, nibabel.Nifti1Header):
                 _check_nifti(header)
+            elif kind is not MGHHeader and path.with_suffix(".mat").exists():
+                raise InputError(
+                    "an Analyze image whose place is in a .mat file; convert it to NIfTI with SPM"
+                )
             return header, head
     except InputError:
         raise
     except HEADER_ERRORS as error:
         raise InputError(f"{UNREADABLE_FILE} ({one_line(error)})") from error
-    if suffix == ".hdr" and head.startswith(ANALYZE_BYTES):
-        raise InputError(
-            "an Analyze 7.5 image, whose format does not tell left from right; convert it to "
-            "NIfTI with a program that knows its orientation"
-        )
     raise InputError(UNREADABLE_FILE)
 
 
@@ -230,8 +226,13 @@ def _check_nifti(header: Any) -> None:
 
 def _note_place(header: Any, shape: Shape, head: bytes) -> None:
     """Note a header without orientation, which nibabel guesses, or with two."""
-    if isinstance(header, MGHHeader):
-        if not any(head[MGH_FLAG]):
+    if not isinstance(header, nibabel.Nifti1Header):
+        if not isinstance(header, MGHHeader):
+            note(
+                "an Analyze image, whose format does not tell left from right: assuming x to the "
+                "left, as nibabel does; if it matters, convert it to NIfTI"
+            )
+        elif not any(head[MGH_FLAG]):
             note(
                 "has no orientation: its voxel sizes (1 mm), position and left/right are "
                 "nibabel's guess"
@@ -247,7 +248,7 @@ def _note_place(header: Any, shape: Shape, head: bytes) -> None:
 
 def _units(header: Any) -> Floats | None:
     """Return the length of the file's unit, mm, for each axis; None if it states none."""
-    if isinstance(header, MGHHeader):
+    if not isinstance(header, nibabel.Nifti1Header):
         return None
     try:
         unit = header.get_xyzt_units()[0]

@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.contents.padding import replace_padding
 from tetopt.errors import InputError
 from tetopt.io.apart import read_apart
 from tetopt.io.text import count_text, plain
@@ -171,7 +172,8 @@ def _read(read: Callable[..., Any], path: Path, *rest: Any) -> Any:
                 raise InputError(
                     f"{file.name} is {other}; move it out of the folder of DICOM files"
                 )
-        size = sum(file.stat().st_size for file in files if file.is_file())
+        tree = (Path(name, file) for name, _, names in _walk(path) for file in names)
+        size = sum(file.stat().st_size for file in tree if file.is_file())
     return read_apart(read, path, *rest, size=size, library="pydicom")
 
 
@@ -277,7 +279,7 @@ def _series(path: Path) -> list[DicomFile]:
         return [file]
     series: dict[str, list[DicomFile]] = {}
     skipped = list[str]()
-    for each in dicom_files(path):
+    for each in list(dicom_files(path)) or _files_below(path):
         if each.name.upper() == "DICOMDIR":
             continue
         if (file := _open_dicom(each, f"the DICOM file {each.name}")) is None:
@@ -307,10 +309,26 @@ def _series(path: Path) -> list[DicomFile]:
     return next(iter(series.values()))
 
 
-def _dicom_folders(path: Path) -> Iterator[tuple[Path, int]]:
-    """Yield subfolders that contain DICOM files, within limits, with their numbers of files."""
+def _files_below(path: Path) -> list[Path]:
+    """Return the DICOM files in subfolders, if the first of each is of one series."""
+    import pydicom
+
+    parts = [list(dicom_files(folder)) for folder, _ in _dicom_folders(path)]
+    with _errors_of("a file in a subfolder"):
+        heads = [pydicom.dcmread(part[0], force=True, stop_before_pixels=True) for part in parts]
+    is_one = len({str(head.get("SeriesInstanceUID", "")) for head in heads}) == 1
+    return [file for part in parts for file in part] if is_one else []
+
+
+def _walk(path: Path) -> Iterator[tuple[str, list[str], list[str]]]:
     for name, folders, files in islice(os.walk(path), WALKED_FOLDERS):
         folders.sort()  # the order in which the walk continues
+        yield name, folders, files
+
+
+def _dicom_folders(path: Path) -> Iterator[tuple[Path, int]]:
+    """Yield subfolders that contain DICOM files, within limits, with their numbers of files."""
+    for name, _, files in _walk(path):
         first = [Path(name, file) for file in sorted(files)[:TRIED_FILES]]
         if any(file.is_file() and is_dicom(file) for file in first):
             yield Path(name), len(files)
@@ -881,11 +899,20 @@ def _rescale_frames(frames: list[Frame], slices: Ints, shape: tuple[int, int, in
         note("its values are as stored: its table of values (ModalityLUTSequence) is not applied")
     bits = max(int(frame.file.tags.BitsAllocated) for frame in frames)
     data = np.empty(shape, dtype=exact_type(bits, {frame.scale for frame in frames}))
+    is_padding = np.zeros(shape, dtype=bool)
     places = iter(slices.tolist())
     for _, of_file in groupby(frames, key=lambda frame: id(frame.file)):
         those = list(of_file)
         for frame, plane in zip(those, _planes(those), strict=True):
-            data[next(places)] = plane * frame.scale[0] + frame.scale[1]
+            place = next(places)
+            data[place] = plane * frame.scale[0] + frame.scale[1]
+            if (value := frame.file.tags.get("PixelPaddingValue")) is not None:
+                ends = sorted([value, frame.file.tags.get("PixelPaddingRangeLimit", value)])
+                is_padding[place] = (plane >= ends[0]) & (plane <= ends[1])
+    if frames[0].file.tags.get("Modality") != "CT":
+        return data
+    data, words = replace_padding(data, is_padding)
+    note(words)
     return data
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 import importlib.util
 import math
 import re
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,13 @@ from tetopt.errors import InputError
 from tetopt.io.apart import read_apart
 from tetopt.io.contradictions import note_metaimage, note_nrrd, note_rest
 from tetopt.io.itk_headers import (
+    LIST_KINDS,
     NRRD_SUFFIXES,
     SPACE_KINDS,
     check_header,
     header_sizes,
+    list_header,
+    other_axes,
     read_header,
 )
 from tetopt.io.segments import labels_of_layers, segments_of
@@ -35,12 +39,12 @@ ITK_READERS = {
     ".mha": "MetaImageIO",
     ".mhd": "MetaImageIO",
 }
+OTHER_READERS = {".gipl": "GiplImageIO", ".gz": "GiplImageIO", ".vtk": "VTKImageIO"}
 
 
 def read_itk(path: Path, request: Request) -> Voxels:
     """Return data and affine of a file; InputError without a leading path."""
-    if importlib.util.find_spec("SimpleITK") is None:
-        raise InputError(f"NRRD and MetaImage need SimpleITK; {install_hint('SimpleITK')}")
+    check_itk()
     header, size = check_header(path)
     is_nrrd = path.suffix.lower() in NRRD_SUFFIXES
     if is_nrrd:
@@ -53,21 +57,37 @@ def read_itk(path: Path, request: Request) -> Voxels:
     units = [header.fields.get("DistanceUnits", "").strip("?")] * 3
     lengths = _nrrd_units(header.fields) if is_nrrd else mm_of_axes(units, "DistanceUnits")
     segments = segments_of(header.texts)
-    data, affine = read_apart(
-        _volume_of,
-        path,
-        request.volume,
-        bool(segments),
-        size=size,
-        value_bytes=header.value_bytes,
-        library="SimpleITK",
-    )
+    others = other_axes(header)
+    is_list = not segments and bool(others) and set(others.values()) <= set(LIST_KINDS)
+    if is_list and len(others) > 1:
+        raise InputError(f"expected one axis beside those of space, got {len(others)}")
+    with tempfile.TemporaryDirectory() as folder:
+        source = path
+        if is_list and (len(header.files) < 2):
+            source = Path(folder, "list.nhdr")
+            source.write_text(list_header(path, header, *others), "latin-1")
+        data, affine = read_apart(
+            volume_of,
+            source,
+            request.volume,
+            bool(segments),
+            is_list,
+            size=size,
+            value_bytes=header.value_bytes,
+            library="SimpleITK",
+        )
     if segments:
         data = labels_of_layers(data, segments)
     n = len(affine) - 1
     affine[:n] *= 1.0 if lengths is None else lengths[:n, None]
     note_size(data.shape, affine, lengths)
     return data, affine
+
+
+def check_itk() -> None:
+    """Raise InputError without SimpleITK."""
+    if importlib.util.find_spec("SimpleITK") is None:
+        raise InputError(f"its format needs SimpleITK; {install_hint('SimpleITK')}")
 
 
 ITK = Reader(
@@ -101,29 +121,32 @@ def _nrrd_units(fields: dict[str, str]) -> Floats | None:
 # In the child
 
 
-def _volume_of(path: str, volume: int | None, has_layers: bool) -> Voxels:
-    """Return data, with layers on a last axis if it has them, and affine."""
+def volume_of(path: str, volume: int | None, has_layers: bool, is_list: bool) -> Voxels:
+    """Return data, with layers on a last axis if it has them, and affine; the volumes of a list
+    are components.
+    """
     import SimpleITK as sitk
 
     try:
         reader = sitk.ImageFileReader()
         reader.SetFileName(path)
-        reader.SetImageIO(ITK_READERS[Path(path).suffix.lower()])
+        reader.SetImageIO((ITK_READERS | OTHER_READERS)[Path(path).suffix.lower()])
         reader.ReadImageInformation()
         count = reader.GetNumberOfComponents()
-        if count > 1 and not has_layers:
+        if count > 1 and not (has_layers or is_list):
             raise InputError(
                 f"expected one number per voxel, got {count} (RGB or vectors); convert it to grey "
                 "first"
             )
         size = reader.GetSize()
-        index = volume_index(size[3:], volume)
-        if index:
+        index = volume_index((count,) if is_list else size[3:], volume)
+        if index and not is_list:
             reader.SetExtractSize([*size[:3], *(0 for _ in index)])
             reader.SetExtractIndex([0, 0, 0, *index])
         data = sitk.GetArrayFromImage(reader.Execute())
-        if has_layers:  # components vary fastest
+        if has_layers or is_list:  # components vary fastest
             data = np.moveaxis(data.reshape(*size[::-1], count), -1, 0)
+            data = data[index[0]] if is_list else data
         return data.T, _ras_affine(reader)
     except RuntimeError as error:
         # The innermost cause comes last; the "Reason:" after it is an unrelated errno.

@@ -46,9 +46,11 @@ def collect_notes() -> Iterator[list[str]]:
 
 
 def note(*texts: str) -> None:
-    """Note oddities of the file that is read, each once; nothing outside `collect_notes`."""
+    """Note oddities of the file that is read, each once; nothing outside `collect_notes`, and no
+    empty texts.
+    """
     notes = _NOTES.get([])
-    notes += [text for text in texts if text not in notes]
+    notes += [text for text in texts if text and text not in notes]
 
 
 class Request(NamedTuple):

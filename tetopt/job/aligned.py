@@ -23,6 +23,7 @@ from tetopt.contents.align import (
 from tetopt.contents.domain import INSIDE_FRACTION
 from tetopt.contents.labels import check_labels
 from tetopt.contents.probabilities import resample_tissue
+from tetopt.energy.sampling import mask_of_values
 from tetopt.errors import InputError, Remark, prefix_errors
 from tetopt.image import Image
 from tetopt.io.images import load_image, parse_crop, parse_slice, part_of, reader_of
@@ -186,13 +187,16 @@ def _say_resampled(
         )
 
 
-def read_companion(path: Path, spacing_mm: str | None = None) -> Image:
+def read_companion(path: Path, spacing_mm: str | None = None, *, is_grid: bool = False) -> Image:
     """Read another file with the image, without the warning for a constant image, which sizes or a
     mask may be.
 
-    Voxel sizes are for a stack or folder of slices; files of other formats have their own.
+    Voxel sizes are for a stack or folder of slices; files of other formats have their own. Only the
+    voxels of a grid count, which are those of any volume.
     """
     file, volume = file_and_volume(path)
+    if is_grid and volume is None and reader_of(file).has_spacing:
+        volume = 0
     spacing = None
     if spacing_mm is not None and not reader_of(file).has_spacing:
         spacing = parse_spacing(spacing_mm)
@@ -205,7 +209,7 @@ def mask_for(
     options: MaskedPart | SourceOptions, image: Image, beside: Beside, loaded: MeshFile | None
 ) -> Image | None:
     """Read the mask of an image's voxels that count: the options', else the one that a mesh's file
-    was built within.
+    was built within, else of those with values.
 
     Warn if the two differ.
 
@@ -216,7 +220,9 @@ def mask_for(
     """
     if options.mask is None:
         read_mask(options)
-        return None if loaded is None else own_mask(loaded, image)
+        if loaded is None:
+            return None
+        return own_mask(loaded, image) or mask_of_values(image, loaded.mesh)
     mask = beside(options.mask, resample_mask)
     if loaded is not None and (n_other := count_of_other_voxels(loaded, mask)):
         warning(

@@ -50,8 +50,8 @@ class Option(NamedTuple):
 
 
 IMAGE_FILES = (
-    "NIfTI, MGZ, NRRD, MetaImage, OME-Zarr, a TIFF stack, a folder of slices, a DICOM "
-    "file or folder, or a 2-D picture."
+    "NIfTI, MGZ, NRRD, MetaImage, AFNI, MINC, GIPL, VTK, .npy, OME-Zarr, a TIFF stack, a folder "
+    "of slices, a DICOM file or folder, or a 2-D picture."
 )
 JsonOption = Annotated[Path | None, Option("FILE", "Write every number here.", "json")]
 ForceOption = Annotated[bool, Option(None, "Replace existing outputs.")]
@@ -85,7 +85,8 @@ class BoxPart:
     spacing_mm: Annotated[
         str | None,
         Option(
-            "MM|X,Y,Z", "Voxel sizes of TIFF stacks and folders of slices that do not state them."
+            "MM|X,Y,Z",
+            "Voxel sizes of arrays (.npy), TIFF stacks and folders of slices that state none.",
         ),
     ] = None
 
@@ -172,7 +173,7 @@ class VoxelOptions:
         str | None,
         Option(
             "NAME",
-            "Write this field of nodes or cells on an image's voxels (.nii, .nii.gz).",
+            "Write this field of nodes or cells on an image's voxels (.nii, .nii.gz, .mgz, .nrrd).",
             "field",
         ),
     ] = None

@@ -186,7 +186,7 @@ def read_source(
     if (
         labels is not None
         and is_own
-        and (numbers or (filled is not None and options.tissues is None))
+        and (numbers or image.has_gaps or (filled is not None and options.tissues is None))
     ):
         image = labels
     contrasts = [image, *(beside(path, resample_contrast) for path in paths[1:])]
@@ -410,8 +410,9 @@ def _labelling(
     if options.labels is None:
         return ReadLabels(table=table)
     labels = beside(options.labels, _align_of_labels(options, numbers))
-    is_own = is_alone and np.array_equal(labels.data, image.data)
-    labels = image if is_own else labels  # kept once
+    own = image.with_zeros()
+    is_own = is_alone and np.array_equal(labels.data, own.data)
+    labels = own if is_own else labels  # kept once
     return ReadLabels(*_merge_labels(labels, table, options, numbers), is_own=is_own)
 
 

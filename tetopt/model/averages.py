@@ -18,7 +18,14 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from tetopt.energy.sampling import cell_of_voxel, nearest_values, nearest_voxels, ranges_of
+from tetopt.contents.content import continue_image
+from tetopt.energy.sampling import (
+    cell_of_voxel,
+    mask_of_values,
+    nearest_values,
+    nearest_voxels,
+    ranges_of,
+)
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import gauss_rule
 from tetopt.geometry.simplex import centroids, volume_gradients, volumes
@@ -248,6 +255,7 @@ def _see_voxels(image: Image, mesh: Mesh) -> tuple[Image, Ints]:
     without voxels. All other voxels get the value of a used one, because a mapping need not be
     defined for the air around an organ.
     """
+    image = continue_image(image, mask_of_values(image, mesh))
     owner = cell_of_voxel(image, mesh).ravel()
     is_seen = owner >= 0
     if is_seen.all():

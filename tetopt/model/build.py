@@ -7,13 +7,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tetopt.contents.content import Content, continue_image, plain
+from tetopt.contents.content import Content, continue_image
 from tetopt.contents.domain import mask_text
+from tetopt.energy.sampling import mask_of_values
 from tetopt.engine.loop import MeshingResult
 from tetopt.errors import InputError, Note, warn
 from tetopt.geometry.check import check_place
 from tetopt.geometry.simplex import volumes
-from tetopt.image import Image
+from tetopt.image import Image, check_image
 from tetopt.measure.judge import warn_of_other_mask
 from tetopt.mesh import Mesh
 from tetopt.model.averages import (
@@ -340,7 +341,8 @@ def _voxels(
     """Return the image with the voxels that count, the whole image, and the file's strings with
     one on the mask.
     """
-    whole = None if image is None else plain(image).given
+    whole = image.given if isinstance(image, Content) else image
+    whole = None if whole is None else check_image("image", whole)
     if (
         whole is not None
         and isinstance(mesh, MeshFile)
@@ -359,8 +361,11 @@ def _voxels(
                 "mesh was built within"
             )
         return image.own, whole, {MASK_TEXT: mask_text(mask), **about}
-    within = None if whole is None or isinstance(mesh, Mesh) else own_mask(mesh, whole)
-    return (whole if whole is None else continue_image(whole, within)), whole, about
+    if whole is None:
+        return None, None, about
+    within = None if isinstance(mesh, Mesh) else own_mask(mesh, whole)
+    within = within or mask_of_values(whole, mesh if isinstance(mesh, Mesh) else mesh.mesh)
+    return continue_image(whole, within), whole, about
 
 
 def _table_of(about: Json) -> LabelTable:
