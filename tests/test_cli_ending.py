@@ -99,6 +99,27 @@ def test_a_signal_leaves_the_mesh_reached(monkeypatch, signals_not_ignored, numb
 
 
 @NEEDS_SIGNALS
+def test_after_a_signal_nothing_is_measured_that_takes_long(monkeypatch, signals_not_ignored):
+    """What is judged is there, and quality has the rest."""
+    image = sample_image(3)
+    tetopt.save_image("in/l.nii.gz", tetopt.Image(1.0 * (image.data > 30), image.affine))
+
+    @contextmanager
+    def told(*_):
+        yield lambda row: signal.raise_signal(signal.SIGTERM) if row.iteration == 1 else None
+
+    monkeypatch.setattr(tetopt.cli.run, "_bar", told)
+    said = run_command(f"{MESH} --labels in/l.nii.gz --iterations 200", code=143).err
+    assert "tetopt quality" in " ".join(said.split())
+    numbers = numbers_in("out/a.json")
+    assert numbers["ended"] == "stopped"
+    assert not {"interfaces", "contacts", "mask", "thickness"} & set(numbers)
+    assert all(row["voxels"] and row["n_cells"] for row in numbers["labels"])
+    run_command("quality out/a.vtu --image in/a.nii.gz --labels in/l.nii.gz --json q.json", code=None)
+    assert "interfaces" in numbers_in("q.json")
+
+
+@NEEDS_SIGNALS
 def test_a_signal_while_the_mesh_is_written_waits_for_it(monkeypatch):
     interrupt = partial(signal.raise_signal, signal.SIGTERM)
     before(tetopt.job.write, "save_for_solver", interrupt, monkeypatch)

@@ -272,7 +272,8 @@ def follow_course(
     has_labels = run.content.memberships is not None and run.state.objective.image > 0.0
     for iteration in range(course.first, course.last + 1):
         before = run.state.complex.ticks.copy()
-        is_labelled = has_labels and gives_labels(iteration, course)
+        # not of a run that ends here, whose mesh is first kept
+        is_labelled = has_labels and gives_labels(iteration, course) and not is_over()
         if is_labelled:
             run.give_labels()
         stars = attract_nodes(run, course, iteration)

@@ -14,7 +14,7 @@ from tetopt.contents.content import continue_image
 from tetopt.engine.label_state import crowded_nodes
 from tetopt.engine.loop import MeshingResult
 from tetopt.errors import Note, warn
-from tetopt.job.events import warnings_heard
+from tetopt.job.events import note, warnings_heard
 from tetopt.job.options import SolverOptions
 from tetopt.job.plan import nodes_of_targets, stated_options
 from tetopt.job.solver_files import (
@@ -150,18 +150,25 @@ def _measured_fields(source: Source, result: MeshingResult, failed: dict[str, st
 
 
 def measures_of(task: Task, result: MeshingResult, model: Model, failed: dict[str, str]) -> Json:
-    """Measure the fit to mask, labels, contrasts and sizes."""
+    """Measure the fit to mask, labels, contrasts and sizes; of a stopped run, whose process may
+    be ended soon, what takes seconds.
+    """
     return_freed()  # by writing the mesh
     source = task.source
-    measured = fidelity(
-        source.labels,
-        source.mask,
-        result.mesh,
-        model.cell_data.get(LABEL_FIELD),
-        failed,
-        source.content,
-        result.extents,
-    )
+    if result.ended == "stopped":
+        measured: Json = {"labels": list(result.extents)} if result.extents else {}
+        if source.labels is not None or source.mask is not None:
+            note("stopped: surfaces, distances and thickness are left to tetopt quality")
+    else:
+        measured = fidelity(
+            source.labels,
+            source.mask,
+            result.mesh,
+            model.cell_data.get(LABEL_FIELD),
+            failed,
+            source.content,
+            result.extents,
+        )
     if (table := _table_of(source)) is not None and table.names:
         measured["label_names"] = table.names
     counted = measure_each(_counts(task, result, model), failed)
