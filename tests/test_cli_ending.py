@@ -115,7 +115,9 @@ def test_after_a_signal_nothing_is_measured_that_takes_long(monkeypatch, signals
     assert numbers["ended"] == "stopped"
     assert not {"interfaces", "contacts", "mask", "thickness"} & set(numbers)
     assert all(row["voxels"] and row["n_cells"] for row in numbers["labels"])
-    run_command("quality out/a.vtu --image in/a.nii.gz --labels in/l.nii.gz --json q.json", code=None)
+    run_command(
+        "quality out/a.vtu --image in/a.nii.gz --labels in/l.nii.gz --json q.json", code=None
+    )
     assert "interfaces" in numbers_in("q.json")
 
 
