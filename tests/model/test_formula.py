@@ -96,7 +96,13 @@ def test_refuses(text):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"), [("2*HU", "write h "), ("h^2", r"write \*\* "), ("h < 2", "where")]
+    ("text", "said"),
+    [
+        ("2*HU", "write h "),
+        ("h^2", r"write \*\* "),
+        ("2*HU^3", r"write h .*write \*\* "),
+        ("h < 2", "where"),
+    ],
 )
 def test_other_programs_words_are_named(text, said):
     with refusal(said):

@@ -106,17 +106,15 @@ def _formula_text(text: str) -> str:
     return line if len(line) <= 60 else f"{line[:57]}..."
 
 
-def _hint(node: ast.expr) -> str:
+def _hints(node: ast.expr) -> str:
     """Return how to write what other programs write otherwise, for the end of a message."""
-    match node:
-        case ast.Name():
-            return "; write h for the intensity"
-        case ast.BinOp(op=ast.BitXor()):
-            return "; write ** for powers"
-        case ast.Compare() | ast.BoolOp():
-            return "; a comparison is a condition of where(h < 1.2, 2*h, 3*h)"
-        case _:
-            return ""
+    inside = list(ast.walk(node))
+    names = {each.id for each in inside if isinstance(each, ast.Name)} - {"h", *FORMULA_FUNCTIONS}
+    hints = ["; write h for the intensity"] if names else []
+    hints += ["; write ** for powers"] * any(isinstance(each, ast.BitXor) for each in inside)
+    if isinstance(node, ast.Compare | ast.BoolOp):
+        hints.append("; a comparison is a condition of where(h < 1.2, 2*h, 3*h)")
+    return "".join(hints)
 
 
 def _compile_node(node: ast.expr, text: str, depth: int) -> Callable[[Floats], Any]:
@@ -162,7 +160,7 @@ def _compile_node(node: ast.expr, text: str, depth: int) -> Callable[[Floats], A
             part = ast.get_source_segment(text.strip(), node) or text
             raise InputError(
                 f'formula: expected {FORMULA_PARTS}; cannot use "{_formula_text(part)}"'
-                f"{_hint(node)}"
+                f"{_hints(node)}"
             )
     values = [_compile_node(operand, text, depth + 1) for operand in operands]
     return lambda h: function(*(value(h) for value in values))
