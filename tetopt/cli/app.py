@@ -51,79 +51,18 @@ COMMANDS = {
 ASIDE = ("demo", "phantom", "warm-up")  # below the commands on a user's own files
 ASIDE_PANEL = "To try, and to prepare"
 
-# of runs, those that most need
-RUN_OPTIONS = (
-    "mask",
-    "mask_label",
-    "background",
-    "labels",
-    "merge",
-    "label_names",
-    "nodes",
-    "target_error",
-    "edge_size",
-    "cells_across",
-    "order",
-    "young",
-    "nu",
-    "loads",
-    "max_seconds",
-    "threads",
-)
 # The options that the help of a command with many shows; `--help-all` shows all.
+OF_RUNS = (
+    "mask mask_label background labels merge label_names nodes target_error edge_size cells_across "
+    "order young nu loads max_seconds threads"
+)
+OF_MESHES = "image_path labels label_field label_names mesh_units young nu density sets loads order"
 SHOWN_OPTIONS = {
-    "mesh": ("output", "json_path", "figures", "force", "dry_run", *RUN_OPTIONS),
-    "cohort": (
-        "output",
-        "suffix",
-        "participants",
-        "mesh_format",
-        "write_table",
-        "dry_run",
-        "retry_failed",
-        "workers",
-        "scheduler",
-        *RUN_OPTIONS,
-    ),
-    "convert": (
-        "image_path",
-        "results_path",
-        "labels",
-        "label_field",
-        "label_names",
-        "mesh_units",
-        "young",
-        "nu",
-        "density",
-        "sets",
-        "loads",
-        "order",
-        "units",
-        "space",
-        "field_name",
-        "like",
-        "warp",
-        "json_path",
-        "force",
-    ),
-    "fem": (
-        "image_path",
-        "compress",
-        "output",
-        "young",
-        "nu",
-        "density",
-        "sets",
-        "loads",
-        "order",
-        "mask",
-        "labels",
-        "label_field",
-        "label_names",
-        "mesh_units",
-        "json_path",
-        "force",
-    ),
+    "mesh": f"output json_path figures force dry_run {OF_RUNS}".split(),
+    "cohort": f"output suffix participants mesh_format write_table dry_run retry_failed workers "
+    f"scheduler {OF_RUNS}".split(),
+    "convert": f"results_path units space field_name like warp json_path force {OF_MESHES}".split(),
+    "fem": f"compress output mask json_path force {OF_MESHES}".split(),
 }
 HELP_ALL = "--help-all"
 # new objects, and collections of a generation; Python's own are 700, 10, 10
