@@ -24,7 +24,7 @@ from tetopt.errors import InputError, Remark, prefix_errors, warn
 from tetopt.image import Image
 from tetopt.io.nifti import NIFTI
 from tetopt.io.other_images import ARRAYS, GRIDS, LEGACY, VTI
-from tetopt.io.read_dicom import DICOM, dicom_files
+from tetopt.io.read_dicom import DICOM, is_dicom
 from tetopt.io.read_itk import ITK
 from tetopt.io.stacks import PICTURES, SLICES, check_spacing, slice_files
 from tetopt.io.volumes import Reader, Request, collect_notes, note, one_line, plane_affine
@@ -145,11 +145,13 @@ def load_image(
         parts = (slice_, crop) if is_part else (None, None)
         request = Request(volume, spacing_mm, lambda shape: _box_of(shape, *parts))
         data, affine = reader.read(path, request)
-        data, words = replace_padding(data)
-        note(words)
         if reader.has_spacing:
             check_spacing(spacing_mm, np.linalg.norm(affine[:-1, :-1], axis=0))
         image = Image(data, affine)
+        data, words = replace_padding(image.data)
+        if words:
+            note(words)
+            image = Image(data, affine)
         if not is_part:
             image = part_of(image, slice_, crop)
         elif slice_ is not None:
@@ -498,8 +500,10 @@ def image_files(path: Path) -> dict[str, Path]:
     _check_regular(path, (None, "a folder"))
     files = [path]
     if path.is_dir():  # a DICOM series is in the folder itself or, without any, in subfolders
-        is_here = next(dicom_files(path), None) or slice_files(path)
-        files = sorted(p for p in (path.iterdir() if is_here else path.rglob("*")) if p.is_file())
+        files = sorted(p for p in path.iterdir() if p.is_file())
+        if not (slice_files(path) or any(map(is_dicom, files))):
+            below = sorted(p for p in path.rglob("*") if p.parent != path and p.is_file())
+            files += filter(is_dicom, below)
     with contextlib.suppress(InputError):  # an unreadable header has no other files
         for reader in _named_readers(path):
             files += reader.other_files(path)
