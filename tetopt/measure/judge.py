@@ -34,7 +34,7 @@ from tetopt.errors import InputError, warn
 from tetopt.geometry.check import BOX_ROUNDING_VOXELS, beyond_box, manifold_problems
 from tetopt.geometry.manifold import OUTSIDE_LABEL
 from tetopt.geometry.simplex import dihedral_angles, edge_pairs, regular_edge, squared_edges
-from tetopt.geometry.topology import boundary_facets, components
+from tetopt.geometry.topology import boundary_facets, components, facets
 from tetopt.image import Image, transform_vectors
 from tetopt.measure.fidelity import (
     LEAST_CELLS,
@@ -460,15 +460,21 @@ def _euler_numbers(
 ) -> tuple[int, ...]:
     """Euler numbers of the closed surfaces of a mesh, of the components of its mask that have a
     cell and, if they differ, of these without details smaller than cells.
+
+    Cells that share no facet are apart, like voxels (`tetopt.measure.interfaces.voxel_euler`), and
+    the mesh counts as if it had as many components as the mask.
     """
     planes, image = _own_voxels(content)[0], content.given
     inside = inside[planes].copy()
     rows = inside.reshape(-1, inside.shape[-1])
-    for _, row, begin, end in component_runs(inside, owner[planes] >= 0)[1]:
+    n_parts, lost = component_runs(inside, owner[planes] >= 0)
+    for _, row, begin, end in lost:
         rows[row, begin:end] = False
-    cells = mesh.cells
-    is_flat = mesh.ndim == 2
-    ours = (1 + is_flat) * euler_characteristic(cells if is_flat else boundary_facets(cells))
+    n_parts -= len(np.unique(lost[:, 0])) + int(components(mesh.cells).max()) + 1
+    shared = facets(mesh.cells)
+    outer = boundary_facets(mesh.cells, shared)
+    inner = euler_characteristic(shared.nodes) - euler_characteristic(outer)
+    ours = 2 * (len(mesh.cells) + (-1) ** mesh.ndim * inner + n_parts)
     if ours == (own := voxel_euler(inside)):
         return ours, own
     reach = 0.5 * regular_edge(mesh.cell_volumes.mean(), mesh.ndim) / image.spacing
