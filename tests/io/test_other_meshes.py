@@ -471,7 +471,19 @@ def test_febio_of_others(version, here):
 
 @pytest.mark.parametrize("name", ["a.inp", "a.feb", "a.mesh", "a.xdmf"])
 @pytest.mark.parametrize(
-    "text", ["", "nonsense", "*Node\n1, x, 2\n", "<a><b/></a>", "Dimension 3\nVertices\n9\n"]
+    "text",
+    [
+        "",
+        "nonsense",
+        "*Node\n1, x, 2\n",
+        "*Node\n1, 2, 2\n*Element, type=C3D4\n1, 1, 1\n*Surface, type=ELEMENT\n",
+        "*Elset, elset=a, generate\n1, 99999999999999, 1\n",
+        "<a><b/></a>",
+        "<a><Nodes><node id='x'>1,2</node><node id='2'>1</node></Nodes></a>",
+        "Dimension 3\nVertices\n9\n",
+        "Dimension 3\nVertices\n1e18 1\n",
+        "Dimension inf\nVertices\n1 1 1 1 0\nTetrahedra\n1\n",
+    ],
 )
 def test_files_that_hold_no_mesh(name, text, here):
     (here / name).write_text(text)

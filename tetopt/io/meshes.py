@@ -152,6 +152,9 @@ def _read(path: Path) -> Raw:
         return MESH_READERS[suffix](path)
     except InputError as error:
         raise InputError(f"{path}: {plain(str(error))}") from error
+    except (ValueError, LookupError, OverflowError) as error:  # of texts that are damaged
+        words = f"damaged, or not a {suffix} mesh ({type(error).__name__})"
+        raise InputError(f"{path}: {words}") from error
 
 
 def _without_former_place(field_data: Arrays, mesh: Mesh) -> tuple[Arrays, tuple[str, ...]]:

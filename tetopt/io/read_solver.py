@@ -42,6 +42,7 @@ MEDIT_KINDS = {
     **{"Hexahedra": "hexahedron", "Prisms": "wedge", "Pyramids": "pyramid"},
 }
 # Abaqus' cards of nodes and elements that are not in the file itself
+MOST_MEMBERS = 10**8  # of a generated set
 GENERATED = ("INCLUDE", "NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY")
 
 
@@ -85,8 +86,7 @@ def read_medit(path: Path) -> Raw:
     if not {"Dimension", "Vertices"} <= sections.keys():
         raise InputError("expected a medit mesh as text, with Dimension and Vertices")
     n = int(sections["Dimension"][0])
-    points = np.zeros((int(sections["Vertices"][0]), 3))
-    points[:, :n] = _rows(sections["Vertices"], n + 1)[:, :n]
+    points = _in_space(_rows(sections["Vertices"], n + 1)[:, :n])
     cells = {}
     refs = {}
     for keyword, kind in MEDIT_KINDS.items():
@@ -233,8 +233,10 @@ def _set_members(body: str, sets: dict[str, Ints], is_range: bool = False) -> In
     """Return the numbers in lines of numbers and names of sets."""
     if is_range:
         rows = np.atleast_2d(_rows_of_lines(body)).astype(np.int64).tolist()
-        ranges = [np.arange(first, last + 1, *step) for first, last, *step in rows]
-        return np.concatenate(ranges)
+        ranges = [range(first, last + 1, *step) for first, last, *step in rows]
+        if sum(map(len, ranges)) > MOST_MEMBERS:
+            raise InputError(f"damaged: a set of more than {MOST_MEMBERS:.0e} members")
+        return np.concatenate([np.arange(each.start, each.stop, each.step) for each in ranges])
     words = [word.strip().strip('"') for word in re.split(r"[,\n]", body)]
     numbers = [int(word) for word in words if word.isdecimal()]
     named = [sets[word] for word in words if not word.isdecimal() and word in sets]
