@@ -258,7 +258,8 @@ def save_voxels(path: Path, values: NDArray, image: Image) -> None:
         save_bytes(path, _nrrd_bytes(values, image))
         return
     if suffix == ".mgz":
-        kept = values if values.dtype in (np.uint8, np.int16, np.int32) else np.float32(values)
+        is_kept = values.dtype in (np.uint8, np.int16, np.int32)
+        kept = values if is_kept else values.astype(np.float32)
         save_bytes(path, _pack(nibabel.MGHImage(kept, image.affine).to_bytes()))
         return
     n = image.ndim
