@@ -453,7 +453,7 @@ mesh lattice.vtu -o a.vtu
 quality no.vtu
     no such file
 quality disc.nii
-    expected a .vtu, .vtk, .msh or .msh2 mesh
+    expected a .vtu, .* or .xdmf mesh
 quality lattice.vtu --image no.nii
     no such file
 quality lattice.vtu --image disc.nii

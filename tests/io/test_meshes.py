@@ -452,7 +452,7 @@ def raw(content):
 
 
 FULL, DEEP, APART = pytest.mark.full, pytest.mark.deep, pytest.mark.apart
-UNKNOWN = r"expected a \.vtu, \.vtk, \.msh or \.msh2 mesh$"
+UNKNOWN = r"expected a \.vtu, .* or \.xdmf mesh; .*\.vtu"
 GARBAGE = [
     b"",
     b"\n",
