@@ -135,7 +135,7 @@ def _msh(text: bytes) -> Raw:
     order = None if is_binary == b"0" else ">" if head.endswith(b"\1") else "<"
     is_4 = version.startswith(b"4")
     entities = _section(text, "Entities")
-    groups_of = {} if is_4 else None
+    groups_of: dict[tuple[int, int], list[int]] | None = {} if is_4 else None
     if is_4 and entities:
         groups_of = _groups_of_entities(_Numbers(entities, order))
     nodes = _section(text, "Nodes")
@@ -297,8 +297,8 @@ def _elements_4(take: _Numbers, groups_of: dict[tuple[int, int], list[int]]) -> 
         kind, n_nodes = _kind(number)
         rows = take.rows(take.ints(1, 8)[0], 1 + n_nodes, size=8)[0]
         group = abs((groups_of.get((dim, tag)) or [0])[0])
-        tags = (np.full(len(rows), each) for each in (group, tag))
-        yield _Elements(kind, rows[:, 0], *tags, rows[:, 1:])
+        groups, entities = np.full((2, len(rows)), [[group], [tag]])
+        yield _Elements(kind, rows[:, 0], groups, entities, rows[:, 1:])
 
 
 def _kind(number: int) -> tuple[str, int]:

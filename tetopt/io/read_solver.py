@@ -190,9 +190,10 @@ def _abaqus(text: str) -> FileNumbers:
             _add(file.points, options.get("NSET"), file.nodes[-1][0])
         elif card == "ELEMENT" and (kind := _abaqus_kind(options.get("TYPE", ""))):
             name, n_nodes = kind
-            rows = _numbers(body.replace(",", " ")).astype(np.int64).reshape(-1, 1 + n_nodes)
-            file.elements.append((name, rows[:, 0], rows[:, 1:]))
-            _add(file.cells, options.get("ELSET"), rows[:, 0])
+            numbers = _numbers(body.replace(",", " ")).astype(np.int64)
+            element, *nodes = numbers.reshape(-1, 1 + n_nodes).T
+            file.elements.append((name, element, np.column_stack(nodes)))
+            _add(file.cells, options.get("ELSET"), element)
         elif card in ("ELSET", "NSET") and card in options:
             sets = file.cells if card == "ELSET" else file.points
             _add(sets, options[card], _set_members(body, sets, is_range="GENERATE" in options))
@@ -267,11 +268,11 @@ def _febio(root: ElementTree.Element) -> FileNumbers:
         for each in root.iter(what):
             members = _ids(each) if len(each) else _numbers((each.text or "").replace(",", " "))
             _add(sets, each.get("name"), members.astype(np.int64))
-    for each in root.iter("Surface"):
-        rows = [child.text or "" for child in each if child.tag.startswith("tri")]
+    for surface in root.iter("Surface"):
+        rows = [child.text or "" for child in surface if child.tag.startswith("tri")]
         if rows:
-            nodes = [np.array(row.split(",")[:3], dtype=np.int64) for row in rows]
-            file.triangles[each.get("name", "surface")] = np.array(nodes)
+            corners = [row.split(",")[:3] for row in rows]
+            file.triangles[surface.get("name", "surface")] = np.array(corners, dtype=np.int64)
     return file
 
 

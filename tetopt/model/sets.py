@@ -423,10 +423,10 @@ def parse_set(text: str, ndim: int) -> SetRequest:
     """
     name, equals, what = text.partition("=")
     if equals and "&" in what:
-        parts = tuple(parse_set(f"{name}={part.strip()}", ndim) for part in what.split("&"))
-        if any(part.kind == "below" for part in parts):
+        all_of = tuple(parse_set(f"{name}={part.strip()}", ndim) for part in what.split("&"))
+        if any(part.kind == "below" for part in all_of):
             raise InputError(f'set {name}: expected sets of facets beside &, got "{what}"')
-        return SetRequest(name, "", [], parts=parts)
+        return SetRequest(name, "", [], parts=all_of)
     kind, _, rest = what.partition(":")
     shapes = {
         "below": ("T", [1]),
@@ -702,7 +702,7 @@ def regions_of(labels: Ints | None, sets: Sets, n_cells: int) -> Ints | None:
     None without either.
     """
     columns = [] if labels is None else [labels]
-    columns += [np.isin(np.arange(n_cells), rows) for rows in sets.cells.values()]
+    columns += [np.isin(np.arange(n_cells), rows).astype(int) for rows in sets.cells.values()]
     if not columns:
         return None
     _, first, region = np.unique(
@@ -725,11 +725,11 @@ def surviving_sets(before: Mesh, sets: Sets, mesh: Mesh, regions: Ints | None = 
         name: rows_of(mesh, now[facet_triples(before.cells, rows)])
         for name, rows in sets.facets.items()
     }
-    cells = {} if regions is None else sets.cells
-    return Sets(
-        {name: rows for name, rows in survivors.items() if len(rows) == len(sets.facets[name])},
-        {name: np.flatnonzero(np.isin(regions, rows)) for name, rows in cells.items()},
-    )
+    facets = {name: rows for name, rows in survivors.items() if len(rows) == len(sets.facets[name])}
+    if regions is None:
+        return Sets(facets, {})
+    of_cells = {name: np.flatnonzero(np.isin(regions, each)) for name, each in sets.cells.items()}
+    return Sets(facets, of_cells)
 
 
 def free_name(label: str, taken: set[str]) -> str:
