@@ -230,7 +230,6 @@ def _of_labels(measured: Json, required: Requirements) -> Iterator[Problem]:
         f"Dice below {LEAST_DICE:g} for label {{1}}",
         f"{MORE_NODES}, or check that these are labels, not intensities",
         5,
-        unhelped,
     )
 
 
