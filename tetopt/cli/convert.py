@@ -110,7 +110,10 @@ def _check_options(
     other way round.
     """
     if voxels is not None:
-        format_of(output)  # raises InputError for an unknown format
+        try:
+            format_of(output)
+        except InputError as error:
+            raise InputError(f"{error}; of images, {', '.join(OUTPUT_SUFFIXES)}") from error
         wrong = given_options(voxels)
         what = "a mesh's file; name an image, such as field.nii.gz"
     else:
