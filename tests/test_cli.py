@@ -495,7 +495,7 @@ quality lattice.vtu --json run.json
 segment sphere.nii.gz lattice.vtu -o odd.nii
     exists
 quality far.vtu --image sphere.nii.gz
-    no voxel centre is inside the mesh
+    lies outside the image
 segment sphere.nii.gz twice.vtu -o s.nii.gz
     twice.vtu: cells overlap:
 segment sphere.nii.gz lattice.vtu -o l.nii --truth shifted.nii

@@ -316,7 +316,7 @@ def outside_fraction(mesh: Mesh, image: Image) -> float:
     is_other = unit != "mm" and fits[unit] > LEAST_OVERLAP
     remedy = "do both use the same world coordinates (mm, RAS+)?"
     remedy = f"is it in {unit}? pass `mesh_units` {unit}" if is_other else remedy
-    if outside == 1.0:
+    if outside == 1.0 and not has_voxel:  # else cells larger than the image may cover it
         raise InputError(
             f"the mesh lies outside the image: no node is in the image's box; {remedy}"
         )
