@@ -226,7 +226,7 @@ def mask_of_values(image: Image, mesh: Mesh) -> Image | None:
     InputError
         A voxel in a cell has no value; as for `cell_moments`.
     """
-    if not image.has_gaps:
+    if not check_image("image", image).has_gaps:
         return None
     check_values(image, cell_of_voxel(image, mesh) >= 0)
     return Image(~np.isnan(image.data), image.affine)
