@@ -131,8 +131,8 @@ def test_fortran_order_and_negative_strides_are_read_right():
         (np.zeros((2, 2), dtype=complex), "magnitude"),
         (np.zeros((2, 2), dtype=[("R", "u1"), ("G", "u1"), ("B", "u1")]), "RGB"),
         (np.array([[None, 1], [2, 3]]), "one number per voxel"),
-        (np.array([["a", "b"]]), "expected numbers"),
-        (np.array([["2020-01-01"]], dtype="M8[D]"), "expected numbers"),
+        (np.array([["a", "b"]]), "expected real numbers"),
+        (np.array([["2020-01-01"]], dtype="M8[D]"), "expected real numbers"),
     ],
 )
 def test_data_that_is_no_image_is_refused(data, message):

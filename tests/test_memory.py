@@ -215,17 +215,18 @@ def log(monkeypatch):
 
 
 def test_lines_are_rare_and_the_first_is_said_at_once(monkeypatch, log):
+    """Each waits twice as long as the one before."""
     lines, clock = log
     at_once, later = cli_run.rare_lines(is_first_said=True), cli_run.rare_lines()
-    for second in range(26):
+    for second in range(71):
         clock[0] = float(second)
         at_once(f"a {second}")
         later(f"b {second}")
-    assert lines == ["a 0", "a 10", "b 10", "a 20", "b 20"]
+    assert lines == ["a 0", "b 10", "a 20", "b 30", "a 60", "b 70"]
     monkeypatch.setattr(type(cli_run.log), "is_terminal", True)
-    clock[0] = 100.0
+    clock[0] = 1000.0
     at_once("on a terminal there is a bar")
-    assert len(lines) == 5
+    assert len(lines) == 6
 
 
 def test_compiling_and_long_iterations_are_told(log):

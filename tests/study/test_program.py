@@ -201,7 +201,10 @@ def test_sigterm_ends_the_comparison_and_its_programs(tmp_path):
         ("a=sh {output}", "expected {output}, and {image}"),
         ("a=sh {image}", "expected {output}, and {image}"),
         ("a=sh {image} {output} {seed}", "unknown placeholder {seed}"),
-        ("a=sh {image} {output}.stl", "must end in .vtu, .vtk, .msh, .msh2, got {output}.stl"),
+        (
+            "a=sh {image} {output}.stl",
+            "must end in .vtu, .vtk, .msh, .msh2, .inp, .feb, .mesh, .xdmf, got {output}.stl",
+        ),
         (
             "a=tetopt-no-such-program {image} {output}",
             'no executable program "tetopt-no-such-program"',
