@@ -71,11 +71,12 @@ def test_fem_bad_meshes(block, capsys):
     flat[cells[3, 3]] = flat[cells[3, :3]].mean(axis=0)
     inner = np.flatnonzero(np.all(np.abs(folded - 3.5) < 3.9, axis=1))[0]
     folded[inner] = folded[cells[0]].mean(axis=0)
+    # nodes at the same place would be merged
+    cracked = np.vstack([points, points + 0.01 * (points == 3.5) * np.array([0.0, 0.0, 1.0])])
     for changed, joined, words in (
         (points * [1.0, 1.0, 0.5], cells, "no node lies on the image's face"),
         (loose, np.vstack([cells, n + np.arange(4)]), f"the first has nodes [{n + 1}, "),
-        # doubled nodes
-        (np.tile(points, (2, 1)), cells + n * ~half[:, None], "a crack or several components"),
+        (cracked, cells + n * ~half[:, None], "a crack or several components"),
         (points, np.tile(cells, (2, 1)), "overlap"),
         (points + np.array([1.0, 0.0, 0.0]), cells, "lie off the faces"),
         (flat, cells, "flat or inverted, such as [3, "),

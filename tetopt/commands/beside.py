@@ -101,11 +101,18 @@ Masks = Callable[[], dict[tuple[Path, Align], Image]]
 
 
 def voxels_of(
-    loaded: MeshFile, mesh: Path, image: Path | None, part: MaskedPart, labels: Path | None = None
+    loaded: MeshFile,
+    mesh: Path,
+    image: Path | None,
+    part: MaskedPart,
+    labels: Path | None = None,
+    *,
+    fills_box: bool = False,
 ) -> MeshVoxels:
     """Read the image and the labels beside a mesh's file, without the voxels outside its mask.
 
-    The mesh gets the majority labels of the voxels in its cells.
+    The mesh gets the majority labels of the voxels in its cells. With `fills_box`, the caller
+    refuses a mesh that does not fill the image's box.
 
     Raises
     ------
@@ -116,7 +123,7 @@ def voxels_of(
     is_other = False
     masks = cache(partial(read_mask, part))
     if image is not None:
-        content, is_other = image_voxels(loaded, mesh, image, part, masks)
+        content, is_other = image_voxels(loaded, mesh, image, part, masks, fills_box)
     if labels is not None:
         if image is not None:
             warn_of_other_world(image, labels)
@@ -127,7 +134,12 @@ def voxels_of(
 
 
 def image_voxels(
-    loaded: MeshFile, mesh: Path, image: Path, part: MaskedPart, masks: Masks | None = None
+    loaded: MeshFile,
+    mesh: Path,
+    image: Path,
+    part: MaskedPart,
+    masks: Masks | None = None,
+    fills_box: bool = False,
 ) -> tuple[Content, bool]:
     """Read the image beside a mesh's file, without the voxels outside its mask; True if the file
     names another one.
@@ -152,7 +164,8 @@ def image_voxels(
     )
     content = _within(whole, part, beside, loaded)
     _warn_of_mask(loaded, content, part)
-    if content.own_mask is None and filled_fraction(loaded.mesh, whole) < FILLED_FRACTION:
+    is_part = not fills_box and content.own_mask is None
+    if is_part and filled_fraction(loaded.mesh, whole) < FILLED_FRACTION:
         note(
             f"{mesh}: has no mask and does not fill the image's box: cells at its boundary count "
             "voxels outside, too; pass `mask`"

@@ -161,9 +161,8 @@ def _model(
     path: Path, image: Path | None, model: ModelOptions, part: LabelledPart, compress: float | None
 ) -> Model:
     """Build the model to solve, of the mesh's file and the image."""
-    loaded, what, is_other = voxels_of(
-        without_results(read_mesh(path, part)), path, image, part, part.labels
-    )
+    read, of_box = without_results(read_mesh(path, part)), not model.loads
+    loaded, what, is_other = voxels_of(read, path, image, part, part.labels, fills_box=of_box)
     about = texts_of(loaded, is_other=is_other)
     box = loaded.box
     whole = None
@@ -171,7 +170,7 @@ def _model(
     if what is not None:
         whole = what.given
         voxels = what.image
-        if not model.loads:
+        if of_box:
             _check_box(whole, loaded)
         box = box_of(whole)
     about |= {} if box is None else {"box": box_text(box)}

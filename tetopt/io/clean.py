@@ -139,6 +139,8 @@ def _covered_fraction(mesh: Mesh) -> float:
     """Return the fraction of some boundary facets with another cell just outside their centre."""
     shared = facets(mesh.cells)
     outer = boundary_facets(mesh.cells, shared)
+    if not len(outer):  # every cell is there twice
+        return 0.0
     cells = mesh.cells[np.unique(shared.cells[shared.n_cells == 1, 0])]
     corners = mesh.points[outer[:: -(-len(outer) // PROBED_FACETS)]]
     sides = corners[:, 1:] - corners[:, :1]
