@@ -50,7 +50,7 @@ from tetopt.cli.app import COMMANDS, SHOWN_OPTIONS, help_line, loaded_command
 from tetopt.cli.console import show_error, show_event
 from tetopt.job.advice import order_problems, sentences, tell, unmet_requirements
 from tetopt.job.events import listen_with
-from tetopt.measure.judge import ERROR_RATE
+from tetopt.measure.judge import ERROR_RATE, Requirements
 from tetopt.measure.segmentation import dice, segment
 from tetopt.report.summary import mesh_hash
 from tetopt.start.octree import nodes_of_sizes
@@ -290,7 +290,7 @@ def test_what_is_violated_is_told_in_the_commands_options(capsys):
         "box": "k_D.nii lies beyond",
     }
     with listen_with(show_event):
-        problems = order_problems(unmet_requirements(violated, {}))
+        problems = order_problems(unmet_requirements(violated, {}, Requirements()))
         assert sentences(problems) == violated
         tell(problems)
     assert capsys.readouterr().err == (
@@ -496,8 +496,6 @@ segment sphere.nii.gz lattice.vtu -o odd.nii
     exists
 quality far.vtu --image sphere.nii.gz
     lies outside the image
-segment sphere.nii.gz twice.vtu -o s.nii.gz
-    twice.vtu: cells overlap:
 segment sphere.nii.gz lattice.vtu -o l.nii --truth shifted.nii
     expected labels on the image's grid
 segment sphere.nii.gz lattice.vtu -o l.nii --truth disc.nii
@@ -831,6 +829,12 @@ def test_a_reader_that_goes_away_loses_no_file():
     assert run.returncode == 0
     assert "Traceback" not in run.stderr
     assert numbers_in("a.json")["quality"]["n_cells"] == len(load_mesh("a.vtu").mesh.cells)
+
+
+def test_segments_of_overlapping_cells():
+    said = run_command("segment sphere.nii.gz twice.vtu -o s.nii.gz", code=2).err
+    assert "tetopt: twice.vtu: cells overlap:" in said
+    assert not Path("s.nii.gz").exists()
 
 
 def test_quality_of_overlapping_cells():

@@ -184,7 +184,7 @@ def test_gravity_needs_densities(path):
 test_refused = refusals(
     """
 fem mesh.vtu --young 3 -o out.vtu --json out.json
-    the mesh's file has no loads: pass --load, such as --load compress:5%
+    the mesh's file has no loads, or its format keeps none: pass --load, such as --load compress:5%
 fem mesh.vtu --load compress:5% -o out.vtu --json out.json
     the mesh's file has no moduli: pass --young, such as --young 3.5
 fem mesh.vtu mesh.vtu mesh.vtu -o out.vtu --json out.json

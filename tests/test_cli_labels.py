@@ -184,11 +184,11 @@ quality named.vtu --label-names t.csv
 compare a.nii.gz -o c --label-names t.csv
     --label-names: needs --labels
 convert named.vtu a.vtu --label-names bad.csv
-    bad.csv, line 3: label 1
+    bad.csv
 fem named.vtu --young 1 --load compress:1% --label-names bad.csv
-    bad.csv, line 3: label 1
+    bad.csv
 view named.vtu --html a.html --label-names bad.csv
-    bad.csv, line 3: label 1
+    bad.csv
 convert plain.vtu a.vtu --sets labels,faces
     --sets: expected some of labels, interfaces, boundary, or all, or none, got "faces"
 fem plain.vtu --young 1 --load compress:5% --sets all

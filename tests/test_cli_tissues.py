@@ -123,8 +123,6 @@ mesh a.nii.gz -o b.vtu --tissues negative.nii.gz,white.nii.gz
     negative.nii.gz: expected probabilities from 0 to 1, got -0.5
 mesh a.nii.gz -o b.vtu --tissues plane.nii.gz,white.nii.gz
     plane.nii.gz: expected 3 axes like the image's
-mesh a.nii.gz -o b.vtu --tissues nan.nii.gz,white.nii.gz
-    nan.nii.gz
 mesh a.nii.gz -o b.vtu --tissues far.nii.gz,white.nii.gz
     far.nii.gz: expected it to cover at least half of the image's voxels
 """

@@ -176,7 +176,18 @@ class Image:
         )
 
     def with_zeros(self) -> Image:
-        """Return the image with 0 where it has no value, as a mask or labels have there."""
+        """Return the image with 0 where it has no value, as a mask or labels have there.
+
+        Returns
+        -------
+        Image
+            The image itself if every voxel has a value.
+
+        Examples
+        --------
+        >>> tetopt.Image([[1.0, np.nan]]).with_zeros().data.tolist()
+        [[1.0, 0.0]]
+        """
         return Image(np.nan_to_num(self.data), self.affine) if self.has_gaps else self
 
     def box(self, start: Sequence[int], stop: Sequence[int]) -> Image:

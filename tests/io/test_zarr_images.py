@@ -523,7 +523,7 @@ def test_chunks_that_cannot_be(tmp_path, monkeypatch):
     os.mkfifo(chunk)
     assert_refused(path, "its chunk c/1/0/0 is not a regular file")
     chunk.unlink()
-    assert_refused(path, "64 voxels are NaN or infinite")
+    assert np.isnan(load_image(path).data[4:]).all()  # no values
     assert read_warned(path, crop=[(0, 4)] * 3)[1] == []  # which do not need it
     monkeypatch.setattr(zarr_images, "MOST_CHUNKS", 1)
     assert_refused(path, "expected at most 1 chunks, got 2")

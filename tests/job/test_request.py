@@ -44,6 +44,8 @@ VALUES = {
     "uniform": True,
     "spacing": 3.0,
     "start": Path("/m.vtu"),
+    "label_field": "tissue",
+    "mesh_units": "cm",
     "k_D": 0.3,
     "iterations": 3,
     "boundary": "fixed",
@@ -122,6 +124,7 @@ def test_a_request_states_what_was_given(request_of):
     request = request_of(young="young.csv", nu="0.3")
     assert request["options"] == {"nodes": 50, "nu": "0.3", "format": ".vtu"}
     assert [name for name, _ in request["files"]["images"]] == ["a.nii"]
+    assert request_of(labels="m.nii", label_names=Path("aseg"))["options"]["label-names"] == "aseg"
     assert sorted(request["files"]) == ["images", "mask", "young"]
     assert request["tetopt"] == tetopt.__version__
 

@@ -103,6 +103,8 @@ def test_the_head_is_of_single_lines():
         f"materials: bins, error of the modulus {model.materials.binning.mean:.3%} (mean by "
         "volume), "
         f"{model.materials.binning.largest:.3%} (largest)",
+        "label 0: label_0",
+        "label 1: label_1",
     ]
     assert "of the slice's plane" in header_lines(sample_model(2))[1]
 

@@ -143,8 +143,8 @@ def _fill_options(
         )
     if not model.loads:
         raise InputError(
-            "the mesh's file has no loads: pass `loads`, such as `loads` compress:5%, "
-            "or `loads` hold:inferior `loads` pressure:superior:1.5"
+            "the mesh's file has no loads, or its format keeps none: pass `loads`, such as `loads` "
+            "compress:5%, or `loads` hold:inferior `loads` pressure:superior:1.5"
         )
     return model
 

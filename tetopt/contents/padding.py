@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from tetopt.system.arrays import Bools
 
 PADDING_BELOW = -1100.0  # Hounsfield units: air has -1000, and its noise is hardly lower
-LEAST_PADDED = 0.001  # fraction of the voxels that have the least value
+# voxels that have the least value: a fraction of all, and a number
+LEAST_PADDED, LEAST_PADDED_VOXELS = 0.001, 20
 AIR_BELOW = -500.0  # the median beside padding is that of air: around an organ cut out, it is not
 
 
@@ -27,8 +28,8 @@ def replace_padding(data: NDArray, is_padding: Bools | None = None) -> tuple[NDA
     data : (s_0, ..., s_{n-1}) array of numbers
     is_padding : (s_0, ..., s_{n-1}) bool, optional
         The padding that the file states. By default, voxels below -1100 connected to those of the
-        least value, if these are a thousandth of all or more, one of them is on the box's sides,
-        and air (below -500) is beside them.
+        least value, if these are 20 and a thousandth of all or more, one of them is on the box's
+        sides, and air (below -500) is beside them.
 
     Returns
     -------
@@ -42,7 +43,7 @@ def replace_padding(data: NDArray, is_padding: Bools | None = None) -> tuple[NDA
             return data, ""
         is_low = data == low
         sides = [is_low.take([0, -1], axis).any() for axis in range(data.ndim)]
-        if is_low.mean() < LEAST_PADDED or not any(sides):
+        if is_low.sum() < max(LEAST_PADDED * data.size, LEAST_PADDED_VOXELS) or not any(sides):
             return data, ""
         is_padding = scipy.ndimage.binary_propagation(is_low, mask=data < PADDING_BELOW)
         most = AIR_BELOW

@@ -206,11 +206,11 @@ def _sides_words(sides: Sequence[int]) -> str:
 
 
 def save_image(path: str | Path, image: Image) -> None:
-    """Write NIfTI, with the full affine as sform, MGZ, NRRD or OME-Zarr, in mm, whole or not at
-    all.
+    """Write an image as NIfTI, MGZ, NRRD or OME-Zarr, in mm, whole or not at all.
 
-    Whole numbers are stored as 8-, 16- or 32-bit integers if they fit, others as float32 or
-    float64. An axis with more voxels than NIfTI-1 supports makes it a NIfTI-2 file.
+    NIfTI has the full affine as sform. Whole numbers are stored as 8-, 16- or 32-bit integers if
+    they fit, others as float32 or float64. An axis with more voxels than NIfTI-1 supports makes it
+    a NIfTI-2 file.
 
     A 2-D image becomes a 2-D file in the plane z = 0, which `load_image` reads back unchanged.
     Replaces an existing file; call `tetopt.system.files.check_output` first.

@@ -25,6 +25,7 @@ from tetopt.io.read_gmsh import read_msh
 from tetopt.io.read_solver import read_feb, read_inp, read_medit, read_xdmf
 from tetopt.io.read_vtk import read_vtk
 from tetopt.io.text import plain
+from tetopt.io.units import LONGEST_BOX, SHORTEST_BOX
 from tetopt.io.vtk import box_in, sets_in
 from tetopt.mesh import Mesh
 from tetopt.model.fields import half_turned_fields, is_stress, scaled_fields
@@ -92,7 +93,8 @@ def load_mesh(
         raise InputError(f"`mesh_units`: expected {', '.join(LENGTH_UNITS)}, got {mesh_units!r}")
     path = regular_file(path, "mesh file")
     raw = _read(path)
-    stress = STRESS_UNITS.get(text_in(raw.field_data, "units") or "kPa")
+    stress_name = text_in(raw.field_data, "units")
+    stress = STRESS_UNITS.get(stress_name or "kPa")
     mm = (1.0 if stress is None else stress.mm) if mesh_units is None else LENGTH_UNITS[mesh_units]
     if mm != 1.0:
         raw = raw._replace(points=raw.points * mm)
@@ -131,7 +133,8 @@ def load_mesh(
             *of_edges,
             *of_labels,
             *moved,
-            *(() if {MASK_TEXT, "options"} & field_data.keys() else apart_words(mesh)),
+            *apart_words(mesh, is_ours=not {MASK_TEXT, "options"}.isdisjoint(field_data)),
+            *(() if stress_name or mesh_units else _size_words(mesh)),
         ),
         2 if kind in raw.middles else 1,
         {name: values[np.concatenate([used, middles])] for name, values in point_data.items()},
@@ -170,6 +173,13 @@ def _without_former_place(field_data: Arrays, mesh: Mesh) -> tuple[Arrays, tuple
     texts[PLACE_TEXT] = np.array([MOVED_FROM_MASK if had_mask else MOVED])
     remedy = "; its mask no longer fits: pass `mask`" if had_mask else ""
     return texts, (f"its nodes were moved after meshing{remedy}",)
+
+
+def _size_words(mesh: Mesh) -> tuple[str, ...]:
+    """Return a remark on a mesh without a stated unit that is hardly a body's in mm."""
+    longest = float(np.ptp(mesh.points, axis=0).max())
+    words = f"the mesh is {longest:.3g} mm long; if its unit is not mm, pass `mesh_units`"
+    return () if SHORTEST_BOX <= longest <= LONGEST_BOX else (words,)
 
 
 def _middles(raw: Raw, kind: str) -> tuple[Ints, bool, tuple[str, ...]]:

@@ -51,7 +51,11 @@ def job_request(job: JobOptions) -> Json:
     left_out = {option_name(name, kinds[name]) for name in OPTIONS_IGNORED}
     options = {name: value for name, value in given_options(job).items() if name not in left_out}
     files = {name: each for name in list(options) if (each := _files(name, options[name]))}
-    stated = {name: value for name, value in options.items() if name not in files}
+    stated = {
+        name: str(value) if isinstance(value, Path) else value
+        for name, value in options.items()
+        if name not in files
+    }
     whole: Json = {
         "options": {**stated, "format": job.output.suffix.lower()},
         "files": {

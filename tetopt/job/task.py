@@ -57,15 +57,22 @@ class Task(NamedTuple):
     regions: Ints | None = None
 
     def labels_of(self, regions: Ints | None) -> Ints | None:
-        """Return the labels of regions of the mesh to start from, if they have labels.
+        """Return the labels of regions of the mesh to start from, (M,); None without labels.
 
         Parameters
         ----------
         regions : (M,) int64, optional
+            Numbers of the start's cells.
 
         Returns
         -------
         (M,) int64, optional
+            Their labels.
+
+        Examples
+        --------
+        >>> task.labels_of(np.array([0, 5]))  # doctest: +SKIP
+        array([1, 2])
         """
         of_start = None if self.started is None else self.started.labels
         return None if regions is None or of_start is None else of_start[regions]

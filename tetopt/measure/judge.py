@@ -295,9 +295,11 @@ def _say_components(parts: MaskComponents, required: Requirements) -> str:
 
 def _say_euler(numbers: tuple[int, ...], required: Requirements) -> str:
     ours, *others = numbers
+    span = f"{min(others)} to {max(others)}, with and without details smaller than cells"
     words = (
-        f"the mesh's surface has an Euler number of {ours}, that of the {required.region} "
-        f"{others[0]}: holes are torn or lost, or cavities; {required.remedy}"
+        f"the mesh's surface has an Euler number of {ours}, that of the {required.region} is "
+        f"{span if len({*others}) > 1 else others[0]}: holes are torn or lost, or cavities; "
+        f"{required.remedy}"
     )
     return "" if min(others) <= ours <= max(others) else words
 
@@ -356,6 +358,11 @@ def _is_large(component: LostComponent) -> bool:
     return component.voxels >= COMPONENT_VOXELS and is_shown(component)
 
 
+def _likeness(row: LabelFidelity) -> float:
+    """Return the smaller of the volumes of cells and voxels, relative to the larger."""
+    return min(row.extent.ratio, 1.0 / max(row.extent.ratio, 1.0))
+
+
 def _say_labels(rows: Sequence[LabelFidelity], required: Requirements) -> str:
     words, texts = required.label_words, list[str]()
     rows = [row for row in rows if not is_pocket(row, required)]
@@ -364,7 +371,7 @@ def _say_labels(rows: Sequence[LabelFidelity], required: Requirements) -> str:
             f"no voxel of label {', '.join(lost)}, of {LABEL_VOXELS} voxels or more, lies in a "
             "cell with that label"
         )
-    off = sorted(filter(_is_off, rows), key=lambda row: -abs(np.log(row.extent.ratio)))
+    off = sorted(filter(_is_off, rows), key=_likeness)
     if off:
         ratios = ", ".join(f"{row.extent.ratio:.3g} for label {words(row.label)}" for row in off)
         texts.append(
