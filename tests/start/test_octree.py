@@ -232,7 +232,8 @@ def test_a_wall_thinner_than_the_cells_is_whole():
     assert 500 < len(start.points) < 1200
     assert octree.is_for_walls(len(start.points), 500)
     assert start.cell_volumes.sum() == pytest.approx(ideal, rel=0.02)
-    result = mesh_image(content, nodes=500)
+    # at the ends of collapsed edges nothing else may change: 16 iterations leave 518
+    result = mesh_image(content, nodes=500, iterations=20)
     assert len(result.mesh.points) == 500
     assert result.mesh.cell_volumes.sum() == pytest.approx(ideal, rel=0.015)
     assert result.violated == {}
