@@ -123,6 +123,28 @@ def test_images_of_vtk(at):
     assert load_image("a.vti", volume=1).data.max() == 240.0
 
 
+@pytest.mark.parametrize("at", [("cell",), ("cell", "point")])
+def test_values_of_cells_are_not_read_as_those_of_points(at):
+    pytest.importorskip("SimpleITK")
+    import pyvista
+
+    grid = pyvista.ImageData(dimensions=np.add(DATA.shape, 1))
+    for each in at:
+        n = grid.n_cells if each == "cell" else grid.n_points
+        getattr(grid, f"{each}_data")["v"] = np.arange(n, dtype=np.uint8 if n < 256 else np.int16)
+    grid.save("a.vtk")
+    assert_refused("a.vtk", "CELL_DATA.*vti")
+
+
+def test_colours_of_vtk_are_no_image():
+    import pyvista
+
+    grid = pyvista.ImageData(dimensions=DATA.shape)
+    grid.point_data["tint"] = np.zeros((DATA.size, 3), np.uint8)
+    grid.save("a.vti")
+    assert_refused("a.vti", "one number per point or cell.*tint")
+
+
 def test_arrays():
     np.save("a.npy", np.stack([DATA, 2 * DATA], axis=-1))
     np.save("b.npy", DATA[0])

@@ -29,18 +29,23 @@ from tetopt.io.volumes import (
 )
 
 AFNI = re.compile(r"(.*)\.(head|brik|brik\.gz)", re.IGNORECASE | re.DOTALL)  # two files of a name
+# The first values in a .vtk file; a header is short
+VALUES_OF_CELLS = re.compile(
+    rb"# vtk(?:(?!^POINT_DATA).)*?^CELL_DATA\s", re.IGNORECASE | re.DOTALL | re.MULTILINE
+)
+HEAD_BYTES = 4096
 IN_LPS = "its format does not tell left from right: assuming LPS, as ITK does"
 IN_RAS = "its format does not tell left from right: assuming RAS, as in tetopt's .vtu"
 
 
-def _reads(library: str, read: Callable[..., Any], words: str, *rest: bool) -> Any:
+def _reads(library: str, read: Callable[..., Any], words: str) -> Any:
     """Return a reader by a library, with a note on directions."""
 
     def read_file(path: Path, request: Request) -> Voxels:
         if library == "SimpleITK":
             check_itk()
         size = sum(file.stat().st_size for file in (path, *_other_files(path)))
-        data, affine = read_apart(read, path, request.volume, *rest, size=size, library=library)
+        data, affine = read_apart(read, path, request.volume, size=size, library=library)
         note(words)
         note_size(data.shape, affine, None)
         return data, affine
@@ -72,6 +77,21 @@ def _other_files(path: Path) -> list[Path]:
 # In the child
 
 
+def _legacy_of(path: str, volume: int | None) -> Voxels:
+    """Return data and affine by SimpleITK, which takes values of cells in .vtk for those of
+    points.
+    """
+    with open(path, "rb") as file:
+        has_cells = VALUES_OF_CELLS.match(file.read(HEAD_BYTES))
+    if has_cells:
+        raise InputError(
+            "its values are of cells (CELL_DATA), expected POINT_DATA; save it as .vti, where "
+            "both are read"
+        )
+    voxels: Voxels = volume_of(path, volume, False, False)
+    return voxels
+
+
 def _grid_of(path: str, volume: int | None) -> Voxels:
     """Return data and affine by nibabel, whose axes are RAS+."""
     file: Any = nibabel.load(path)
@@ -95,7 +115,12 @@ def _vti_of(path: str, volume: int | None) -> Voxels:
         for name, values in getattr(grid, f"{at}_data").items()
         if values.ndim == 1 and not name.startswith("vtk")
     ]
-    names = ", ".join(name for name, *_ in arrays) or "one number per point or cell, and has none"
+    if not arrays:
+        raise InputError(
+            "expected an array with one number per point or cell (no RGB or vectors), found "
+            f"{', '.join(grid.array_names) or 'none'}; convert it to grey first"
+        )
+    names = ", ".join(name for name, *_ in arrays)
     _, values, shift = arrays[volume_index((len(arrays),), volume, names)[0]]
     shape = np.array(grid.dimensions)
     affine = np.array(grid.index_to_physical_matrix)
@@ -109,6 +134,6 @@ GRIDS = Reader(
     _reads("nibabel", _grid_of, ""),
     other_files=_other_files,
 )
-LEGACY = Reader((".gipl", ".gipl.gz", ".vtk"), _reads("SimpleITK", volume_of, IN_LPS, False, False))
+LEGACY = Reader((".gipl", ".gipl.gz", ".vtk"), _reads("SimpleITK", _legacy_of, IN_LPS))
 VTI = Reader((".vti",), _reads("VTK", _vti_of, IN_RAS))
 ARRAYS = Reader((".npy",), read_array, has_spacing=False)
