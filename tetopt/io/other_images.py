@@ -33,7 +33,7 @@ AFNI = re.compile(r"(.*)\.(head|brik|brik\.gz)", re.IGNORECASE | re.DOTALL)  # t
 VALUES_OF_CELLS = re.compile(
     rb"# vtk(?:(?!^POINT_DATA).)*?^CELL_DATA\s", re.IGNORECASE | re.DOTALL | re.MULTILINE
 )
-HEAD_BYTES = 4096
+LEGACY_BYTES = 4096
 IN_LPS = "its format does not tell left from right: assuming LPS, as ITK does"
 IN_RAS = "its format does not tell left from right: assuming RAS, as in tetopt's .vtu"
 
@@ -82,7 +82,7 @@ def _legacy_of(path: str, volume: int | None) -> Voxels:
     points.
     """
     with open(path, "rb") as file:
-        has_cells = VALUES_OF_CELLS.match(file.read(HEAD_BYTES))
+        has_cells = VALUES_OF_CELLS.match(file.read(LEGACY_BYTES))
     if has_cells:
         raise InputError(
             "its values are of cells (CELL_DATA), expected POINT_DATA; save it as .vti, where "
