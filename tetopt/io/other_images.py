@@ -29,11 +29,11 @@ from tetopt.io.volumes import (
 )
 
 AFNI = re.compile(r"(.*)\.(head|brik|brik\.gz)", re.IGNORECASE | re.DOTALL)  # two files of a name
-# The first values in a .vtk file; a header is short
+# The first values in a .vtk file
 VALUES_OF_CELLS = re.compile(
     rb"# vtk(?:(?!^POINT_DATA).)*?^CELL_DATA\s", re.IGNORECASE | re.DOTALL | re.MULTILINE
 )
-LEGACY_BYTES = 4096
+LEGACY_BYTES = 4096  # more than a header without arrays has
 IN_LPS = "its format does not tell left from right: assuming LPS, as ITK does"
 IN_RAS = "its format does not tell left from right: assuming RAS, as in tetopt's .vtu"
 
