@@ -164,6 +164,7 @@ def test_ghosts_that_repeat_cells_of_another_piece(here):
 
 
 NAMES = ["medit:ref", "gmsh:physical", "labels", "RegionId", "MaterialIDs", "subdomains", "Tissue"]
+NAMES += ["material id", "MatID", "Label"]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -185,6 +186,38 @@ def test_fields_that_are_no_labels(here):
         points, cells, 3, region=some / 2, tissue=some - 1, young=1.0 + some, material=some
     ).save("a.vtu")
     assert load_mesh("a.vtu").labels is None
+
+
+@pytest.mark.parametrize(
+    ("own", "is_told"),
+    [
+        (lambda some: some / 2, True),
+        (lambda some: some - 1, True),
+        (lambda some: np.where(some < 9, np.nan, some), True),
+        (lambda some: np.column_stack([some, some]), True),
+        (lambda some: 0 * some, False),
+    ],
+)
+def test_a_damaged_label_is_no_label(own, is_told, here):
+    points, cells = nodes_of(box_mesh(3), 1)
+    some = np.arange(len(cells))
+    grid_of(points, cells, 3, label=own(some), region=some % 3).save("a.vtu")
+    loaded = load_mesh("a.vtu")
+    assert_array_equal(loaded.labels, some % 3)
+    assert any("region" in note for note in loaded.notes)
+    assert any('"label"' in note for note in loaded.notes) == is_told
+
+
+def test_a_column_of_labels(here):
+    import meshio
+
+    mesh = box_mesh(3)
+    labels = 1 + np.arange(len(mesh.cells)) % 3
+    data = {"label": [labels[:, None]], "region": [labels + 1]}
+    meshio.Mesh(mesh.points, [("tetra", mesh.cells)], cell_data=data).write(
+        "a.xdmf", data_format="XML"
+    )
+    assert_array_equal(load_mesh("a.xdmf").labels, labels)
 
 
 def test_a_named_field_of_labels(here, capsys):
@@ -293,6 +326,18 @@ def test_partial_values_are_missing_voxels(here):
 def test_other_versions_of_gmsh_are_refused(version, here):
     (here / "a.msh").write_text(f"$MeshFormat\n{version} 0 8\n$EndMeshFormat\n")
     with refusal("2.2 or 4.1.*msh41"):
+        load_mesh("a.msh")
+
+
+@pytest.mark.parametrize("section", ["Nodes", "Elements", "ElementData"])
+def test_cut_sections_of_gmsh_are_named(section, here):
+    mesh = box_mesh(3)
+    numbers = 100 + np.arange(len(mesh.cells))
+    views = [(b"ElementData", b"x", numbers, np.ones(len(numbers)))]
+    write_22(here / "a.msh", mesh, numbers, views, False)
+    text = (here / "a.msh").read_text()
+    (here / "a.msh").write_text(text[: text.index(f"$End{section}") - 9])
+    with refusal(f"[$]{section}"):
         load_mesh("a.msh")
 
 
@@ -413,16 +458,104 @@ def test_abaqus_of_others(kind, here):
         ("*Instance, name=i, part=p\n 0., 0., 9.\n*End Instance\n", "INSTANCE"),
         ("*Node\n1, 9., 9., 9.\n", "repeat"),
         ("*Element, type=C3D8\n9, 1, 2, 3, 4, 1, 2, 3, 4\n", "hexahedr"),
+        ("*Element, type=C3D5\n9, 1, 2, 3, 4, 1\n", "pyramid"),
+        ("*Element, type=COH3D8\n9, 1, 2, 3, 4, 1, 2, 3, 4\n", "COH3D8"),
+        ("*Element, type=CIN3D8\n9, 1, 2, 3, 4, 1, 2, 3, 4\n", "CIN3D8"),
+        ("*Element, type=C3D27\n9, 1, 2, 3, 4, 1, 2, 3, 4\n", "C3D27"),
+        ("*System\n1., 0., 0.\n", "SYSTEM"),
+        ("*Node, system=C\n999, 9., 9., 9.\n", "SYSTEM"),
+        ("*Element, type=C3D4\n999, 1, 2", "C3D4"),
+        ("*Node\n998, 9., 9., 9.\n999, 9.", "lines of 4"),
+        ("*Elset, elset=a\nOther\n", "Other"),
     ],
 )
 def test_abaqus_that_is_not_one_flat_mesh_is_refused(extra, word, here):
+    write_abaqus(here / "a.inp", extra)
+    with refusal(word):
+        load_mesh("a.inp")
+
+
+def write_abaqus(path, extra, change=lambda nodes: nodes):
+    """A box of tetrahedra, whose lines of nodes are changed."""
     points, cells = nodes_of(box_mesh(3), 1)
     numbers = np.arange(1, len(points) + 1)
     nodes = lines_of(zip(numbers, *points.T.tolist(), strict=True))
     rows = lines_of(zip(range(1, len(cells) + 1), *(cells + 1).T.tolist(), strict=True))
-    (here / "a.inp").write_text(f"*Node\n{nodes}*Element, type=C3D4\n{rows}{extra}")
-    with refusal(word):
-        load_mesh("a.inp")
+    path.write_text(f"*Node\n{change(nodes)}*Element, type=C3D4\n{rows}{extra}")
+
+
+@pytest.mark.parametrize(
+    ("extra", "members"),
+    [
+        ("*Elset, elset=One\n1, 2\n*Elset, elset=ONE\n5\n", [0, 1, 4]),
+        ("*Elset, elset=a\n1, 2\n*Elset, elset=One\nA, 5\n", [0, 1, 4]),
+        ("*Elset, elset=One, generate\n1, 3\n5, 9, 2\n11, 12\n", [0, 1, 2, 4, 6, 8, 10, 11]),
+        ("*Elset, elset=One, generate\n5, 9, 2\n11, 12\n", [4, 6, 8, 10, 11]),
+        ("*Elset,\n  elset=One\n1, 2\n", [0, 1]),
+    ],
+)
+def test_sets_of_abaqus(extra, members, here):
+    write_abaqus(here / "a.inp", extra)
+    assert_array_equal(load_mesh("a.inp").sets.cells["One"], members)
+
+
+@pytest.mark.parametrize(
+    ("extra", "word"),
+    [
+        ("*Element, type=T3D2, elset=rods\n9001, 1, 2\n9002, 2, 3\n", "2 of type T3D2"),
+        ("*Element, type=SPRINGA\n9001, 1, 2\n", "1 of type SPRINGA"),
+        ("*Elset, elset=One\n1, 99999\n", "One"),
+    ],
+)
+def test_elements_of_abaqus_that_are_no_cells_are_told(extra, word, here):
+    write_abaqus(here / "a.inp", extra)
+    assert any(word in note for note in load_mesh("a.inp").notes)
+
+
+def test_sections_of_abaqus_in_another_case_are_labels(here):
+    last = len(box_mesh(3).cells)
+    sets = f"*Elset, elset=Skin, generate\n1, 9\n*Elset, elset=Bone, generate\n10, {last}\n"
+    sections = "*Solid section, elset=SKIN, material=M\n,\n*Solid section, elset=bone, material=M\n"
+    write_abaqus(here / "a.inp", sets + sections)
+    assert_array_equal(load_mesh("a.inp").labels, 1 + (np.arange(last) >= 9))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda nodes: nodes.replace(", 0.0", ", "),
+        lambda nodes: nodes.replace(".0", ".D0"),
+        lambda nodes: nodes.replace(".0", ".0d+00"),
+        lambda nodes: nodes.replace("\n", ",\n"),
+    ],
+)
+def test_numbers_of_abaqus(change, here):
+    write_abaqus(here / "a.inp", "", change)
+    assert_allclose(load_mesh("a.inp").mesh.points, box_mesh(3).points)
+
+
+def test_sections_of_medit_add_up(here):
+    mesh = box_mesh(3)
+    half = len(mesh.cells) // 2
+    text = f"MeshVersionFormatted 1\nDimension 3\nVertices\n{len(mesh.points)}\n"
+    text += lines_of([*point, 0] for point in mesh.points.tolist()).replace(",", "")
+    for cells in (mesh.cells[:half], mesh.cells[half:]):
+        rows = lines_of([*cell, 1] for cell in (cells + 1).tolist()).replace(",", "")
+        text += f"Tetrahedra\n{len(cells)}\n{rows}"
+    (here / "a.mesh").write_text(f"{text}End\n")
+    assert_array_equal(load_mesh("a.mesh").mesh.cells, mesh.cells)
+
+
+def test_xdmf_of_two_grids_is_refused(here):
+    import meshio
+
+    mesh = box_mesh(3)
+    meshio.Mesh(mesh.points, [("tetra", mesh.cells)]).write("a.xdmf", data_format="XML")
+    text = (here / "a.xdmf").read_text()
+    grid = text[text.index("<Grid") : text.index("</Grid>") + 7]
+    (here / "a.xdmf").write_text(text.replace(grid, grid + grid))
+    with refusal("uniform grid"):
+        load_mesh("a.xdmf")
 
 
 @pytest.mark.parametrize("suffix", [".mesh", ".xdmf"])
@@ -445,30 +578,44 @@ def test_meshes_by_meshio(suffix, n, here):
 
 
 @pytest.mark.parametrize("version", ["2.5", "4.0"])
-def test_febio_of_others(version, here):
+@pytest.mark.parametrize("names", ["ab", "aab"])
+def test_febio_of_others(version, names, here):
+    """Parts in blocks, of which several may have one name."""
     mesh = box_mesh(3)
-    half = len(mesh.cells) // 2
-    section = "Geometry" if version == "2.5" else "Mesh"
-    text = f'<febio_spec version="{version}"><{section}><Nodes name="all">'
-    for k, x in enumerate(mesh.points.tolist()):
-        text += f'<node id="{k + 3}">{",".join(map(str, x))}</node>'
-    text += "</Nodes>"
-    for name, first, cells in (("a", 0, mesh.cells[:half]), ("b", half, mesh.cells[half:])):
-        text += f'<Elements type="tet4" mat="1" name="{name}">'
-        for k, cell in enumerate(cells):
-            text += f'<elem id="{first + k + 1}">{",".join(map(str, cell + 3))}</elem>'
-        text += "</Elements>"
-    members = "".join(f'<e id="{k}"/>' for k in (1, 2)) if version == "2.5" else "1,2"
-    corners = ",".join(str(x) for x in mesh.cells[0][[1, 2, 3]] + 3)
-    text += f'<ElementSet name="few">{members}</ElementSet>'
-    text += f'<Surface name="skin"><tri3 id="1">{corners}</tri3></Surface>'
-    (here / "a.feb").write_text(f"{text}</{section}></febio_spec>")
+    blocks = np.array_split(np.arange(len(mesh.cells)), len(names))
+    write_febio(here / "a.feb", version, zip(names, blocks, strict=True))
     loaded = load_mesh("a.feb")
     assert_allclose(loaded.mesh.points, mesh.points)
     assert_array_equal(loaded.mesh.cells, mesh.cells)
     assert_array_equal(loaded.sets.cells["few"], [0, 1])
     assert len(loaded.sets.facets["skin"]) == 1
-    assert_array_equal(loaded.labels, 1 + (np.arange(len(mesh.cells)) >= half))
+    assert_array_equal(loaded.labels, 1 + (np.arange(len(mesh.cells)) >= blocks[-1][0]))
+
+
+def test_other_cells_of_febio_are_refused(here):
+    cell = '<Elements type="pyra5" name="q"><elem id="900">3,4,5,6,7</elem></Elements>'
+    write_febio(here / "a.feb", "4.0", [("a", np.arange(40))], cell)
+    with refusal("pyramid"):
+        load_mesh("a.feb")
+
+
+def write_febio(path, version, blocks, extra=""):
+    mesh = box_mesh(3)
+    section = "Geometry" if version == "2.5" else "Mesh"
+    text = f'<febio_spec version="{version}"><{section}><Nodes name="all">'
+    for k, x in enumerate(mesh.points.tolist()):
+        text += f'<node id="{k + 3}">{",".join(map(str, x))}</node>'
+    text += "</Nodes>"
+    for name, those in blocks:
+        text += f'<Elements type="tet4" mat="1" name="{name}">'
+        for k in those:
+            text += f'<elem id="{k + 1}">{",".join(map(str, mesh.cells[k] + 3))}</elem>'
+        text += "</Elements>"
+    members = "".join(f'<e id="{k}"/>' for k in (1, 2)) if version == "2.5" else "1,2"
+    corners = ",".join(str(x) for x in mesh.cells[0][[1, 2, 3]] + 3)
+    text += f'{extra}<ElementSet name="few">{members}</ElementSet>'
+    text += f'<Surface name="skin"><tri3 id="1">{corners}</tri3></Surface>'
+    path.write_text(f"{text}</{section}></febio_spec>")
 
 
 @pytest.mark.parametrize("name", ["a.inp", "a.feb", "a.mesh", "a.xdmf"])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 from scipy.spatial import KDTree
 
@@ -25,12 +27,13 @@ MERGE_EDGE_FRACTION = 1e-3
 # To find cells that touch others without common nodes: as many facets of the boundary, and nearest
 # cells of the boundary for each; a point outside a facet, in sizes of it
 PROBED_FACETS, PROBED_CELLS, PROBE_FRACTION = 4000, 32, 0.01
-# Other programs' names of cell data with labels, in lower case, the most specific ones first.
+# Names of cell data with labels, in lower case without spaces and underscores, the most specific
+# ones first.
 LABEL_NAMES = """
-label labels medit:ref gmsh:physical tissue tissues tissue_type regionid region_id modelregionid
-region regions materialid materialids material_id material materials subdomain subdomains
-subdomain_id domain domains domain_id cellentityids attribute attributes partid part_id elemtag
-cell_tags cell_markers segmentation seg tag tags ref
+label labels medit:ref gmsh:physical tissue tissues tissuetype regionid modelregionid region regions
+materialid materialids matid material materials subdomain subdomains subdomainid domain domains
+domainid cellentityids attribute attributes partid elemtag celltags cellmarkers segmentation seg tag
+tags ref
 """
 
 
@@ -189,17 +192,25 @@ def with_labels(
                 f"there are {list_names([*fields]) or 'none'}"
             )
         return cell_data | {LABEL_FIELD: fields[name]}, ()
-    if LABEL_FIELD in cell_data:
-        return cell_data, ()
     # a material of a modulus is a bin, not a tissue
     known = {
-        each.lower(): each
-        for each, labels in fields.items()
+        re.sub("[ _]", "", each.lower()): each
+        for each, labels in sorted(fields.items(), key=lambda item: item[0] == LABEL_FIELD)
         if labels.any() and not ("young" in cell_data and each == "material")
     }
     names = [known[each] for each in LABEL_NAMES.split() if each in known]
+    notes = []
+    if LABEL_FIELD in cell_data.keys() - fields.keys():
+        notes.append(
+            f'cell field "{LABEL_FIELD}" is not used: expected one whole number from 0 for each '
+            "cell"
+        )
     if not names:
-        return cell_data, ()
-    words = f'labels are those of cell field "{names[0]}"'
-    words += f"; `label_field` takes another, {list_names(names[1:])}" if names[1:] else ""
-    return {LABEL_FIELD: fields[names[0]]} | cell_data, (words,)
+        return cell_data | {name: fields[name] for name in fields.keys() & {LABEL_FIELD}}, (*notes,)
+    first, *others = names
+    if first != LABEL_FIELD:
+        words = f'labels are those of cell field "{first}"'
+        words += f"; `label_field` takes another, {list_names(others)}" if others else ""
+        notes.append(words)
+    rest = {each: values for each, values in cell_data.items() if each != LABEL_FIELD}
+    return {LABEL_FIELD: fields[first]} | rest, (*notes,)

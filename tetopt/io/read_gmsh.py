@@ -140,6 +140,8 @@ def _msh(text: bytes) -> Raw:
         groups_of = _groups_of_entities(_Numbers(entities, order))
     nodes = _section(text, "Nodes")
     elements = _section(text, "Elements")
+    if not nodes or not elements:
+        raise InputError(f"damaged: it has no ${'Elements' if nodes else 'Nodes'}")
     if groups_of is None:
         numbers, points = _nodes_2(nodes, order)
         blocks = list(_elements_2(elements, order))
@@ -453,6 +455,8 @@ def _sections(text: bytes, name: str) -> Iterator[bytes]:
     while start >= 0:
         before = text.index(b"\n", start + 1)
         end = text.find(f"\n$End{name}".encode(), before)
+        if end < 0:
+            raise InputError(f"damaged: ${name} does not end")
         yield text[before + 1 : end]
         start = text.find(head, max(end, before))
 

@@ -23,27 +23,34 @@ from tetopt.io.apart import read_apart
 from tetopt.io.gmsh import own_comments
 from tetopt.io.raw import Group, Raw, by_corners
 from tetopt.io.read_gmsh import of_ours, places_of
+from tetopt.io.text import list_names
 from tetopt.model.label_names import LABEL_FIELD, TABLE_TEXT, LabelTable, table_words
 from tetopt.model.model import STRESS_UNITS, WATER_DENSITY
 from tetopt.model.sets import facet_triples
 from tetopt.system.arrays import Arrays, Floats, Ints, Json
 
-# Abaqus' and FEBio's cells by their number of nodes; other elements are no part of a mesh
+# Abaqus' and FEBio's cells by their number of nodes
 CELLS_BY_COUNT = {
     **{"solid 4": "tetra", "solid 10": "tetra10", "solid 6": "wedge", "solid 8": "hexahedron"},
     **{"solid 15": "wedge15", "solid 20": "hexahedron20", "face 3": "triangle"},
-    **{"face 6": "triangle6", "face 4": "quad", "face 8": "quad8"},
+    **{"face 6": "triangle6", "face 4": "quad", "face 8": "quad8", "solid 5": "pyramid"},
 }
 ABAQUS_SOLID = r"D?C3D(\d+)"
 ABAQUS_FACE = r"(?:CP[ESEG]+|CAX|DC2D|DS|S|STRI|M3D|SFM3D|R3D)(\d+)"
+# Elements that are no cells, which are left out: beams, trusses, springs, masses, connectors
+ABAQUS_OTHERS = (
+    r"B[23]\d|PIPE|ELBOW|FRAME|T[23]D|DC1D|SPRING|DASHPOT|MASS|ROTARYI|HEATCAP|CONN|GAP|DGAP|IT[ST]|"
+    r"JOINT|DCOUP|RB[23]D|R2D|RAX|SAX|MAX|DSAX|D$"
+)
+FEBIO_OTHERS = r"line|truss|beam"
 MEDIT_KINDS = {
     **{"Edges": "line", "Triangles": "triangle", "Tetrahedra": "tetra", "EdgesP2": "line3"},
     **{"TrianglesP2": "triangle6", "TetrahedraP2": "tetra10", "Quadrilaterals": "quad"},
     **{"Hexahedra": "hexahedron", "Prisms": "wedge", "Pyramids": "pyramid"},
 }
-# Abaqus' cards of nodes and elements that are not in the file itself
 MOST_MEMBERS = 10**8  # of a generated set
-GENERATED = ("INCLUDE", "NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY")
+# Abaqus' cards of nodes and elements that are not in the file itself, or are in other axes
+GENERATED = ("INCLUDE", "NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM")
 
 
 class FileNumbers(NamedTuple):
@@ -57,6 +64,7 @@ class FileNumbers(NamedTuple):
     triangles: dict[str, Ints]  # surfaces: numbers of nodes, (K, 3)
     parts: dict[str, str]  # the material of a set of elements
     constants: dict[str, dict[str, Floats]]  # of a material, by name: one number, or one a cell
+    others: dict[str, int]  # numbers of elements that are no cells, by type
 
 
 def read_inp(path: Path) -> Raw:
@@ -82,7 +90,12 @@ def read_medit(path: Path) -> Raw:
     text = path.read_text("utf-8", "replace")
     lines = [line[2:] for line in text.splitlines() if line.startswith("# ")]
     parts = re.split(r"^\s*([A-Za-z]\w*)", re.sub("#.*", "", text), flags=re.MULTILINE)
-    sections = dict(zip(parts[1::2], map(_numbers, parts[2::2]), strict=True))
+    sections: dict[str, Floats] = {}
+    for keyword, numbers in zip(parts[1::2], map(_numbers, parts[2::2]), strict=True):
+        if keyword in sections:  # one more section of a keyword has more rows of it
+            count, *rest = sections[keyword]
+            numbers = np.concatenate([numbers[:1] + count, rest, numbers[1:]])
+        sections[keyword] = numbers
     if not {"Dimension", "Vertices"} <= sections.keys():
         raise InputError("expected a medit mesh as text, with Dimension and Vertices")
     n = int(sections["Dimension"][0])
@@ -120,9 +133,10 @@ def _xdmf_fields(path: str) -> Json:
 
     try:
         file = meshio.read(path)
-    except (Exception, SystemExit) as error:  # meshio can raise any error
+    except (Exception, SystemExit) as error:  # meshio can raise any error, and exits for others
+        why = "expected one uniform grid" if isinstance(error, SystemExit) else str(error)
         words = "save it as .vtu, by ParaView or meshio convert"
-        raise InputError(f"cannot be read as one XDMF mesh ({error}); {words}") from error
+        raise InputError(f"cannot be read as one XDMF mesh ({why}); {words}") from error
     cells: dict[str, Ints] = {}
     cell_data: dict[str, Arrays] = {name: {} for name in file.cell_data}
     for kind in dict.fromkeys(block.type for block in file.cells):
@@ -173,27 +187,22 @@ def _row_places(rows: Ints, some: Ints) -> Ints:
 
 def _abaqus(text: str) -> FileNumbers:
     """Return what an input file lists."""
-    file = FileNumbers([], [], {}, {}, {}, {}, {}, {})
+    file = FileNumbers([], [], {}, {}, {}, {}, {}, {}, {})
     material = ""
+    spelling: dict[tuple[str, str], str] = {}
     text = re.sub(r"^\*\*.*\n?", "", text, flags=re.MULTILINE)
     for block in re.split(r"^\*", text, flags=re.MULTILINE)[1:]:
-        head, _, body = block.partition("\n")
-        card, *words = (word.strip().strip('"') for word in head.split(","))
-        pairs = (word.partition("=") for word in words)
-        options = {key.strip().upper(): value.strip().strip('"') for key, _, value in pairs}
-        card = card.upper()
-        if card in GENERATED or (card == "INSTANCE" and body.strip()):
+        card, options, body = _card(block, spelling)
+        is_turned = card == "NODE" and options.get("SYSTEM", "R").upper() != "R"
+        if card in GENERATED or is_turned or (card == "INSTANCE" and body.strip()):
+            card += ", SYSTEM" * is_turned
             raise InputError(f"cannot be read with *{card}; export one mesh with all its nodes")
         if card == "NODE":
             rows = np.atleast_2d(_rows_of_lines(body))
             file.nodes.append((rows[:, 0].astype(np.int64), _in_space(rows[:, 1:4])))
             _add(file.points, options.get("NSET"), file.nodes[-1][0])
-        elif card == "ELEMENT" and (kind := _abaqus_kind(options.get("TYPE", ""))):
-            name, n_nodes = kind
-            numbers = _numbers(body.replace(",", " ")).astype(np.int64)
-            element, *nodes = numbers.reshape(-1, 1 + n_nodes).T
-            file.elements.append((name, element, np.column_stack(nodes)))
-            _add(file.cells, options.get("ELSET"), element)
+        elif card == "ELEMENT":
+            _add_elements(file, options, body)
         elif card in ("ELSET", "NSET") and card in options:
             sets = file.cells if card == "ELSET" else file.points
             _add(sets, options[card], _set_members(body, sets, is_range="GENERATE" in options))
@@ -214,6 +223,43 @@ def _abaqus(text: str) -> FileNumbers:
     return file
 
 
+def _card(block: str, spelling: dict[tuple[str, str], str]) -> tuple[str, dict[str, str], str]:
+    """Return a keyword, its options and the lines of data; names have their first `spelling`,
+    as Abaqus knows no case.
+    """
+    head, _, body = block.partition("\n")
+    while head.rstrip().endswith(",") and re.match(r"\s*[A-Za-z]", body):
+        more, _, body = body.partition("\n")
+        head += more
+    card, *words = (word.strip().strip('"') for word in head.split(","))
+    card = card.upper()
+    options = {}
+    for key, _, value in (word.partition("=") for word in words):
+        key, value = key.strip().upper(), value.strip().strip('"')
+        of = card if key == "NAME" else key
+        options[key] = spelling.setdefault((of, value.casefold()), value)
+    return card, options, body
+
+
+def _add_elements(file: FileNumbers, options: dict[str, str], body: str) -> None:
+    """Add the cells of a card, or the number of its elements that are none."""
+    word = options.get("TYPE", "")
+    kind = _abaqus_kind(word)
+    numbers = _numbers(body.replace(",", " ")).astype(np.int64)
+    if kind is None:
+        n_more = len(re.findall(r",[ \t]*$", body, re.MULTILINE))  # lines that go on
+        n_lines = sum(bool(line.strip()) for line in body.splitlines())
+        file.others[word] = file.others.get(word, 0) + n_lines - n_more
+        _add(file.cells, options.get("ELSET"), numbers[:0])
+        return
+    name, n_nodes = kind
+    if len(numbers) % (1 + n_nodes):
+        raise InputError(f"damaged: expected {1 + n_nodes} numbers for each element of {word}")
+    element, *nodes = numbers.reshape(-1, 1 + n_nodes).T
+    file.elements.append((name, element, np.column_stack(nodes)))
+    _add(file.cells, options.get("ELSET"), element)
+
+
 def _abaqus_kind(word: str) -> tuple[str, int] | None:
     """Return the type of cells and its number of nodes; None for springs, beams and the like."""
     for what, pattern in (("solid", ABAQUS_SOLID), ("face", ABAQUS_FACE)):
@@ -221,7 +267,15 @@ def _abaqus_kind(word: str) -> tuple[str, int] | None:
             count = {"65": 6}.get(match[1], match[1])  # STRI65
             if (kind := CELLS_BY_COUNT.get(f"{what} {count}")) is not None:
                 return kind, int(count)
+    if re.match(ABAQUS_OTHERS, word.upper()) is None:
+        raise _unknown_type(word)
     return None
+
+
+def _unknown_type(word: str) -> InputError:
+    return InputError(
+        f'expected tetrahedra or triangles, of order 1 or 2, found elements of type "{word}"'
+    )
 
 
 def _add(sets: dict[str, Ints], name: str | None, members: Ints) -> None:
@@ -233,14 +287,23 @@ def _add(sets: dict[str, Ints], name: str | None, members: Ints) -> None:
 def _set_members(body: str, sets: dict[str, Ints], is_range: bool = False) -> Ints:
     """Return the numbers in lines of numbers and names of sets."""
     if is_range:
-        rows = np.atleast_2d(_rows_of_lines(body)).astype(np.int64).tolist()
+        lines = [line.replace(",", " ") for line in body.splitlines() if line.strip()]
+        rows = [_numbers(line).astype(np.int64).tolist() for line in lines]
         ranges = [range(first, last + 1, *step) for first, last, *step in rows]
         if sum(map(len, ranges)) > MOST_MEMBERS:
             raise InputError(f"damaged: a set of more than {MOST_MEMBERS:.0e} members")
         return np.concatenate([np.arange(each.start, each.stop, each.step) for each in ranges])
     words = [word.strip().strip('"') for word in re.split(r"[,\n]", body)]
     numbers = [int(word) for word in words if word.isdecimal()]
-    named = [sets[word] for word in words if not word.isdecimal() and word in sets]
+    places = {name.casefold(): members for name, members in sets.items()}
+    named = []
+    for word in words:
+        if word and not word.isdecimal():
+            name = word.casefold()
+            name = name if name in places else name.rpartition(".")[2]  # INSTANCE.SET
+            if name not in places:
+                raise InputError(f'damaged: expected a set, found "{word}", which it does not have')
+            named.append(places[name])
     return np.concatenate([np.array(numbers, dtype=np.int64), *named])
 
 
@@ -249,21 +312,29 @@ def _set_members(body: str, sets: dict[str, Ints], is_range: bool = False) -> In
 
 def _febio(root: ElementTree.Element) -> FileNumbers:
     """Return what a file lists, of versions 2 to 4."""
-    file = FileNumbers([], [], {}, {}, {}, {}, {}, {})
+    file = FileNumbers([], [], {}, {}, {}, {}, {}, {}, {})
     for nodes in root.iter("Nodes"):
         file.nodes.append((_ids(nodes), _of_children(nodes)))
     domains = {each.get("name"): each.get("mat", "") for each in root.iter("SolidDomain")}
     for block in root.iter("Elements"):
-        match = re.fullmatch(r"(?:(tet|hex|penta)|(?:tri|quad|q))(\d+).*", block.get("type", ""))
+        word = block.get("type", "")
+        match = re.fullmatch(r"(?:(tet|hex|penta|pyra)|(?:tri|quad|q))(\d+).*", word.lower())
         kind = (
             CELLS_BY_COUNT.get(f"{'solid' if match[1] else 'face'} {match[2]}") if match else None
         )
-        if kind is not None and len(block):
+        if not len(block):
+            continue
+        if kind is not None:
             file.elements.append((kind, _ids(block), _of_children(block).astype(np.int64)))
             name = block.get("name", f"part {len(file.parts) + 1}")
             file.parts[name] = name
-            file.cells[name] = _ids(block)
+            blocks = [file.cells[name]] if name in file.cells else []
+            file.cells[name] = np.concatenate([*blocks, _ids(block)])
             file.constants[name] = _febio_constants(root, name, domains.get(name, ""))
+        elif re.match(FEBIO_OTHERS, word.lower()):
+            file.others[word] = file.others.get(word, 0) + len(block)
+        else:
+            raise _unknown_type(word)
     for what, sets in (("ElementSet", file.cells), ("NodeSet", file.points)):
         for each in root.iter(what):
             members = _ids(each) if len(each) else _numbers((each.text or "").replace(",", " "))
@@ -330,8 +401,24 @@ def _raw_of(file: FileNumbers, lines: list[str]) -> Raw:
     }
     facets = _facets_of(file, raw, kind, ids[kind], place)
     raw = _with_texts(_with_groups(raw, members, facets), lines)
+    raw = raw._replace(notes=(*raw.notes, *_lost_words(file, ids)))
     constants = {name: file.constants.get(each, {}) for name, each in file.parts.items()}
     return _with_materials(raw, kind, parts, constants)
+
+
+def _lost_words(file: FileNumbers, ids: dict[str, Ints]) -> Iterator[str]:
+    """Yield notes on elements that are no cells, and on sets of others than the file's cells."""
+    if file.others:
+        counts = [f"{count} of type {word}" for word, count in file.others.items()]
+        yield f"left out elements that are no cells: {', '.join(counts)}"
+    numbers = np.concatenate(list(ids.values()))
+    n_lost = {name: int((~np.isin(those, numbers)).sum()) for name, those in file.cells.items()}
+    if any(n_lost.values()):
+        names = [name for name, count in n_lost.items() if count]
+        yield (
+            f"left out {sum(n_lost.values())} members of {list_names(names)}, which are none of "
+            "its cells"
+        )
 
 
 def _kind_of(raw: Raw) -> str:
@@ -459,7 +546,7 @@ def _numbers(text: str) -> Floats:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         try:
-            return np.fromstring(text, sep=" ")
+            return np.fromstring(text.replace("D", "E").replace("d", "e"), sep=" ")  # Fortran's
         except (ValueError, DeprecationWarning) as error:
             raise InputError(
                 f"damaged: expected numbers ({' '.join(text.split())[:40]})"
@@ -475,10 +562,14 @@ def _rows(values: Floats, width: int) -> Floats:
 
 
 def _rows_of_lines(body: str) -> Floats:
-    """Return the numbers of lines with commas, a row for each line."""
-    width = len(body.lstrip().partition("\n")[0].strip().rstrip(",").split(","))
-    values = _numbers(body.replace(",", " "))
-    if len(values) % width:
+    """Return the numbers of lines with commas, a row for each line; blank ones are 0, also after
+    a last comma.
+    """
+    lines = [line for each in body.splitlines() if (line := each.strip())]
+    width = 1 + max((line.removesuffix(",").count(",") for line in lines), default=0)
+    lines = [line + "," * (width - line.count(",") if line.endswith(",") else 1) for line in lines]
+    values = _numbers(re.sub(r",[ \t]*(?=,)", " 0", "\n".join(lines)).replace(",", " "))
+    if any(line.count(",") != width for line in lines) or len(values) != len(lines) * width:
         raise InputError(f"damaged: expected lines of {width} numbers")
     return values.reshape(-1, width)
 
