@@ -137,6 +137,22 @@ def table_of(tmp_path, text, name="table.txt", encoding="utf-8"):
             {},
         ),
         ("index\tname\tcolor\n1\tspleen\tff8000\n", {1: "spleen"}, {1: (255, 128, 0)}),
+        # a separator tells where a name ends; in blanks, all lines do
+        ("1\trib 3\t10\t20\t30\n2\trib 4\t9\t8\t7\n", {1: "rib 3", 2: "rib 4"}, {2: (9, 8, 7)}),
+        ("1,rib 3,10,20,30\n", {1: "rib 3"}, {1: (10, 20, 30)}),
+        ("819 A 0 80 0 0 2\n820 A 1 80 0 0 2\n", {819: "A", 820: "A"}, {820: (1, 80, 0)}),
+        ("819 A 0 80 0 128 2\n820 B 1 80 0 0 2\n", {819: "A", 820: "B"}, {819: (0, 80, 0)}),
+        (
+            "1 left kidney 1 2 3 255\n2 right liver 4 5 6 255\n",
+            {1: "left kidney", 2: "right liver"},
+            {2: (4, 5, 6)},
+        ),
+        (
+            "1 v #3 1 2 3 0 # note\n2 a 4 5 6 0\n",
+            {1: "v #3", 2: "a"},
+            {1: (1, 2, 3), 2: (4, 5, 6)},
+        ),
+        ("1 liver # note\r2 spleen\r", {1: "liver", 2: "spleen"}, {}),
         # twice the same is one
         ("1 spleen 1 2 3 0\n1 spleen 1 2 3 0\n", {1: "spleen"}, {1: (1, 2, 3)}),
     ],
@@ -198,6 +214,9 @@ def test_a_background_without_a_colour_has_none(tmp_path):
         ("label,name,r,g,b\n1,spleen,0.1,0.2,2\n", "from 0 to 1, got 0.1, 0.2, 2"),
         ("0 a 0 0 0 0\n1 spleen 256 0 0 0\n", "line 2: expected red, green and blue from 0 to 255"),
         ("0 a 0 0 0 0\n1 spleen\n", 'line 2: expected label, name, red, .* got "1 spleen"'),
+        ("1 rib 3 10 20 30\n2 rib 4 9 8 7\n", "colours; separate"),
+        ("1 liver 10 20 30\n2 rib 4 9 8 7\n", "colours; separate"),
+        ("1 A 0 80 0 0 0\n2 A 1 80 0 0 0\n", "colours; separate"),
         ('0 0 0 0 0 0 0 "a"\n1 spleen 1 2 3 0\n', "line 2: expected label, red, .* as in ITK-SNAP"),
         ("1 (none) 1 2 3 0\n", "expected names of labels, found none"),
         (

@@ -52,7 +52,10 @@ PAIR_LINE = re.compile(
 )
 # A label, a name that may have blanks, and all numbers after it.
 LUT_LINE = re.compile(r"\s*(\d{1,10})[\s,;]+(\S.{0,1000}?)((?:[\s,;]+-?\d+(?:\.\d*)?){3,9})\s*")
-MOST_TISSUES = 9  # FreeSurfer's tissue types are below
+COMMENT = re.compile(r'\s+#\s+[^\W\d][^"]*$')  # after a name, which may have a # in it
+ABBREVIATION = re.compile(r"\W.*|.*[._-].*")  # MRtrix's, such as L.BSTS
+TISSUES = frozenset(range(-1, 10))  # FreeSurfer's types
+OPACITIES = frozenset((0, 1, 255))  # usual ones
 # Names of columns, in lower case without blanks; the first one present is used.
 LABEL_COLUMNS = ("labelvalue", "index", "id", "value", "labelid", "label", "labels")
 NAME_COLUMNS = (
@@ -232,7 +235,10 @@ def _of_xml(path: Path, text: str) -> Iterator[LabelEntry]:
 
 def _of_text(path: Path, text: str) -> Iterator[LabelEntry]:
     """Yield the labels of the lines, all in the format of the first line."""
-    lines = [(number, line.strip(" ")) for number, line in enumerate(text.split("\n"), 1)]
+    lines = [
+        (number, COMMENT.sub("", line).strip(" "))
+        for number, line in enumerate(re.split(r"\r\n?|\n", text), 1)
+    ]
     lines = [(number, line) for number, line in lines if line.strip() and not line.startswith("#")]
     if not lines:
         raise InputError(f"{path}: expected a label and its name on each line, found no lines")
@@ -247,7 +253,9 @@ def _of_text(path: Path, text: str) -> Iterator[LabelEntry]:
             yield LabelEntry(where, int(label), _one_line(name))
     elif LUT_LINE.fullmatch(first):
         words = "label, name, red, green, blue, opacity, as in FreeSurfer and 3D Slicer"
-        yield from _of_colours(path, list(_match_lines(path, lines, LUT_LINE, words)))
+        rows = list(_match_lines(path, lines, LUT_LINE, words))
+        split = next(filter(None, (_split_names(path, lines, each) for each in "\t,;")), None)
+        yield from _of_colours(path, split or rows, split is not None, "mrtrix" in text.lower())
     else:
         yield from _of_columns(path, lines)
 
@@ -261,25 +269,39 @@ def _match_lines(
         yield f"line {number}", match.groups()
 
 
-def _of_colours(path: Path, lines: list[tuple[str, tuple[str, ...]]]) -> Iterator[LabelEntry]:
+def _split_names(
+    path: Path, lines: list[tuple[int, str]], separator: str
+) -> list[tuple[str, tuple[str, ...]]]:
+    """Return label, name and numbers where a separator is around all names; none elsewhere."""
+    rows = []
+    for number, line in lines:
+        cells = [each.strip() for each in _cells(path, number, line, separator)]
+        label, name = [*cells, "", ""][:2]
+        match = LUT_LINE.fullmatch(f"{label} x {' '.join(cells[2:])}")
+        if match is None or match[2] != "x" or not name:
+            return []
+        rows.append((f"line {number}", (label, name, match[3])))
+    return rows
+
+
+def _of_colours(
+    path: Path, lines: list[tuple[str, tuple[str, ...]]], is_split: bool, is_mrtrix: bool
+) -> Iterator[LabelEntry]:
     """Yield the labels of lines with a label, a name and numbers: a colour, and what programs add
-    to it.
+    to it. Without separators around names, the first numbers may belong to these.
     """
     rows = [
         (where, label, name.split(), re.split(r"[\s,;]+", numbers.strip(" \t,;")))
         for where, (label, name, numbers) in lines
     ]
-    long = [(words, [*map(float, numbers)]) for *_, words, numbers in rows if len(numbers) > 4]
-    # The fifth number is a tissue type, unless names end in numbers, such as "rib 3".
-    has_types = (
-        all(len(words) == 1 and len(v) == 5 and v[3] in (0.0, 255.0) for words, v in long)
-        and len({words[0] for words, _ in long}) == len(long)
-        and 0.0 < max((v[-1] for _, v in long), default=0.0) <= MOST_TISSUES
-    )
-    # Names of two words seldom differ in both, as abbreviations and names do.
+    has_types = is_split or _has_types(path, rows)
+    # Names of two words may differ in both, as abbreviations and names do.
     pairs = [words for *_, words, numbers in rows if (len(words), len(numbers)) == (2, 4)]
-    has_short = 1 < len(rows) == len(pairs) and all(
-        len(set(each)) == len(rows) for each in zip(*pairs, strict=True)
+    has_short = (
+        not is_split
+        and 1 < len(rows) == len(pairs)
+        and all(len(set(each)) == len(rows) for each in zip(*pairs, strict=True))
+        and (is_mrtrix or all(ABBREVIATION.fullmatch(short) for short, _ in pairs))
     )
     if has_short:
         warn(f"{path}: read as MRtrix's: label, abbreviation, name, colour", Note)
@@ -289,6 +311,35 @@ def _of_colours(path: Path, lines: list[tuple[str, tuple[str, ...]]]) -> Iterato
         name = " ".join(words[has_short:] + numbers[:n_kept]).strip('"')
         colour = _colour(path, where, numbers[n_kept:][:3], whole)
         yield LabelEntry(where, int(label), _one_line(name), colour)
+
+
+def _has_types(path: Path, rows: Sequence[tuple[str, str, list[str], list[str]]]) -> bool:
+    """Return whether the fifth numbers are tissue types, as in FreeSurfer's, and not opacities
+    after names that end in numbers, such as "rib 3".
+
+    Raises
+    ------
+    InputError
+        They may be both; or only some lines have opacities, or those may be part of the colours.
+    """
+    long = [(words, [*map(float, numbers)]) for *_, words, numbers in rows if len(numbers) > 4]
+    counts = {len(numbers) for *_, numbers in rows}
+    names = {(label, *words) for _, label, words, _ in rows}
+    is_doubled = len({each[1:] for each in names}) < len(names)
+    opacities = {float(numbers[3]) for *_, numbers in rows if len(numbers) == 4}
+    is_unclear = 3 in counts and len(counts) > 1
+    is_unclear |= counts == {4} and is_doubled and not opacities <= OPACITIES
+    lasts = {values[-1] for _, values in long}
+    has_types = bool(long) and lasts <= TISSUES and all(len(values) == 5 for _, values in long)
+    if has_types and lasts <= OPACITIES:
+        has_types = False
+        is_unclear |= all(len(words) == 1 and values[3] in OPACITIES for words, values in long)
+    if is_unclear:
+        raise InputError(
+            f"{path}: the numbers may end names or be colours; separate the columns by tabs, "
+            "or name them in the first row"
+        )
+    return has_types
 
 
 def _of_columns(path: Path, lines: list[tuple[int, str]]) -> Iterator[LabelEntry]:
