@@ -54,8 +54,8 @@ PAIR_LINE = re.compile(
 LUT_LINE = re.compile(r"\s*(\d{1,10})[\s,;]+(\S.{0,1000}?)((?:[\s,;]+-?\d+(?:\.\d*)?){3,9})\s*")
 COMMENT = re.compile(r'\s+#\s+[^\W\d][^"]*$')  # after a name, which may have a # in it
 ABBREVIATION = re.compile(r"\W.*|.*[._-].*")  # MRtrix's, such as L.BSTS
-TISSUES = frozenset(range(-1, 10))  # FreeSurfer's types
-OPACITIES = frozenset((0, 1, 255))  # usual ones
+TISSUE_TYPES = frozenset(range(-1, 10))  # FreeSurfer's types
+USUAL_OPACITIES = frozenset((0, 1, 255))  # usual ones
 # Names of columns, in lower case without blanks; the first one present is used.
 LABEL_COLUMNS = ("labelvalue", "index", "id", "value", "labelid", "label", "labels")
 NAME_COLUMNS = (
@@ -328,12 +328,14 @@ def _has_types(path: Path, rows: Sequence[tuple[str, str, list[str], list[str]]]
     is_doubled = len({each[1:] for each in names}) < len(names)
     opacities = {float(numbers[3]) for *_, numbers in rows if len(numbers) == 4}
     is_unclear = 3 in counts and len(counts) > 1
-    is_unclear |= counts == {4} and is_doubled and not opacities <= OPACITIES
+    is_unclear |= counts == {4} and is_doubled and not opacities <= USUAL_OPACITIES
     lasts = {values[-1] for _, values in long}
-    has_types = bool(long) and lasts <= TISSUES and all(len(values) == 5 for _, values in long)
-    if has_types and lasts <= OPACITIES:
+    has_types = bool(long) and lasts <= TISSUE_TYPES and all(len(values) == 5 for _, values in long)
+    if has_types and lasts <= USUAL_OPACITIES:
         has_types = False
-        is_unclear |= all(len(words) == 1 and values[3] in OPACITIES for words, values in long)
+        is_unclear |= all(
+            len(words) == 1 and values[3] in USUAL_OPACITIES for words, values in long
+        )
     if is_unclear:
         raise InputError(
             f"{path}: the numbers may end names or be colours; separate the columns by tabs, "
