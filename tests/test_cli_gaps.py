@@ -205,12 +205,27 @@ def test_padding_that_was_interpolated():
     assert read_warned("a.nii.gz")[0].range[0] > -1100.0
 
 
+@pytest.mark.parametrize("kind", ["lower", "mixed"])
+def test_padding_beside_other_values(tmp_path, kind):
+    h, r = scan(-3024.0)
+    if kind == "lower":
+        h[12, 12, 6] = -5000.0
+    else:
+        h[(r <= 11.0) & (np.arange(12) % 2 > 0)] = 40.0
+    save_image(tmp_path / "a.nii.gz", Image(h, AFFINE))
+    image, said = read_warned(tmp_path / "a.nii.gz")
+    assert "padding" in said[0]
+    assert np.mean(image.data < -1100.0) < 0.001
+
+
 @pytest.mark.parametrize(
     "data",
     [
         scan(-1024.0, noise=20.0)[0],  # no lower than the noise of air
         scan(-3024.0, beyond=5.0)[0],  # an organ that was cut out
         scan(-3024.0, beyond=50.0)[0],  # none
+        np.maximum(-1500.0 + 10.0 * np.indices((60, 8, 8))[0] - 100.0, -1500.0),  # distances
+        np.round(np.linspace(-1500.0, 1000.0, 60 * 64)).reshape(60, 8, 8),
         np.where(scan(0.0)[1] < 5.0, 300.0, 0.0),
         np.where(scan(0.0)[1] < 5.0, 1.0, -5.0),
         np.where((scan(0.0)[1] < 2.0) & (np.arange(12) % 11 > 0), -3024.0, -1000.0),  # within it

@@ -11,9 +11,13 @@ from numpy.typing import NDArray
 from tetopt.system.arrays import Bools
 
 PADDING_BELOW = -1100.0  # Hounsfield units: air has -1000, and its noise is hardly lower
-# voxels that have the least value: a fraction of all, and a number
-LEAST_PADDED, LEAST_PADDED_VOXELS = 0.001, 20
-AIR_BELOW = -500.0  # the median beside padding is that of air: around an organ cut out, it is not
+LEAST_PADDED, LEAST_PADDED_VOXELS = 0.001, 20  # fraction of the voxels, and number
+LEAST_COMMON = 0.2  # part of the low voxels that has a level's value, rounded
+LEAST_CONSTANT = 0.5  # part near the levels: a map that falls smoothly has none
+RINGING = 0.05  # of a level, by splines
+EDGE_VOXELS = 3  # beside padding, of which interpolation changes some
+AIR_BELOW = -800.0  # lungs included
+LEAST_AIR = 0.25  # part of the voxels beside padding; an organ that was cut out has less
 
 
 def replace_padding(data: NDArray, is_padding: Bools | None = None) -> tuple[NDArray, str]:
@@ -27,29 +31,25 @@ def replace_padding(data: NDArray, is_padding: Bools | None = None) -> tuple[NDA
     ----------
     data : (s_0, ..., s_{n-1}) array of numbers
     is_padding : (s_0, ..., s_{n-1}) bool, optional
-        The padding that the file states. By default, voxels below -1100 connected to those of the
-        least value, if these are 20 and a thousandth of all or more, one of them is on the box's
-        sides, and air (below -500) is beside them.
+        The padding that the file states. By default, voxels below -1100 connected to those of a
+        constant level on the box's sides, which most of those below -1100 have or are close to, if
+        a quarter of those beside are air.
 
     Returns
     -------
     (s_0, ..., s_{n-1}) array, str
         The data, and a note; the data itself, and an empty text, if there is no padding.
     """
-    most = np.inf
-    if is_padding is None:
-        low = data.min()
-        if not low < PADDING_BELOW:
-            return data, ""
-        is_low = data == low
-        sides = [is_low.take([0, -1], axis).any() for axis in range(data.ndim)]
-        if is_low.sum() < max(LEAST_PADDED * data.size, LEAST_PADDED_VOXELS) or not any(sides):
-            return data, ""
-        is_padding = scipy.ndimage.binary_propagation(is_low, mask=data < PADDING_BELOW)
-        most = AIR_BELOW
-    beside = data[scipy.ndimage.binary_dilation(is_padding) & ~is_padding]
-    if len(beside) == 0 or not (middle := np.median(beside)) <= most:
+    if is_padding is not None:
+        beside = _values_beside(data, is_padding, 1)
+    else:
+        is_padding = _low_levels(data)
+        beside = _values_beside(data, is_padding, EDGE_VOXELS)
+        is_air = beside < AIR_BELOW
+        beside = beside[is_air & (np.count_nonzero(is_air) >= LEAST_AIR * len(beside))]
+    if len(beside) == 0:
         return data, ""
+    middle = np.median(beside)
     half = beside[beside <= middle]
     values = np.concatenate([half, 2.0 * middle - half])
     data = data.copy()
@@ -58,3 +58,34 @@ def replace_padding(data: NDArray, is_padding: Bools | None = None) -> tuple[NDA
     )
     data[is_padding] = np.random.default_rng(0).choice(values, np.count_nonzero(is_padding))
     return data, f"{words}: they get values of the air beside them, about {middle:g}"
+
+
+def _values_beside(data: NDArray, is_padding: Bools, steps: int) -> NDArray:
+    return data[scipy.ndimage.binary_dilation(is_padding, iterations=steps) & ~is_padding]
+
+
+def _low_levels(data: NDArray) -> Bools:
+    """Return the voxels of constant levels far below air that start at the box's sides, and what
+    interpolation made of their edges; none if there are no such levels.
+    """
+    is_low = data < PADDING_BELOW
+    least = max(LEAST_PADDED * data.size, LEAST_PADDED_VOXELS)
+    none: Bools = np.zeros(data.shape, dtype=bool)
+    n_low = np.count_nonzero(is_low)
+    if n_low < least:
+        return none
+    values, counts = np.unique(np.round(data[is_low]), return_counts=True)
+    levels = values[counts >= max(LEAST_COMMON * n_low, least)]
+    is_level = is_low & np.isin(np.round(data), levels)
+    if not any(is_level.take([0, -1], axis).any() for axis in range(data.ndim)):
+        return none
+    is_close = np.zeros_like(none)
+    for level in levels:
+        is_close |= np.abs(data - level) <= RINGING * abs(level)
+    is_close &= is_low
+    is_edge = scipy.ndimage.binary_dilation(is_close, iterations=EDGE_VOXELS)
+    n_others = np.count_nonzero(is_low & ~is_edge)
+    if np.count_nonzero(is_close) < LEAST_CONSTANT * n_low or n_others >= least:
+        return none
+    padding: Bools = scipy.ndimage.binary_propagation(is_level, mask=is_low)
+    return padding
