@@ -14,7 +14,7 @@ PADDING_BELOW = -1100.0  # Hounsfield units: air has -1000, and its noise is har
 LEAST_PADDED, LEAST_PADDED_VOXELS = 0.001, 20  # fraction of the voxels, and number
 LEAST_COMMON = 0.2  # part of the low voxels that has a level's value, rounded
 LEAST_CONSTANT = 0.5  # part near the levels: a map that falls smoothly has none
-RINGING = 0.05  # of a level, by splines
+LEVEL_RINGING = 0.05  # of a level, by splines
 EDGE_VOXELS = 3  # beside padding, of which interpolation changes some
 AIR_BELOW = -800.0  # lungs included
 LEAST_AIR = 0.25  # part of the voxels beside padding; an organ that was cut out has less
@@ -81,7 +81,7 @@ def _low_levels(data: NDArray) -> Bools:
         return none
     is_close = np.zeros_like(none)
     for level in levels:
-        is_close |= np.abs(data - level) <= RINGING * abs(level)
+        is_close |= np.abs(data - level) <= LEVEL_RINGING * abs(level)
     is_close &= is_low
     is_edge = scipy.ndimage.binary_dilation(is_close, iterations=EDGE_VOXELS)
     n_others = np.count_nonzero(is_low & ~is_edge)
