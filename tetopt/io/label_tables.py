@@ -273,7 +273,7 @@ def _split_names(
     path: Path, lines: list[tuple[int, str]], separator: str
 ) -> list[tuple[str, tuple[str, ...]]]:
     """Return label, name and numbers where a separator is around all names; none elsewhere."""
-    rows = []
+    rows: list[tuple[str, tuple[str, ...]]] = []
     for number, line in lines:
         cells = [each.strip() for each in _cells(path, number, line, separator)]
         label, name = [*cells, "", ""][:2]
