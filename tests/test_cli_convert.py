@@ -683,7 +683,7 @@ surface mesh.vtu -o s.obj --label 1
 view mesh.vtu --html a.png
     a.png
 view mesh.vtu --html b.html --field young
-    --field: the mesh has no field "young"; it has mean
+    --field: the mesh has no field "young"; it has label, mean
 view mesh.vtu --html b.html --range 3
     --range: expected LOW,HIGH, such as 0,120
 view mesh.vtu --html b.html --range low,3

@@ -40,7 +40,7 @@ def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("labels")
     mesh = labelled_lattice_words(path)
     (path / "t.csv").write_text(TABLE, encoding="utf-8")
-    (path / "bad.csv").write_text("label,name\n1,a\n1,b\n")
+    (path / "bad.csv").write_text("label,name\n1,a\nx,b\n")
     assert_done(*mesh, f"-o {path}/plain.vtu")
     names = f"--label-names {path}/t.csv --json {path}/named.json"
     assert_done(*mesh, f"-o {path}/named.vtu {names}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import cell_edges
@@ -83,7 +83,9 @@ def with_merged_nodes(raw: Raw, kind: str) -> Raw:
     if not np.isfinite(points[used]).all():
         return raw  # as well
     tolerance = MERGE_FRACTION * float(np.abs(points[used]).max())
-    tree = KDTree(points[used], compact_nodes=False, balanced_tree=False)  # built in half the time
+    tree = scipy.spatial.KDTree(
+        points[used], compact_nodes=False, balanced_tree=False
+    )  # built in half the time
     pairs = used[tree.query_pairs(tolerance, output_type="ndarray")]
     if len(pairs):
         apart = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
@@ -154,7 +156,7 @@ def _covered_fraction(mesh: Mesh) -> float:
     else:
         normals = sides[:, 0, ::-1] * [1.0, -1.0]
     probes = corners.mean(axis=1) + PROBE_FRACTION * normals
-    tree = KDTree(mesh.points[cells].mean(axis=1))
+    tree = scipy.spatial.KDTree(mesh.points[cells].mean(axis=1))
     near = tree.query(probes, k=min(PROBED_CELLS, len(cells)))[1].reshape(len(probes), -1)
     first, *others = np.moveaxis(mesh.points[cells[near]], 2, 0)
     edges = np.stack([other - first for other in others], axis=-1)
