@@ -371,7 +371,9 @@ COMMANDS = {
 def test_a_mesh_in_another_unit_is_told_or_refused(unit, origin, command, here, capsys):
     save_beside_image(3, UNITS[unit], origin=origin)
     code = exit_code(COMMANDS[command])
-    assert f"--mesh-units {unit}" in " ".join(capsys.readouterr().err.split())
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"--mesh-units {unit}" in said
+    assert said.count("times as long as the image") <= 1
     assert code == 2 or (unit, origin) != ("m", 0.0)
     assert exit_code(COMMANDS[command], f"--mesh-units {unit} --force") in (0, 1)
     assert "--mesh-units" not in capsys.readouterr().err

@@ -121,12 +121,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     atexit.register(gc.freeze)
     open_streams()
     with (
-        warnings.catch_warnings(),
+        warnings_once(),
         outputs_of_command() as outputs,
         signals_heard(),
         listen_with(show_event),
     ):
-        warnings.showwarning = warnings_once()
         # its font-cache notice does not concern the user
         logging.getLogger("matplotlib").setLevel(logging.ERROR)
         code = _run(list(sys.argv[1:] if argv is None else argv), outputs)

@@ -9,8 +9,10 @@ import os
 import re
 import sys
 import textwrap
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from typing import IO, TYPE_CHECKING, Any
 
 from rich.console import Console
@@ -35,6 +37,8 @@ HEADS = {
     "modulus": "young",
 }
 OPTION_NAMES: dict[str, str] = {}  # of the command that runs, by the arguments that messages name
+# warnings that the command has printed; None outside of one
+_SHOWN: ContextVar[set[str] | None] = ContextVar("shown", default=None)
 
 
 class _Stream:
@@ -219,22 +223,26 @@ def show_event(event: Event) -> None:
 
 
 def show_warning(message: str) -> None:
-    """Print a warning."""
-    _say(f"tetopt: warning: {plain(in_options(message))}", "tetopt: warning:", "yellow")
+    """Print a warning; each text once in a command."""
+    shown = _SHOWN.get()
+    if shown is None or message not in shown:
+        _say(f"tetopt: warning: {plain(in_options(message))}", "tetopt: warning:", "yellow")
+    if shown is not None:
+        shown.add(message)
 
 
-def warnings_once() -> Callable[..., None]:
-    """Return a replacement of `warnings.showwarning` that prints each text once: a file may be
-    image and labels.
+@contextmanager
+def warnings_once() -> Iterator[None]:
+    """Print Python's warnings and those of runs, each text once within this context: a file may be
+    image and labels, and several functions compare a mesh with the image.
     """
-    shown: set[str] = set()
-
-    def show(message: Warning | str, *_: Any, **__: Any) -> None:
-        if (text := str(message)) not in shown:
-            shown.add(text)
-            show_warning(text)
-
-    return show
+    token = _SHOWN.set(set())
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = lambda message, *_, **__: show_warning(str(message))
+            yield
+    finally:
+        _SHOWN.reset(token)
 
 
 def print_verdict(
