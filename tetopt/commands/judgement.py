@@ -15,8 +15,8 @@ from tetopt.commands.beside import check_part
 from tetopt.contents.labels import LARGEST_LABEL
 from tetopt.energy.discretization import content_E_D
 from tetopt.energy.sampling import cell_moments
-from tetopt.errors import InputError, prefix_errors
-from tetopt.geometry.check import check_mesh, check_place, manifold_problems, scaled_jacobians
+from tetopt.errors import InputError
+from tetopt.geometry.check import check_mesh, manifold_problems, scaled_jacobians
 from tetopt.geometry.simplex import dihedral_angles
 from tetopt.job.advice import (
     Problem,
@@ -27,8 +27,8 @@ from tetopt.job.advice import (
     unmet_requirements,
 )
 from tetopt.job.aligned import read_companion
-from tetopt.job.events import warning, warnings_heard
-from tetopt.job.mesh_file import label_table, read_mesh, warn_of_other_image
+from tetopt.job.events import warning
+from tetopt.job.mesh_file import check_mesh_place, label_table, read_mesh, warn_of_other_image
 from tetopt.job.options import WHOLE_IMAGE, ImagePart, MaskedPart, SourceOptions
 from tetopt.job.request import checksum
 from tetopt.job.source import Source, read_source
@@ -201,8 +201,7 @@ def judge(
         source = _source(loaded, image, labels, part, label_names)
         first = source.contrasts[0]
         is_registered = part.registered
-        with prefix_errors(mesh), warnings_heard():
-            check_place(loaded.mesh, first)
+        check_mesh_place(mesh, loaded.mesh, first)
         is_other = warn_of_other_image(
             loaded, mesh, image, first, is_registered=is_registered, is_exact=check
         )

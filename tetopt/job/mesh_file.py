@@ -8,13 +8,14 @@ import numpy as np
 
 from tetopt.contents.align import SAME_BOX_VOXELS, SAME_GRID_VOXELS
 from tetopt.energy.sampling import overlap_of
-from tetopt.errors import InputError
+from tetopt.errors import InputError, prefix_errors
+from tetopt.geometry.check import check_place
 from tetopt.image import Image
 from tetopt.io.images import sha256
 from tetopt.io.label_tables import LabelTable, load_label_table, own_label_table
 from tetopt.io.meshes import load_mesh
 from tetopt.io.text import list_names
-from tetopt.job.events import note, warning
+from tetopt.job.events import note, warning, warnings_heard
 from tetopt.job.option_values import file_and_volume
 from tetopt.job.options import MeshPart
 from tetopt.mesh import Mesh
@@ -37,6 +38,14 @@ def read_mesh(path: Path, part: MeshPart) -> MeshFile:
             f"{list_names(list(violated))}"
         )
     return loaded
+
+
+def check_mesh_place(what: object, mesh: Mesh, image: Image) -> None:
+    """Raise InputError for a mesh that does not meet the image; report one that meets it in part.
+    `what` begins the error.
+    """
+    with prefix_errors(what), warnings_heard():
+        check_place(mesh, image)
 
 
 def check_overlap(path: Path, mesh: Mesh, image: Image) -> None:

@@ -120,6 +120,17 @@ def mesh_task(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
     regions = None if task.regions is None else result.labels
     if regions is not None:
         result = result._replace(labels=task.labels_of(regions))
+    _tell_curving(task, result)
+    seconds = {"load": begins[0] - begin, "optimize": time.perf_counter() - begins[0]}
+    return_freed()  # by the search
+    n_nodes = max(result.nodes or 0, len(result.initial.points))
+    memory = {"predicted_bytes": most_bytes(n_nodes)}
+    early_file = early[-1] if early else None
+    return Meshed(result, result.initial, seconds, memory, early_file, regions)
+
+
+def _tell_curving(task: Task, result: MeshingResult) -> None:
+    """Note what became of the edges of order 2."""
     if result.curving is not None:
         note(curving_in_words(result.curving))
     elif (
@@ -131,12 +142,6 @@ def mesh_task(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
             "`start`: curved edges become straight, as there are no labels or mask for their "
             "nodes to follow"
         )
-    seconds = {"load": begins[0] - begin, "optimize": time.perf_counter() - begins[0]}
-    return_freed()  # by the search
-    n_nodes = max(result.nodes or 0, len(result.initial.points))
-    memory = {"predicted_bytes": most_bytes(n_nodes)}
-    early_file = early[-1] if early else None
-    return Meshed(result, result.initial, seconds, memory, early_file, regions)
 
 
 def _check_initial(task: Task, initial: Mesh) -> None:

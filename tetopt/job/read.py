@@ -7,13 +7,12 @@ from pathlib import Path
 import numba
 import numpy as np
 
-from tetopt.errors import InputError, prefix_errors
-from tetopt.geometry.check import check_place
+from tetopt.errors import InputError
 from tetopt.io.formats import format_of
 from tetopt.job.advice import tell_label_sizes
-from tetopt.job.events import note, start_stage, warnings_heard
+from tetopt.job.events import note, start_stage
 from tetopt.job.job import Job
-from tetopt.job.mesh_file import label_table, read_mesh, warn_of_other_image
+from tetopt.job.mesh_file import check_mesh_place, label_table, read_mesh, warn_of_other_image
 from tetopt.job.plan import (
     Plan,
     changed_options,
@@ -75,8 +74,7 @@ def read_planned(plan: Plan) -> Task:
     if start is not None:
         image = source.contrasts[0]
         path = Path(str(plan.job.start))
-        with prefix_errors(path), warnings_heard():
-            check_place(start.mesh, image)
+        check_mesh_place(path, start.mesh, image)
         warn_of_other_image(start, path, source.paths[0], image, is_registered=None)
         if plan.job.order is None and start.order == 2 and format_of(plan.job.output).has_quadratic:
             plan = plan._replace(job=changed_options(plan.job, order=2))

@@ -13,13 +13,12 @@ import numpy as np
 
 import tetopt
 from tetopt.engine.loop import MeshingResult
-from tetopt.errors import InputError, error_words, prefix_errors
-from tetopt.geometry.check import check_place
+from tetopt.errors import InputError, error_words
 from tetopt.image import Image
 from tetopt.io.formats import FIELDS, FORMATS, file_bytes, format_of, save_mesh, save_model
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.events import note, warning, warnings_heard
-from tetopt.job.mesh_file import label_table
+from tetopt.job.mesh_file import check_mesh_place, label_table
 from tetopt.job.options import ModelOptions, SolverOptions
 from tetopt.mesh import Mesh
 from tetopt.model.averages import DEFAULT_AVERAGE, parse_average
@@ -253,8 +252,7 @@ def convert_model(
     implausible units.
     """
     if image is not None:
-        with prefix_errors("mesh and image"), warnings_heard():
-            check_place(loaded.mesh, image)
+        check_mesh_place("mesh and image", loaded.mesh, image)
         fields = loaded.cell_data | cell_fields(loaded.mesh, image)
         loaded = loaded._replace(cell_data=fields)
     table = label_table(options.label_names, loaded)
