@@ -130,7 +130,7 @@ def cell_moments(image: Image, mesh: Mesh) -> CellMoments:
     >>> float(moments.mean.min()), float(moments.mean.max())
     (20.0, 100.0)
     """
-    image = continue_image(image, mask_of_values(image, mesh))
+    image = without_gaps(image, mesh)
     return _moments(image, mesh, _sample_cells(image, mesh))
 
 
@@ -138,7 +138,7 @@ def cell_moments_and_ranges(image: Image, mesh: Mesh) -> tuple[CellMoments, tupl
     """`cell_moments`, and the least and greatest intensity in each cell, (M,) each; in a cell
     without voxel centre the nearest voxel's.
     """
-    image = continue_image(image, mask_of_values(image, mesh))
+    image = without_gaps(image, mesh)
     sampled = _sample_cells(image, mesh)
     return _moments(image, mesh, sampled), _ranges(image, mesh, sampled)
 
@@ -230,6 +230,13 @@ def mask_of_values(image: Image, mesh: Mesh) -> Image | None:
         return None
     check_values(image, cell_of_voxel(image, mesh) >= 0)
     return Image(~np.isnan(image.data), image.affine)
+
+
+def without_gaps(image: Image, mesh: Mesh) -> Image:
+    """Return an image whose voxels without a value, all outside the cells, have the nearest one's;
+    itself without any. InputError as for `mask_of_values`.
+    """
+    return continue_image(image, mask_of_values(image, mesh))
 
 
 class Overlap(NamedTuple):

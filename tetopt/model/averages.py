@@ -18,13 +18,12 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from tetopt.contents.content import continue_image
 from tetopt.energy.sampling import (
     cell_of_voxel,
-    mask_of_values,
     nearest_values,
     nearest_voxels,
     ranges_of,
+    without_gaps,
 )
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import gauss_rule
@@ -255,7 +254,7 @@ def _see_voxels(image: Image, mesh: Mesh) -> tuple[Image, Ints]:
     without voxels. All other voxels get the value of a used one, because a mapping need not be
     defined for the air around an organ.
     """
-    image = continue_image(image, mask_of_values(image, mesh))
+    image = without_gaps(image, mesh)
     owner = cell_of_voxel(image, mesh).ravel()
     is_seen = owner >= 0
     if is_seen.all():
