@@ -48,17 +48,19 @@ def without_ghosts(raw: Raw) -> Raw:
     }
     n_left = sum(int((~each).sum()) for each in is_kept.values())
 
-    def kept(by_kind: Arrays) -> Arrays:
+    def own_rows(by_kind: Arrays) -> Arrays:
         return {kind: rows[is_kept[kind]] for kind, rows in by_kind.items() if is_kept[kind].any()}
 
     words = (
         f"left out {n_left} ghost cells ({GHOST_FIELD}): copies of other pieces' cells, or hidden"
     )
     return raw._replace(
-        cells=kept(raw.cells),
-        middles=kept(raw.middles),
+        cells=own_rows(raw.cells),
+        middles=own_rows(raw.middles),
         cell_data={
-            name: kept(by_kind) for name, by_kind in raw.cell_data.items() if name != GHOST_FIELD
+            name: own_rows(by_kind)
+            for name, by_kind in raw.cell_data.items()
+            if name != GHOST_FIELD
         },
         notes=(*raw.notes, *[words] * bool(n_left)),
     )
@@ -83,9 +85,8 @@ def with_merged_nodes(raw: Raw, kind: str) -> Raw:
     if not np.isfinite(points[used]).all():
         return raw  # as well
     tolerance = MERGE_FRACTION * float(np.abs(points[used]).max())
-    tree = scipy.spatial.KDTree(
-        points[used], compact_nodes=False, balanced_tree=False
-    )  # built in half the time
+    # built in half the time
+    tree = scipy.spatial.KDTree(points[used], compact_nodes=False, balanced_tree=False)
     pairs = used[tree.query_pairs(tolerance, output_type="ndarray")]
     if len(pairs):
         apart = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)

@@ -47,6 +47,11 @@ class Raw(NamedTuple):
     notes: tuple[str, ...] = ()  # one line for each dropped item
 
 
+def main_kind(raw: Raw) -> str:
+    """Return the type of cells of highest dimension."""
+    return max(raw.cells, key=lambda name: CELL_DIMENSIONS.get(name, -1))
+
+
 def by_corners(raw: Raw) -> Raw:
     """Rename quadratic cell types to the linear type of their corners; their mid-edge nodes become
     `middles`, by type.

@@ -18,7 +18,7 @@ from tetopt.errors import InputError
 from tetopt.interop.conversions import CELL_DIMENSIONS
 from tetopt.io.apart import read_apart
 from tetopt.io.gmsh import TET10_ORDER, OwnComments, own_comments
-from tetopt.io.raw import Group, Raw, by_corners
+from tetopt.io.raw import Group, Raw, by_corners, main_kind
 from tetopt.io.text import free_text
 from tetopt.model.label_names import LABEL_FIELD, TABLE_TEXT, LabelTable, table_words
 from tetopt.system.arrays import Arrays, Floats, Ints, Json
@@ -319,7 +319,7 @@ def _label_cells(raw: Raw, comments: OwnComments | None) -> Raw:
     Not done if there are other labels already, or if the groups of a file of tetopt's are not
     labels.
     """
-    kind = _kind_of_cells(raw)
+    kind = main_kind(raw)
     groups = [group for group in raw.groups if group.kind == kind]
     are_materials = any(re.fullmatch(r"material_\d+|unnamed", group.label) for group in groups)
     is_other = are_materials if comments is None else comments.zero is None
@@ -352,14 +352,9 @@ def _label_cells(raw: Raw, comments: OwnComments | None) -> Raw:
     return raw._replace(cell_data=cell_data, field_data=raw.field_data | table)
 
 
-def _kind_of_cells(raw: Raw) -> str:
-    """Return the cell type of highest dimension."""
-    return max(raw.cells, key=lambda name: CELL_DIMENSIONS.get(name, -1))
-
-
 def of_ours(raw: Raw, comments: OwnComments) -> Raw:
     """Apply the comments of a file of tetopt's: groups and views become cell sets and materials."""
-    kind = _kind_of_cells(raw)
+    kind = main_kind(raw)
     members = _members(raw, kind, comments.cells)
     constants = np.full((3, len(raw.cells[kind])), np.nan)
     for name in comments.constants.keys() & members.keys():

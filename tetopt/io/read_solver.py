@@ -21,7 +21,7 @@ from tetopt.interop.conversions import CELL_DIMENSIONS, CORNER_KINDS
 from tetopt.io.abaqus import ALL_ELEMENTS, FACE_NUMBERS
 from tetopt.io.apart import read_apart
 from tetopt.io.gmsh import own_comments
-from tetopt.io.raw import Group, Raw, by_corners
+from tetopt.io.raw import Group, Raw, by_corners, main_kind
 from tetopt.io.read_gmsh import of_ours, places_of
 from tetopt.io.text import list_names
 from tetopt.model.label_names import LABEL_FIELD, TABLE_TEXT, LabelTable, table_words
@@ -39,8 +39,8 @@ ABAQUS_SOLID = r"D?C3D(\d+)"
 ABAQUS_FACE = r"(?:CP[ESEG]+|CAX|DC2D|DS|S|STRI|M3D|SFM3D|R3D)(\d+)"
 # Elements that are no cells, which are left out: beams, trusses, springs, masses, connectors
 ABAQUS_OTHERS = (
-    r"B[23]\d|PIPE|ELBOW|FRAME|T[23]D|DC1D|SPRING|DASHPOT|MASS|ROTARYI|HEATCAP|CONN|GAP|DGAP|IT[ST]|"
-    r"JOINT|DCOUP|RB[23]D|R2D|RAX|SAX|MAX|DSAX|D$"
+    r"B[23]\d|PIPE|ELBOW|FRAME|T[23]D|DC1D|SPRING|DASHPOT|MASS|ROTARYI|HEATCAP|CONN|GAP|DGAP|"
+    r"IT[ST]|JOINT|DCOUP|RB[23]D|R2D|RAX|SAX|MAX|DSAX|D$"
 )
 FEBIO_OTHERS = r"line|truss|beam"
 MEDIT_KINDS = {
@@ -153,7 +153,7 @@ def _xdmf_fields(path: str) -> Json:
     members: dict[str, Ints] = {}
     facets: dict[str, Ints] = {}
     if own_comments(lines) is not None:
-        kind = _kind_of(raw)
+        kind = main_kind(raw)
         width = CELL_DIMENSIONS[kind]
         for name, nodes in _sets_by_tags(root, "cells", width + 1):
             members[name] = _row_places(raw.cells[kind], nodes)
@@ -390,7 +390,7 @@ def _raw_of(file: FileNumbers, lines: list[str]) -> Raw:
         cells[kind] = place(np.concatenate([each[2] for each in those])[order])
         ids[CORNER_KINDS.get(kind, kind)] = np.concatenate([each[1] for each in those])[order]
     raw = by_corners(Raw(points, cells, {}, {}, {}, [], "ras"))
-    kind = _kind_of(raw)
+    kind = main_kind(raw)
     is_ours = own_comments(lines) is not None
     parts = {name: places_of(ids[kind], file.cells.get(name, numbers[:0])) for name in file.parts}
     own = {ALL_ELEMENTS, *file.parts} - _label_sets(lines).keys() if is_ours else set()
@@ -419,11 +419,6 @@ def _lost_words(file: FileNumbers, ids: dict[str, Ints]) -> Iterator[str]:
             f"left out {sum(n_lost.values())} members of {list_names(names)}, which are none of "
             "its cells"
         )
-
-
-def _kind_of(raw: Raw) -> str:
-    """Return the type of cells of highest dimension."""
-    return max(raw.cells, key=lambda name: CELL_DIMENSIONS.get(name, -1))
 
 
 def _facets_of(
@@ -456,7 +451,7 @@ def _facets_of(
 
 def _with_groups(raw: Raw, members: dict[str, Ints], facets: dict[str, Ints]) -> Raw:
     """Return the contents with sets of cells, and of facets by their corners."""
-    kind = _kind_of(raw)
+    kind = main_kind(raw)
     groups = [Group(name, kind, those[those >= 0]) for name, those in members.items()]
     cells = dict(raw.cells)
     if facets:
@@ -491,7 +486,7 @@ def _label_sets(lines: list[str]) -> dict[str, int]:
 
 def _with_labels(raw: Raw, lines: list[str]) -> Raw:
     """Return the contents with the labels that the comments name, if all cells have one."""
-    kind = _kind_of(raw)
+    kind = main_kind(raw)
     labels = np.full(len(raw.cells[kind]), -1)
     label_of = _label_sets(lines)
     for group in raw.groups:
