@@ -468,8 +468,9 @@ def _euler_numbers(
     """Euler numbers of the closed surfaces of a mesh, of the components of its mask that have a
     cell and, if they differ, of these without details smaller than cells.
 
-    Cells that share no facet are apart, like voxels (`tetopt.measure.interfaces.voxel_euler`), and
-    the mesh counts as if it had as many components as the mask.
+    Cells that share no facet are apart, like voxels (`tetopt.measure.interfaces.voxel_euler`).
+    Each number is that of as many components as the mask has: closing may join two, and opening
+    part one.
     """
     planes, image = _own_voxels(content)[0], content.given
     inside = inside[planes].copy()
@@ -477,18 +478,23 @@ def _euler_numbers(
     n_parts, lost = component_runs(inside, owner[planes] >= 0)
     for _, row, begin, end in lost:
         rows[row, begin:end] = False
-    n_parts -= len(np.unique(lost[:, 0])) + int(components(mesh.cells).max()) + 1
+    n_parts -= len(np.unique(lost[:, 0]))
     shared = facets(mesh.cells)
     outer = boundary_facets(mesh.cells, shared)
     inner = euler_characteristic(shared.nodes) - euler_characteristic(outer)
-    ours = 2 * (len(mesh.cells) + (-1) ** mesh.ndim * inner + n_parts)
+    n_more = n_parts - 1 - int(components(mesh.cells).max())
+    ours = 2 * (len(mesh.cells) + (-1) ** mesh.ndim * inner + n_more)
     if ours == (own := voxel_euler(inside)):
         return ours, own
     reach = 0.5 * regular_edge(mesh.cell_volumes.mean(), mesh.ndim) / image.spacing
     size, voxels = 1 + 2 * np.rint(np.maximum(reach, 1.0)).astype(int), inside.view(np.uint8)
     closed = scipy.ndimage.grey_closing(voxels, size)
     opened = (scipy.ndimage.grey_opening(each, size) for each in (voxels, closed))
-    return ours, own, *(voxel_euler(each > 0) for each in (closed, *opened))
+
+    def euler(each: NDArray[np.uint8]) -> int:
+        return voxel_euler(each > 0) + 2 * (n_parts - int(scipy.ndimage.label(each)[1]))
+
+    return ours, own, *(euler(each) for each in (closed, *opened))
 
 
 def _bare_parts(mesh: Mesh, is_bare: Bools, affine: Floats) -> tuple[LostComponent, ...]:
