@@ -92,11 +92,11 @@ def runs(monkeypatch):
     """The optimisation once; whether a mesh is there, which may then not be lost."""
     once = {}
 
-    def remembered(image, aim, attempt, required, **options):
+    def remembered(image, aim, attempt, *required, **options):
         if "result" in once:  # what is said and checked before goes on in each run
             attempt(lambda **_: once["result"], once["result"].initial, aim, [])
         else:
-            once["result"] = search_mesh(image, aim, attempt, required, **options)
+            once["result"] = search_mesh(image, aim, attempt, *required, **options)
         once["is_there"] = True
         return once["result"]
 

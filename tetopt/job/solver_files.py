@@ -411,7 +411,8 @@ def save_anyway(
     InputError
         If the user can fix `error`; the message says where the mesh is.
     """
-    kept = early or keep_early(result.mesh, result.labels, kept_places(output))
+    is_there = early is not None and early.is_file()  # and not gone with its folder
+    kept = early if is_there else keep_early(result.mesh, result.labels, kept_places(output))
     where = "could not be saved anywhere"
     if kept is not None:
         where = f"is in {kept}: continue from there with tetopt convert"
