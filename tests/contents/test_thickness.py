@@ -2,6 +2,7 @@
 shapes.
 """
 
+import numba
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
@@ -9,7 +10,7 @@ from shapes import distance
 
 from tetopt.contents import thickness as thickness_module
 from tetopt.contents.memberships import finer, memberships, supersampling
-from tetopt.contents.thickness import _cosine, _Labels, local_thickness
+from tetopt.contents.thickness import _cosine, _Labels, local_thickness, thickness_at
 from tetopt.image import Image
 
 MOST = 12.0
@@ -79,7 +80,8 @@ def test_chords_at_the_sides_of_the_grid_are_the_shortest_that_end_inside(
     """
     field = gaussian_filter(np.random.default_rng(1).normal(size=(3, *shape)), (0.0, 1.5, 1.5, 1.5))
     members = memberships(Image(field.argmax(axis=0).astype(float), np.diag([*spacing, 1.0])))
-    (steps, lengths), edges = thickness_module._rays(np.array(spacing))
+    steps, ways, edges = thickness_module._rays(np.array(spacing))
+    lengths = ways[:, 1]
     partition, nothing = members.partition.astype(np.int16), np.empty((0,) * 4, np.uint16)
     labels = _Labels(partition, members.levels, members.channel, nothing)
     monkeypatch.setattr(thickness_module, "_spread_balls", lambda *_: None)
@@ -97,6 +99,26 @@ def test_chords_at_the_sides_of_the_grid_are_the_shortest_that_end_inside(
                 for number, way in ((d, steps[d]), (-1 - d, -steps[d]))
             )
         assert chords[place] == pytest.approx(min(size, 8.0), abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("shape", "spacing"),
+    [((40, 31, 26), (1.0, 1.0, 1.0)), ((18, 19, 22), (1.0, 1.2, 1.9)), ((90, 41), (0.8, 1.1))],
+)
+def test_at_some_voxels_it_is_that_of_the_whole_grid(shape, spacing, monkeypatch):
+    """To the last bit, whichever they are, on any number of threads."""
+    rng, n = np.random.default_rng(3), len(shape)
+    field = gaussian_filter(rng.normal(size=(4, *shape)), (0.0, *[3.0] * n))
+    image, inside = Image(field.argmax(axis=0).astype(float)), rng.random(shape) < 0.999
+    members, spacing = memberships(image), np.array(spacing)
+    whole = local_thickness(members, spacing, 6.0, inside)
+    assert len(np.unique(whole)) > 100
+    places = rng.permutation(whole.size)[: whole.size // 2]
+    rows = np.where(inside, members.partition, -1)
+    for n_threads in (1, 3):
+        monkeypatch.setattr(numba, "get_num_threads", lambda n_threads=n_threads: n_threads)
+        found = thickness_at(places, rows, members, spacing, 6.0)
+        np.testing.assert_array_equal(found, whole.ravel()[places])
 
 
 def _walk(members, place, step, length):

@@ -29,6 +29,7 @@ from tetopt.system.slabs import over_slabs
 # percentiles over a label's voxels that describe its thickness
 THICKNESS_PERCENTILES = (5.0, 50.0, 95.0)
 THICKNESS_BYTES = 19.0  # per voxel: chords, thickness, the labels, and the labels within a region
+BOUND_BYTES = 8.0  # per voxel: limits of balls, and the labels
 STEP_BYTES, CROSSING_BYTES = 1.0, 2.0  # per direction, and voxel of the slabs in work
 BEYOND_REGION = -1  # stands for a label beyond the region
 NO_CROSSING = 2**16 - 1  # marks a step that no facet crosses
@@ -85,30 +86,47 @@ def local_thickness(
     InputError
         Not enough memory for it.
     """
-    _check_room(members.partition.shape, STEP_BYTES, spacing, 0.0)
+    _check_room(members.partition.shape, THICKNESS_BYTES, STEP_BYTES, spacing, 0.0)
     partition = (
         members.partition if inside is None else np.where(inside, members.partition, BEYOND_REGION)
     )
-    whole = (1,) * (3 - members.partition.ndim) + members.partition.shape
-    levels = members.levels.reshape(-1, *whole)
-    return _thickness(partition, levels, members.channel, None, spacing, most)
+    labels, rays, whole = _labels_of(partition, members), _rays(spacing), _in_space(partition)
+    chord, is_middle = np.zeros(whole, dtype=np.float32), np.zeros(whole, dtype=np.bool_)
+    reach, n = int(most / rays[1][:, 1].min()) + 1, partition.ndim
+    n_slabs = max(whole[3 - n] // SLAB_PLANES, numba.get_num_threads())
+    _over_slabs(
+        lambda slab: _fill_chords(chord, is_middle, labels, rays, most, reach, slab),
+        whole,
+        n,
+        n_slabs,
+    )
+    thickness = chord.copy()
+    _over_slabs(
+        lambda slab: _spread_balls(thickness, chord, is_middle, labels.partition, rays[2], slab),
+        whole,
+        n,
+    )
+    return thickness.reshape(partition.shape)
 
 
-def thickness_between(
-    corners: Floats,
+def thickness_at(
+    places: Ints,
     partition: NDArray[np.integer],
+    surfaces: Memberships | Floats,
     spacing: Floats,
     most: float,
 ) -> NDArray[np.float32]:
-    """Local thickness of labels whose surfaces are facets, such as those of a mesh.
+    """Local thickness of labels at some voxels, the same as that of all.
 
     Parameters
     ----------
-    corners : (F, n, n) float64
-        Nodes of each facet between two labels, mm from the centre of the first voxel, along the
-        grid's axes.
+    places : (K,) int
+        Indices of the voxels, flat.
     partition : (s_0, ..., s_{n-1}) array of int
         Label of each voxel's centre, any whole number from 0; -1 beyond the region.
+    surfaces : Memberships or (F, n, n) float64
+        Levels of the labels on this grid; or facets, such as those of a mesh: the nodes of each
+        between two labels, mm from the centre of the first voxel, along the grid's axes.
     spacing : (n,) float64
         Edges of the voxels, mm.
     most : float
@@ -116,7 +134,7 @@ def thickness_between(
 
     Returns
     -------
-    (s_0, ..., s_{n-1}) float32
+    (K,) float32
         mm; 0 beyond the region.
 
     Raises
@@ -124,80 +142,88 @@ def thickness_between(
     InputError
         Not enough memory.
     """
-    _check_room(partition.shape, STEP_BYTES + CROSSING_BYTES, spacing, most)
-    if partition.ndim == 2:  # a segment becomes a rectangle across the plane, of two triangles
-        flat = np.stack(
-            [np.pad(corners, ((0, 0), (0, 0), (1, 0)), constant_values=x) for x in (-1.0, 1.0)],
-            axis=2,
-        )
-        # below and above the first node, and then the second
-        flat = flat.reshape(len(corners), 4, 3)
-        corners = np.concatenate([flat[:, :3], flat[:, 1:]])
-    no_levels = np.zeros((1, 1, 1, 1), dtype=np.float32)
-    return _thickness(partition, no_levels, np.zeros(1, dtype=np.int64), corners, spacing, most)
-
-
-def _check_room(shape: tuple[int, ...], n_bytes: float, spacing: Floats, beyond: float) -> None:
-    """Check the memory for a grid, with `n_bytes` per direction in the slabs in work and
-    `beyond` them, mm.
-    """
-    planes = 2.0 * beyond / float(min(spacing)) + SLAB_PLANES
-    fraction = min(numba.get_num_threads() * planes / shape[0], 1.0)
-    n_bytes = THICKNESS_BYTES + n_bytes * len(_rays(spacing)[0][0]) * fraction
-    check_memory(n_bytes * prod(shape), "thickness of labels", "crop the image")
-
-
-def _thickness(
-    partition: NDArray[np.integer],
-    levels: NDArray[np.float32],
-    channel: Ints,
-    corners: Floats | None,
-    spacing: Floats,
-    most: float,
-) -> NDArray[np.float32]:
-    """`local_thickness` of labels by row (-1 beyond the region), between levels or facets'
-    corners on a 3-D grid.
-    """
-    n, axis = partition.ndim, 3 - partition.ndim
-    whole = (1,) * axis + partition.shape
-    rows, no_crossing = (
-        partition.reshape(whole).astype(np.int16, copy=False),
-        np.zeros((0, 1, 1, 1), np.uint16),
-    )
-    labels = _Labels(rows, levels, channel, no_crossing)
-    (steps, lengths), edges = _rays(spacing)
-    ways = np.cumsum(
-        np.pad(np.repeat(lengths[:, None], MOST_STEPS, axis=1), ((0, 0), (1, 0))), axis=1
-    )
-    rays = steps, ways, edges
-    chord, is_middle = np.zeros(whole, dtype=np.float32), np.zeros(whole, dtype=np.bool_)
-    reach = int(most / lengths.min()) + 1
+    n, axis, rays, whole = partition.ndim, 3 - partition.ndim, _rays(spacing), _in_space(partition)
+    at = np.stack(np.unravel_index(places, whole), axis=1)
+    # a ball's centre is as far away as its radius, and its chords end as far away as its size
+    beyond = 1.5 * most
+    reach = int(beyond / float(min(spacing))) + 1
+    has_levels = isinstance(surfaces, Memberships)
+    of_step = 0.0 if has_levels else CROSSING_BYTES
+    _check_room(partition.shape, BOUND_BYTES, of_step, spacing, beyond)
+    corners = None if has_levels else _in_planes(surfaces) if n == 2 else surfaces
+    labels = _labels_of(partition, surfaces if has_levels else None)
+    balls, sizes = _ball_offsets(rays[2], most, axis), np.zeros(len(at), dtype=np.float32)
 
     def fill(slab: tuple[tuple[int, int], ...]) -> None:
-        if corners is None:
-            _fill_chords(chord, is_middle, labels, rays, most, reach, slab)
-            return
-        # Crossings are kept as far from the slab as chords reach: 26 bytes a voxel of these planes
-        # alone.
         first, stop = slab[axis]
         ends = max(first - reach, 0), min(stop + reach, whole[axis])
         around = (slice(None),) * axis + (slice(*ends),)
         near = labels._replace(partition=labels.partition[around])
-        crossing = np.full((len(steps), *near.partition.shape), NO_CROSSING, dtype=np.uint16)
-        _fill_crossings(crossing, corners, steps * edges, edges, ends, axis)
-        moved = (*slab[:axis], (first - ends[0], stop - ends[0]), *slab[axis + 1 :])
-        near = near._replace(crossing=crossing)
-        _fill_chords(chord[around], is_middle[around], near, rays, most, reach, moved)
+        if corners is None:
+            near = near._replace(levels=near.levels[:, *around])
+        else:  # 26 bytes a voxel
+            crossing = np.full((len(rays[0]), *near.partition.shape), NO_CROSSING, np.uint16)
+            _fill_crossings(crossing, corners, rays[0] * rays[2], rays[2], ends, axis)
+            near = near._replace(crossing=crossing)
+        own = (first <= at[:, axis]) & (at[:, axis] < stop)
+        index = at[own]
+        index[:, axis] -= ends[0]
+        bound = np.full(near.partition.shape, np.inf, dtype=np.float32)
+        sizes[own] = _thickness_near(index, near, rays, balls, most, bound)
 
-    n_slabs = max(whole[axis] // SLAB_PLANES, numba.get_num_threads())
-    _over_slabs(fill, whole, n, n_slabs)
-    thickness = chord.copy()
-    _over_slabs(
-        lambda slab: _spread_balls(thickness, chord, is_middle, labels.partition, edges, slab),
-        whole,
-        n,
+    _over_slabs(fill, whole, n, max(whole[axis] // SLAB_PLANES, numba.get_num_threads()))
+    return sizes
+
+
+def _ball_offsets(edges: Floats, most: float, axis: int) -> tuple[Ints, Floats]:
+    """Voxels (O, 3) in a ball of this size around one, in the plane if `axis` is 1, and the squares
+    of their distances.
+    """
+    most_steps = (0.5 * most / edges).astype(int)
+    most_steps[:axis] = 0
+    offsets = np.indices(2 * most_steps + 1).reshape(3, -1).T - most_steps
+    squares = ((offsets * edges) ** 2).cumsum(axis=1)[:, 2]
+    is_near = squares <= 0.25 * most * most
+    return offsets[is_near], squares[is_near]
+
+
+def _in_planes(segments: Floats) -> Floats:
+    """Two triangles for each segment (F, 2, 2), of a rectangle across the plane."""
+    flat = np.stack(
+        [np.pad(segments, ((0, 0), (0, 0), (1, 0)), constant_values=x) for x in (-1.0, 1.0)],
+        axis=2,
     )
-    return thickness.reshape(partition.shape)
+    # below and above the first node, and then the second
+    flat = flat.reshape(len(segments), 4, 3)
+    return np.concatenate([flat[:, :3], flat[:, 1:]])
+
+
+def _check_room(
+    shape: tuple[int, ...], of_voxel: float, of_step: float, spacing: Floats, beyond: float
+) -> None:
+    """Check the memory for a grid, in bytes by voxel, and by direction in the slabs in work and
+    `beyond` them, mm.
+    """
+    planes = 2.0 * beyond / float(min(spacing)) + SLAB_PLANES
+    fraction = min(numba.get_num_threads() * planes / shape[0], 1.0)
+    n_bytes = of_voxel + of_step * len(_rays(spacing)[0]) * fraction
+    check_memory(n_bytes * prod(shape), "thickness of labels", "crop the image")
+
+
+def _in_space(partition: NDArray) -> tuple[int, ...]:
+    return (1,) * (3 - partition.ndim) + partition.shape
+
+
+def _labels_of(partition: NDArray[np.integer], members: Memberships | None) -> _Labels:
+    whole = _in_space(partition)
+    return _Labels(
+        partition.reshape(whole).astype(np.int16, copy=False),
+        np.zeros((1, 1, 1, 1), np.float32)
+        if members is None
+        else members.levels.reshape(-1, *whole),
+        np.zeros(1, dtype=np.int64) if members is None else members.channel,
+        np.zeros((0, 1, 1, 1), np.uint16),
+    )
 
 
 def _over_slabs(
@@ -215,11 +241,9 @@ def _over_slabs(
     )
 
 
-def _rays(
-    spacing: Floats,
-) -> tuple[tuple[Ints, Floats], Floats]:
-    """Steps (D, 3) along axes and diagonals, one of each opposite pair, their lengths, and a
-    voxel's edges.
+def _rays(spacing: Floats) -> tuple[Ints, Floats, Floats]:
+    """Steps (D, 3) along axes and diagonals, one of each opposite pair, the lengths of any number
+    of each, and a voxel's edges.
     """
     n = len(spacing)
     edges = np.concatenate([np.ones(3 - n), spacing])
@@ -230,7 +254,8 @@ def _rays(
             if s > (0, 0, 0) and not any(s[: 3 - n])
         ]
     )
-    return (steps, np.linalg.norm(steps * edges, axis=1)), edges
+    lengths = np.repeat(np.linalg.norm(steps * edges, axis=1)[:, None], MOST_STEPS, axis=1)
+    return steps, np.cumsum(np.pad(lengths, ((0, 0), (1, 0))), axis=1), edges
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -250,7 +275,7 @@ def _fill_chords(
     from as many planes (rows in 2-D) beyond the slab as chords reach: a tenth of the time of
     walking from each voxel.
     """
-    (steps, ways, edges), partition = rays, labels.partition
+    (steps, ways, _), partition = rays, labels.partition
     low, high = max(slab[1][0] - reach, 0), min(slab[1][1] + reach, partition.shape[1])
     before, after = max(slab[0][0] - reach, 0), min(slab[0][1] + reach, partition.shape[0])
     first, size, most_steps = (
@@ -296,13 +321,7 @@ def _fill_chords(
                             abs(forth - back) / ways[d, 1],
                             d,
                         )
-                if shortest >= 0:
-                    step, length = row(steps, shortest), ways[shortest, 1]
-                    forth = _cosine(labels, (i, j, k), (shortest, step), length, edges)
-                    step = (-step[0], -step[1], -step[2])
-                    back = _cosine(labels, (i, j, k), (-1 - shortest, step), length, edges)
-                    least *= 0.5 * (forth + back)
-                chord[i, j, k] = least
+                chord[i, j, k] = _across(labels, (i, j, k), rays, shortest, least)
                 is_middle[i, j, k] = off_middle <= OFF_MIDDLE_STEPS
 
 
@@ -435,6 +454,95 @@ def _cosine(
         along += slope * step[axis] * edges[axis]
         square += slope * slope
     return max(abs(along) / (length * np.sqrt(square)), LEAST_COSINE) if square > 0.0 else 1.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _across(
+    labels: _Labels,
+    place: tuple[int, int, int],
+    rays: tuple[NDArray, NDArray, NDArray],
+    d: int,
+    chord: float,
+) -> float:
+    """The length of a chord in direction d, -1 for none, across its label's surfaces."""
+    if d < 0:
+        return chord
+    ways, edges, step = rays[1], rays[2], row(rays[0], d)
+    forth = _cosine(labels, place, (d, step), ways[d, 1], edges)
+    step = (-step[0], -step[1], -step[2])
+    back = _cosine(labels, place, (-1 - d, step), ways[d, 1], edges)
+    return chord * (0.5 * (forth + back))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _chord_through(
+    labels: _Labels,
+    place: tuple[int, int, int],
+    rays: tuple[NDArray, NDArray, NDArray],
+    limits: tuple[float, float],
+    first: int,
+) -> tuple[float, bool, int]:
+    """The shortest chord through a voxel as in `_fill_chords`, whether the voxel is in its middle,
+    and its direction; or any chord shorter than the lower of the limits, which that in the `first`
+    direction mostly is.
+    """
+    (steps, ways, _), (low, least) = rays, limits
+    off_middle, shortest = np.inf, -1
+    for number in range(-1, len(steps)):
+        d = first if number < 0 else number
+        step = row(steps, d)
+        forth = _way(labels, place, (d, step), ways, 0, least)
+        if forth >= least:
+            continue
+        step = (-step[0], -step[1], -step[2])
+        back = _way(labels, place, (-1 - d, step), ways, 0, least - forth)
+        if np.float32(forth + back) < low:
+            return forth + back, True, d
+        if number >= 0 and forth + back < least:
+            least, off_middle, shortest = forth + back, abs(forth - back) / ways[d, 1], d
+    chord = _across(labels, place, rays, shortest, least)
+    return chord, off_middle <= OFF_MIDDLE_STEPS, max(shortest, 0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _thickness_near(
+    places: NDArray,
+    labels: _Labels,
+    rays: tuple[NDArray, NDArray, NDArray],
+    balls: tuple[NDArray, NDArray],
+    most: float,
+    bound: NDArray,
+) -> NDArray:
+    """`local_thickness` at voxels (K, 3): the size of the largest ball around a middle nearby, at
+    `balls`' offsets (O, 3) with their squares, that covers each.
+
+    `bound` is an upper limit of the size of each voxel's ball, infinite at first: most voxels need
+    one direction of 13.
+    """
+    (offsets, squares), shape = balls, labels.partition.shape
+    sizes, d = np.zeros(len(places), dtype=np.float32), 0
+    for p in range(len(places)):
+        i, j, k = row(places, p)
+        own = labels.partition[i, j, k]
+        if own < 0:
+            continue
+        size, _, d = _chord_through(labels, (i, j, k), rays, (0.0, most), d)
+        sizes[p] = size
+        for o in range(len(offsets)):
+            a, b, c = i + offsets[o, 0], j + offsets[o, 1], k + offsets[o, 2]
+            is_in = 0 <= a < shape[0] and 0 <= b < shape[1] and 0 <= c < shape[2]
+            if sizes[p] >= np.float32(most):
+                break
+            if not is_in or labels.partition[a, b, c] != own or bound[a, b, c] <= sizes[p]:
+                continue
+            if squares[o] > (0.5 * bound[a, b, c]) ** 2:
+                continue
+            low = max(float(sizes[p]), 2.0 * np.sqrt(squares[o]))
+            size, is_middle, d = _chord_through(labels, (a, b, c), rays, (low, most), d)
+            bound[a, b, c] = size if is_middle else 0.0
+            if bound[a, b, c] > sizes[p] and squares[o] <= (0.5 * bound[a, b, c]) ** 2:
+                sizes[p] = bound[a, b, c]
+    return sizes
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -566,7 +566,7 @@ def label_extents(voxels: OwnedVoxels, mesh: Mesh, row_of_cell: Ints) -> list[La
     """
     true, painted = voxels.rows, painted_voxels(voxels.owner, row_of_cell, voxels.outside)
     n_labels = int(max(true.max(), row_of_cell.max())) + 1
-    n_true, n_painted = (_voxel_counts(rows, n_labels) for rows in (true, painted))
+    n_true, n_painted = (voxel_counts(rows, n_labels) for rows in (true, painted))
     n_cells = np.bincount(row_of_cell, minlength=n_labels)
     mesh_volume = np.bincount(row_of_cell, mesh.cell_volumes, n_labels)
     voxel_volume = abs(np.linalg.det(voxels.affine[:-1, :-1]))
@@ -619,7 +619,7 @@ def _label_overlaps(
     """Overlaps of all labels but for Dice, by the names of `LabelOverlap`."""
     true, owner, outside = voxels.rows, voxels.owner, voxels.outside
     n_labels = int(max(true.max(), of_cell.max())) + 1
-    n_true = _voxel_counts(true, n_labels)
+    n_true = voxel_counts(true, n_labels)
     pieces, n_pieces = mesh.straight_pieces()
     overlap, size, (overlap_beyond, size_beyond) = _overlaps(
         labels, true, pieces, np.repeat(of_cell, n_pieces), n_labels
@@ -953,7 +953,7 @@ def _narrow(rows: NDArray[np.integer]) -> NDArray[np.integer]:
     return rows.astype(np.int16 if rows.max(initial=0) < 2**15 - 1 else np.int32)
 
 
-def _voxel_counts(rows: NDArray[np.integer], n: int) -> Ints:
+def voxel_counts(rows: NDArray[np.integer], n: int) -> Ints:
     """Number of voxels of each row, (n,); -1 is no row."""
 
     def count(first: int, stop: int) -> Ints:
@@ -966,8 +966,8 @@ def _voxel_dice(true: NDArray[np.integer], painted: NDArray[np.integer], n_true:
     """Dice of the voxels of each label, (K,), with those that cells give it; `n_true` are the
     numbers of the former.
     """
-    both = _voxel_counts(np.where(true == painted, true, OUTSIDE_LABEL), len(n_true))
-    return 2.0 * both / np.maximum(n_true + _voxel_counts(painted, len(n_true)), 1)
+    both = voxel_counts(np.where(true == painted, true, OUTSIDE_LABEL), len(n_true))
+    return 2.0 * both / np.maximum(n_true + voxel_counts(painted, len(n_true)), 1)
 
 
 def check_cell_labels(of_cell: ArrayLike, mesh: Mesh) -> Ints:
