@@ -15,6 +15,7 @@ LEAST_PADDED, LEAST_PADDED_VOXELS = 0.001, 20  # fraction of the voxels, and num
 LEAST_COMMON = 0.2  # part of the low voxels that has a level's value, rounded
 LEAST_CONSTANT = 0.5  # part near the levels: a map that falls smoothly has none
 LEVEL_RINGING = 0.05  # of a level, by splines
+MOST_OTHERS = 0.1  # part of the low voxels elsewhere; splines of order 5 ring in half of that
 EDGE_VOXELS = 3  # beside padding, of which interpolation changes some
 AIR_BELOW = -800.0  # lungs included
 LEAST_AIR = 0.25  # part of the voxels beside padding; an organ that was cut out has less
@@ -38,7 +39,8 @@ def replace_padding(data: NDArray, is_padding: Bools | None = None) -> tuple[NDA
     Returns
     -------
     (s_0, ..., s_{n-1}) array, str
-        The data, and a note; the data itself, and an empty text, if there is no padding.
+        The data, and a note; the data itself, and an empty text, if there is no padding. A constant
+        level without air beside it, as around an organ that was cut out, stays, with a note.
     """
     if is_padding is not None:
         beside = _values_beside(data, is_padding, 1)
@@ -46,7 +48,11 @@ def replace_padding(data: NDArray, is_padding: Bools | None = None) -> tuple[NDA
         is_padding = _low_levels(data)
         beside = _values_beside(data, is_padding, EDGE_VOXELS)
         is_air = beside < AIR_BELOW
-        beside = beside[is_air & (np.count_nonzero(is_air) >= LEAST_AIR * len(beside))]
+        if len(beside) and np.count_nonzero(is_air) < LEAST_AIR * len(beside):
+            words = f"{is_padding.mean():.1%} of its voxels have values down to"
+            words += f" {data[is_padding].min():g}, without air beside them: exclude them by `mask`"
+            return data, f"{words} or `background`"
+        beside = beside[is_air]
     if len(beside) == 0:
         return data, ""
     middle = np.median(beside)
@@ -85,7 +91,8 @@ def _low_levels(data: NDArray) -> Bools:
     is_close &= is_low
     is_edge = scipy.ndimage.binary_dilation(is_close, iterations=EDGE_VOXELS)
     n_others = np.count_nonzero(is_low & ~is_edge)
-    if np.count_nonzero(is_close) < LEAST_CONSTANT * n_low or n_others >= least:
+    most = max(least, MOST_OTHERS * n_low)
+    if np.count_nonzero(is_close) < LEAST_CONSTANT * n_low or n_others >= most:
         return none
     padding: Bools = scipy.ndimage.binary_propagation(is_level, mask=is_low)
     return padding
