@@ -469,6 +469,7 @@ def test_abaqus_of_others(kind, here):
         ("*Element, type=C3D4\n999, 1, 2", "C3D4"),
         ("*Node\n998, 9., 9., 9.\n999, 9.", "lines of 4"),
         ("*Elset, elset=a\nOther\n", "Other"),
+        ("*Solid section, elset=None, material=m\n,\n", "None"),
     ],
 )
 def test_abaqus_that_is_not_one_flat_mesh_is_refused(extra, word, here):
@@ -507,9 +508,10 @@ def test_sets_of_abaqus(extra, members, here):
         ("*Element, type=T3D2, elset=rods\n9001, 1, 2\n9002, 2, 3\n", "2 of type T3D2"),
         ("*Element, type=SPRINGA\n9001, 1, 2\n", "1 of type SPRINGA"),
         ("*Elset, elset=One\n1, 99999\n", "One"),
+        ("*Elset, elset=One\n1, 2", "cut short"),
     ],
 )
-def test_elements_of_abaqus_that_are_no_cells_are_told(extra, word, here):
+def test_what_an_abaqus_file_lacks_is_told(extra, word, here):
     write_abaqus(here / "a.inp", extra)
     assert any(word in note for note in load_mesh("a.inp").notes)
 

@@ -71,7 +71,9 @@ def read_inp(path: Path) -> Raw:
     """Read an Abaqus or CalculiX input file."""
     text = path.read_text("utf-8", "replace")
     lines = [line[3:] for line in text.splitlines() if line.startswith("** ")]
-    return _raw_of(_abaqus(text), lines)
+    raw = _raw_of(_abaqus(text), lines)
+    words = "its last line has no end, so that the file may have been cut short"
+    return raw._replace(notes=(*raw.notes, *[words] * (not text.endswith("\n"))))
 
 
 def read_feb(path: Path) -> Raw:
@@ -220,7 +222,19 @@ def _abaqus(text: str) -> FileNumbers:
                 constants |= dict(zip(names, values[:, None], strict=True))
         elif card == "SOLID SECTION":
             file.parts[options.get("ELSET", "")] = options.get("MATERIAL", "")
-    return file
+    # sections may stand before their sets
+    parts = {_set_name(name, file.cells): material for name, material in file.parts.items()}
+    return file._replace(parts=parts)
+
+
+def _set_name(word: str, sets: dict[str, Ints]) -> str:
+    """Return the name of the set that a word names, in any case, or as INSTANCE.SET."""
+    names = {name.casefold(): name for name in sets}
+    key = word.casefold()
+    key = key if key in names else key.rpartition(".")[2]
+    if key not in names:
+        raise InputError(f'damaged: expected a set, found "{word}", which it does not have')
+    return names[key]
 
 
 def _card(block: str, spelling: dict[tuple[str, str], str]) -> tuple[str, dict[str, str], str]:
@@ -295,15 +309,7 @@ def _set_members(body: str, sets: dict[str, Ints], is_range: bool = False) -> In
         return np.concatenate([np.arange(each.start, each.stop, each.step) for each in ranges])
     words = [word.strip().strip('"') for word in re.split(r"[,\n]", body)]
     numbers = [int(word) for word in words if word.isdecimal()]
-    places = {name.casefold(): members for name, members in sets.items()}
-    named = []
-    for word in words:
-        if word and not word.isdecimal():
-            name = word.casefold()
-            name = name if name in places else name.rpartition(".")[2]  # INSTANCE.SET
-            if name not in places:
-                raise InputError(f'damaged: expected a set, found "{word}", which it does not have')
-            named.append(places[name])
+    named = [sets[_set_name(word, sets)] for word in words if word and not word.isdecimal()]
     return np.concatenate([np.array(numbers, dtype=np.int64), *named])
 
 
