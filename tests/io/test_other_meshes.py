@@ -50,6 +50,23 @@ def pieces(n, order, by=0.0):
 
 
 @pytest.mark.parametrize(("n", "order"), SHAPES)
+@pytest.mark.parametrize("by", [0.0, 1e-7])
+def test_cells_that_repeat_are_left_out(n, order, by, here):
+    """With the nodes of others, or as copies with nodes of their own; the first one's values."""
+    points, cells = nodes_of(box_mesh(n), order)
+    others = cells[2:5, ::-1] if by == 0.0 and order == 1 else cells[2:5] + len(points)
+    both = np.vstack([cells, others])
+    grid_of(np.vstack([points, points + by * (np.arange(3) < n)]), both, n, order).save("a.vtu")
+    grid = pyvista.read("a.vtu")
+    grid.cell_data["x"] = np.arange(len(both))
+    grid.save("a.vtu")
+    loaded = load_mesh("a.vtu")
+    assert_array_equal(loaded.mesh.cells, box_mesh(n).cells)
+    assert_array_equal(loaded.cell_data["x"], np.arange(len(cells)))
+    assert "left out 3 cells that repeat the nodes of others" in loaded.notes
+
+
+@pytest.mark.parametrize(("n", "order"), SHAPES)
 @pytest.mark.parametrize("suffix", [".vtu", ".vtk"])
 @pytest.mark.parametrize("by", [0.0, 1e-7])
 def test_pieces_share_their_nodes(n, order, suffix, by, here):

@@ -1,4 +1,4 @@
-"""Cleaning of what a mesh's file holds: ghosts, nodes at one place, the field of labels."""
+"""Cleaning of what a mesh's file holds: ghosts, nodes at one place, repeated cells, labels."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tetopt.io.raw import Raw
 from tetopt.io.text import list_names
 from tetopt.mesh import Mesh
 from tetopt.model.label_names import LABEL_FIELD, labels_of
-from tetopt.system.arrays import Arrays, Floats, Ints
+from tetopt.system.arrays import Arrays, Bools, Floats, Ints
 
 GHOST_FIELD = "vtkGhostType"
 # VTK's bits of cells that are elsewhere in the file, or not part of the mesh: DUPLICATECELL,
@@ -46,23 +46,44 @@ def without_ghosts(raw: Raw) -> Raw:
         kind: (values.astype(np.int64) & GHOST_BITS).reshape(len(values), -1)[:, 0] == 0
         for kind, values in ghosts.items()
     }
+    words = f"ghost cells ({GHOST_FIELD}): copies of other pieces' cells, or hidden"
+    cell_data = {name: each for name, each in raw.cell_data.items() if name != GHOST_FIELD}
+    return _with_rows(raw._replace(cell_data=cell_data), is_kept, words)
+
+
+def without_copies(raw: Raw, kind: str) -> Raw:
+    """Return a file's contents with one cell of a type for those with the same nodes."""
+    cells = np.sort(raw.cells[kind], axis=1)
+    order = np.lexsort(cells.T)  # stable: the first of its copies comes first
+    is_copy = np.zeros(len(cells), dtype=bool)
+    is_copy[order[1:]] = (cells[order[1:]] == cells[order[:-1]]).all(axis=1)
+    return _with_rows(raw, {kind: ~is_copy}, "cells that repeat the nodes of others")
+
+
+def _with_rows(raw: Raw, is_kept: dict[str, Bools], words: str) -> Raw:
+    """Return a file's contents with the cells of some types that are kept, and a note on others."""
     n_left = sum(int((~each).sum()) for each in is_kept.values())
+    if n_left == 0:
+        return raw
 
     def own_rows(by_kind: Arrays) -> Arrays:
-        return {kind: rows[is_kept[kind]] for kind, rows in by_kind.items() if is_kept[kind].any()}
+        rows = {
+            kind: each[is_kept[kind]] if kind in is_kept else each for kind, each in by_kind.items()
+        }
+        return {kind: each for kind, each in rows.items() if len(each)}
 
-    words = (
-        f"left out {n_left} ghost cells ({GHOST_FIELD}): copies of other pieces' cells, or hidden"
-    )
+    groups = []
+    for group in raw.groups:
+        if (each := is_kept.get(group.kind)) is not None:
+            own = group.members[each[group.members]]
+            group = group._replace(members=(np.cumsum(each) - 1)[own])
+        groups.append(group)
     return raw._replace(
         cells=own_rows(raw.cells),
         middles=own_rows(raw.middles),
-        cell_data={
-            name: own_rows(by_kind)
-            for name, by_kind in raw.cell_data.items()
-            if name != GHOST_FIELD
-        },
-        notes=(*raw.notes, *[words] * bool(n_left)),
+        cell_data={name: own_rows(by_kind) for name, by_kind in raw.cell_data.items()},
+        groups=groups,
+        notes=(*raw.notes, f"left out {n_left} {words}"),
     )
 
 

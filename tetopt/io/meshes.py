@@ -19,7 +19,13 @@ from tetopt.interop.conversions import (
     rows_by_kind,
     simplices_of,
 )
-from tetopt.io.clean import apart_words, with_labels, with_merged_nodes, without_ghosts
+from tetopt.io.clean import (
+    apart_words,
+    with_labels,
+    with_merged_nodes,
+    without_copies,
+    without_ghosts,
+)
 from tetopt.io.raw import Raw, by_corners
 from tetopt.io.read_gmsh import read_msh
 from tetopt.io.read_solver import read_feb, read_inp, read_medit, read_xdmf
@@ -53,7 +59,8 @@ def load_mesh(
     """Read triangles or tetrahedra, linear or quadratic, from a file of a known suffix.
 
     Cells that VTK marks as ghosts are left out, nodes that coincide within rounding are merged,
-    and labels are taken from a cell field with a known name, such as "RegionId"; notes list this.
+    cells that repeat the nodes of others are left out, and labels are taken from a cell field with
+    a known name, such as "RegionId"; notes list this.
 
     Parameters
     ----------
@@ -102,7 +109,7 @@ def load_mesh(
         raw = without_ghosts(raw)
         kind = kind_of_cells(raw.cells)
         n = CELL_DIMENSIONS[kind]
-        raw = with_merged_nodes(raw, kind)
+        raw = without_copies(with_merged_nodes(raw, kind), kind)
         points = half_turn(raw.points) if n == 3 and raw.space == "lps" else raw.points
         picked = simplices_of(points, raw.cells[kind], raw.middles.get(kind))
         middles, is_curved, of_edges = _middles(raw, kind)
