@@ -654,6 +654,11 @@ HEAVY = (
         # nibabel loads pydicom where it is installed, and that PIL
         ("import tetopt.cli.mesh", "nibabel numba PIL"),
         ("import tetopt; tetopt.mesh_image", "numba"),
+        (
+            "import numpy; from tetopt.contents import padding; "
+            "print(padding.replace_padding(numpy.zeros((4, 4, 4))))",
+            "",
+        ),
     ],
 )
 def test_nothing_is_loaded_before_it_is_used(code, needed):

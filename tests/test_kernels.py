@@ -119,6 +119,29 @@ def test_kernels_read_records():
     assert work.out == pytest.approx(sums[work.threads - 10, range(7)] - 4.0, rel=1e-14)
 
 
+@unit
+def n_done(out: Floats1) -> int:
+    return int(np.sum(out))
+
+
+@unit
+def wait_or_do(whole: Whole, number: int) -> None:
+    """The first number waits for all others, at most some seconds."""
+    trials = 0
+    while number == 0 and trials < 100_000_000 and n_done(whole.out) < len(whole.out) - 1:
+        trials += 1
+    whole.out[number] = 1.0 if trials < 100_000_000 else -1.0
+
+
+@linked_only
+@pytest.mark.skipif(numba.get_num_threads() < 2, reason="needs two threads")
+def test_threads_take_what_is_left():
+    """No number waits for a thread that is busy with another."""
+    work = whole()
+    run(wait_or_do, 7, work)
+    assert work.out.tolist() == [1.0] * 7
+
+
 @compiled_only
 @pytest.mark.parametrize(
     ("change", "words"),
@@ -163,7 +186,7 @@ def test_a_record_keeps_what_it_points_to():
 @compiled_only
 def test_roots_are_what_no_kernel_calls():
     here = {kernel.__name__ for kernel in kernels.roots() if kernel.__module__ == __name__}
-    assert here == {"fill", "all_sums"}
+    assert here == {"fill", "all_sums", "wait_or_do"}
 
 
 def test_by_value_is_a_named_tuple_of_its_arrays():

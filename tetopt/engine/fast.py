@@ -356,6 +356,7 @@ def prepare_kernels(
             "density": is_graded or image.ndim == 3,
             "repair": image.ndim == 3,
             "interfaces": has_labels,
+            "label_state": has_labels,
             "labelling": has_labels,
             "nearest": has_labels or content.region is not None,  # measures the result afterwards
             "paper_moves": False,

@@ -135,9 +135,12 @@ def sweep(
     """
     gains = np.zeros(len(may_move)) if gains is None else gains
     laid_out = pack_record(state), pack_record(stars), pack_record(groups)
+    n_moving = np.add.reduceat(may_move[groups.nodes], groups.start[:-1], dtype=np.int64)
     for chosen in colours_of(state, stars, groups):
         if is_over():
             return False
+        # the longest first, so that no thread is left with one at the end
+        chosen = chosen[np.argsort(-n_moving[chosen], kind="stable")]
         with few_threads(len(chosen) * BLOCK_NODES * 100):
             run(_sweep, len(chosen), Sweep(*laid_out, chosen, may_move, gains))
     return True

@@ -202,15 +202,39 @@ def fails(_context: Any, address: Any, values: Any, number: Any) -> Any:
     return types.boolean(types.int64, types.int64, types.int64), generate
 
 
-# The only parallel loop: separate loops took 2 s each to compile.
+@intrinsic
+def take_number(_context: Any, place: Any) -> Any:
+    """Return the number at an address and add 1 to it, as one step among all threads."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        number = builder.inttoptr(arguments[0], ir.IntType(64).as_pointer())
+        return builder.atomic_rmw("add", number, ir.Constant(ir.IntType(64), 1), "monotonic")
+
+    return types.int64(types.int64), generate
+
+
+@njit()
+def take_numbers(task: int, values: int, n: int, place: int) -> int:
+    """Call the task for the numbers below n that no other thread takes first."""
+    n_failed, number = 0, take_number(place)
+    while number < n:
+        n_failed += fails(task, values, number)
+        number = take_number(place)
+    return n_failed
+
+
+# The only parallel loop: separate loops took 2 s each to compile. Threads take numbers one by one:
+# with a fixed half each, the loops of 15,000 nodes last 1.09 times as long on two threads.
 @njit(cache=True, parallel=True)
-def run(task: int, values: int, n: int) -> int:
+def run(task: int, values: int, n: int, place: int, n_threads: int) -> int:
     """Call the task at an address for a record and all numbers below n; return how many calls
     fail.
+
+    `place` is the address of an integer that is 0.
     """
     n_failed = 0
-    for number in prange(n):
-        n_failed += fails(task, values, np.int64(number))
+    for _ in prange(n_threads):
+        n_failed += take_numbers(task, values, n, place)
     return n_failed
 
 

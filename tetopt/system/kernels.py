@@ -500,6 +500,11 @@ def _run_plain(task: Unit, n: int, values: Any) -> int:
         return sum(threads.map(fraction, range(n_threads)))
 
 
+def _run_linked(task: int, values: int, n: int) -> int:
+    taken = np.zeros(1, dtype=np.int64)
+    return int(links().run(task, values, n, taken.ctypes.data, numba.get_num_threads()))
+
+
 def run(task: Any, n: int, values: Any) -> None:
     """Call a unit `task(values, number)` for all numbers below n, on numba's threads.
 
@@ -520,7 +525,7 @@ def run(task: Any, n: int, values: Any) -> None:
                 f"{task.__name__}: expected a {task.signature.args[0]}, got a {laid_out.type}"
             )
         with _LOOPING if numba.threading_layer() == "workqueue" else contextlib.nullcontext():
-            n_failed = links().run(task.address, laid_out.address, n)
+            n_failed = _run_linked(task.address, laid_out.address, n)
     if n_failed > 0:
         raise MemoryError(
             f"{task.__name__}: {n_failed} of {n} calls could not allocate their arrays"
@@ -605,7 +610,7 @@ def check_links() -> None:
     # OpenMP starts no threads then, which a fork of the user's would not survive
     numba.set_num_threads(1)
     try:
-        n_failed = links().run(multiplied.address, rows.address, len(x))
+        n_failed = _run_linked(multiplied.address, rows.address, len(x))
     finally:
         numba.set_num_threads(n_threads)
     if failures != (False, True) or n_failed != 0 or x.tolist() != [4.0, 4.0, 2.0]:
