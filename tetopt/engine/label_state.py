@@ -25,12 +25,11 @@ from tetopt.engine.labelling import (
 )
 from tetopt.engine.sliding import MOST_MEETING, insert_label
 from tetopt.geometry.manifold import OUTSIDE_LABEL, pinches
-from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import facets
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.system.arrays import Floats, Ints
-from tetopt.system.kernels import entry, unit
+from tetopt.system.kernels import entry
 from tetopt.system.slabs import count_pairs, over_slabs
 
 # of voxels that determine a cell's labels; in cells with fewer, levels are sampled
@@ -78,11 +77,11 @@ def mend_pinches(
     labels, across = (
         array[: len(mesh.cells)] for array in (state.complex.labels, state.complex.across)
     )
-    of_ridges, of_nodes = pinches(facets(mesh.cells), labels)
     aim = image.voxel_volume * np.array([sizes.sum() for sizes in voxels.components])
     is_unfit = unfit_labels(labels, mesh.cell_volumes, aim)
     if is_unfit.any() or any(
-        (places.labels[:, 0] != OUTSIDE_LABEL).any() for places in (of_ridges, of_nodes)
+        (places.labels[:, 0] != OUTSIDE_LABEL).any()
+        for places in pinches(facets(mesh.cells), labels)
     ):
         contents = cell_contents(image, members, mesh, voxels)
         labels[:] = mend_labels(mesh.points, mesh.cells, across, contents, labels, aim)
@@ -111,11 +110,7 @@ def cell_contents(image: Image, members: Memberships, mesh: Mesh, voxels: LabelV
     samples = count_pairs(of_sample, np.concatenate(there).ravel(), shape)
     # Not 1 per centre: among cells of about `FEWEST_CENTRES`, those with more centres than their
     # volume are counted.
-    each = (
-        np.abs(volumes(mesh.points, mesh.cells))
-        / image.voxel_volume
-        / np.where(is_sampled, len(inner), n_owned)
-    )
+    each = mesh.cell_volumes / image.voxel_volume / np.where(is_sampled, len(inner), n_owned)
     counts = _diagonal(each) @ (_diagonal(~is_sampled) @ centres + samples)
     # Samples may miss a label of a voxel or two, so its centres count.
     is_unseen = counts.sum(axis=0) < SAMPLED_FRACTION * centres.sum(axis=0)
@@ -163,19 +158,13 @@ def meet_everywhere(state: State) -> None:
     _meet_everywhere(state, node_stars(state))
 
 
-@unit
-def _meet(state: State, stars: NodeStars, node: int) -> None:
-    """Store the labels of the cells around a node."""
-    meeting, count = state.complex.meeting[node], 0
-    for m in range(MOST_MEETING):
-        meeting[m] = -1
-    for r in range(stars.start[node], stars.start[node + 1]):
-        count = insert_label(meeting, count, state.complex.labels[stars.cells[r]])
-    if count == 1:
-        meeting[0] = -1
-
-
 @entry
 def _meet_everywhere(state: State, stars: NodeStars) -> None:
     for node in range(len(state.complex.ticks)):
-        _meet(state, stars, node)
+        meeting, count = state.complex.meeting[node], 0
+        for m in range(MOST_MEETING):
+            meeting[m] = -1
+        for r in range(stars.start[node], stars.start[node + 1]):
+            count = insert_label(meeting, count, state.complex.labels[stars.cells[r]])
+        if count == 1:
+            meeting[0] = -1

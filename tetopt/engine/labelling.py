@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from tetopt.contents.labels import COMPONENT_VOXELS
 from tetopt.engine.complex import has_node
 from tetopt.geometry.simplex import facet_areas, regular_edge, volumes
-from tetopt.geometry.topology import connected_sets, stars
+from tetopt.geometry.topology import stars
 from tetopt.system.arrays import Bools, Floats, Ints
 from tetopt.system.kernels import (
     Bools1,
@@ -222,14 +222,15 @@ def label_cells(
     voxel = float(dual.volume.sum() / contents.counts.sum())
     targets = _targets(dual, np.bincount(dual.row, dual.volume, len(dual.bias)))
     labels = _settle_majority(dual, targets, voxel * contents.counts, keeps_volumes)
-    _mend_cheaply(dual, labels, targets, voxel, components)
+    marks = _marks(dual)
+    _mend_cheaply(dual, labels, targets, voxel, components, marks)
     _give_away_unfit(dual, labels, targets.volume)
     is_kept = np.zeros(len(labels), dtype=bool)
     if keeps_volumes and contents.pieces is not None:
         rows = voxel * contents.pieces
         _give_cells(dual, labels, is_kept, rows, contents.label_of_piece, PIECE_SHARE)
     for limits in LAST_PASSES:
-        mend(dual, labels, is_kept, targets, limits)
+        mend(dual, labels, is_kept, targets, limits, marks)
     return labels
 
 
@@ -263,18 +264,22 @@ def mend(
     limits: Pass,
     marks: _Marks | None = None,
 ) -> None:
-    """Mend places that are not manifold and have a node marked near, by default all, and those near
-    changes, if that lowers the energy.
+    """Mend places that are not manifold, if that lowers the energy.
 
-    Cells of `is_kept`, (M,), stay, and labels keep within the limits of their volumes. Afterwards
-    no node is marked near; those with a fault there or at an edge, or near a change, are not marked
-    sound; and those are due where mending may succeed later.
+    Cells of `is_kept`, (M,), stay, and labels keep within the limits of their volumes. With the
+    marks of an earlier pass of the same bias and contacts, places are not tried where nothing has
+    changed since they failed.
     """
     if not limits.has_contacts:
         dual = dual._replace(contacts=_no_contacts(len(labels), len(dual.bias)))
-    marks = marks or _Marks(*np.ones((3, len(dual.scale)), dtype=bool))
+    marks = marks or _marks(dual)
     volume, (least, most) = _label_volumes(dual, labels), targets.bounds(limits)
     room = np.stack([volume - least, most - volume])
+    marks.is_near[dual.cells[labels != marks.labels]] = True
+    is_changed = marks.is_near[dual.cells].any(axis=1)
+    marks.is_due[dual.cells[is_changed]] = True
+    marks.rise[is_changed] = -np.inf
+    marks.is_near[marks.is_due & ~marks.is_sound] = True
     while marks.is_near.any():
         faces, is_two = _nonmanifold(dual, labels, marks.is_near)
         marks.is_sound[marks.is_near] = True
@@ -282,7 +287,8 @@ def mend(
         marks.is_due[marks.is_near] = False  # all places at these nodes are tried
         marks.is_near[:] = False
         faces = faces if limits.is_wide else faces[is_two]
-        _mend_places(dual, labels, room, is_kept, faces, limits.has_pairs, marks, _work(dual))
+        _mend_places(dual, labels, room, is_kept, faces, limits.has_pairs, marks)
+    marks.labels[:] = labels
 
 
 def _targets(dual: Dual, aim: NDArray) -> Targets:
@@ -296,7 +302,7 @@ def _targets(dual: Dual, aim: NDArray) -> Targets:
     is_inner = (beside == labels[:, None]).all(axis=1)[cell] & (dual.row == labels[cell])
     inner = np.bincount(dual.row[is_inner], dual.volume[is_inner], len(aim))
     fit = np.maximum(_least_fit(dual.size, aim), dual.size.min())
-    return Targets(np.asarray(aim, dtype=np.float64), aim - inner, fit)
+    return Targets(aim, aim - inner, fit)
 
 
 def _label_volumes(dual: Dual, labels: Ints) -> NDArray:
@@ -331,6 +337,8 @@ def _settle_majority(
         step = bias * (aim > 0.0) - dual.bias
         longest = np.where(step * before < 0.0, 0.5 * longest, longest)
         before = np.clip(step, -longest, longest)
+        if not before.any():
+            break
         dual.bias[:] += before
     dual.bias[:] = bias_of_best
     return best
@@ -342,20 +350,15 @@ def _mend_cheaply(
     targets: Targets,
     voxel: float,
     components: list[NDArray],
+    marks: _Marks,
 ) -> None:
     """Remove fragments, and pinches where that is cheap, and settle; `voxel` in mm^n."""
-    is_bridge, mended = np.zeros(len(labels), dtype=bool), np.full(len(labels), -1)
-    marks = _Marks(*np.ones((3, len(dual.scale)), dtype=bool))
+    is_bridge = np.zeros(len(labels), dtype=bool)
     least = targets.bounds(CHEAP_PASS)[0]
     for _ in range(MENDING_ROUNDS):
         before = labels.copy(), is_bridge.copy()
         _without_fragments(dual, labels, is_bridge, targets.volume, voxel, components)
-        # Where nothing changed since mending failed, it fails again.
-        marks.is_near[dual.cells[labels != mended]] = True
-        marks.is_due[dual.cells[marks.is_near[dual.cells].any(axis=1)]] = True
-        marks.is_near[:] = marks.is_due
         mend(dual, labels, is_bridge, targets, CHEAP_PASS, marks)
-        mended = labels.copy()
         _settle(dual, labels, least, True)
         # what one step of a round changed, another undid
         if all(map(np.array_equal, before, (labels, is_bridge))):
@@ -508,13 +511,29 @@ def components_of(across: Ints, labels: Ints) -> tuple[Ints, Ints]:
     """The component of each cell, (M,), linked by facets between cells of one label; and each
     component's label.
     """
-    one = np.repeat(np.arange(len(labels)), across.shape[1])
-    other = across.ravel()
-    is_link = (other > one) & (labels[one] == labels[other])
-    n_pieces, number = connected_sets(one[is_link], other[is_link], len(labels))
-    of_component = np.empty(n_pieces, dtype=np.int64)
+    number, stack = np.full(len(labels), -1), np.empty(len(labels), dtype=np.int64)
+    of_component = np.empty(_number_components(number, stack, across, labels), dtype=np.int64)
     of_component[number] = labels
     return number, of_component
+
+
+@entry
+def _number_components(number: Ints1, stack: Ints1, across: Ints2, labels: Ints1) -> int:
+    """Number components in the order of their first cells; return how many there are."""
+    n_pieces = 0
+    for first in range(len(labels)):
+        if number[first] >= 0:
+            continue
+        number[first], stack[0], count = n_pieces, first, 1
+        while count > 0:
+            count -= 1
+            cell = stack[count]
+            for other in across[cell]:
+                if other >= 0 and number[other] < 0 and labels[other] == labels[cell]:
+                    number[other], stack[count] = n_pieces, other
+                    count += 1
+        n_pieces += 1
+    return n_pieces
 
 
 def _dual(
@@ -574,27 +593,22 @@ def _fill_majority(labels: Ints1, dual: Dual) -> None:
                 labels[cell], most = dual.row[p], worth
 
 
-def _settle(dual: Dual, labels: Ints, least: Floats, is_careful: bool) -> int:
-    """Let cells take a neighbour's label while the energy falls, the best moves first; return their
-    number.
+def _settle(dual: Dual, labels: Ints, least: Floats, is_careful: bool) -> None:
+    """Let cells take a neighbour's label while the energy falls, the best moves first.
 
     Tension alone lowers no label below its volume `least`. If `is_careful`, no label's topology
     changes.
     """
-    room = np.bincount(labels, dual.size, len(least)) - least
-    n_of = np.bincount(labels, minlength=len(least))
-    total, gains, is_stale = 0, np.zeros(len(labels)), np.ones(len(labels), dtype=bool)
-    while True:
+    room, n_of = _label_volumes(dual, labels) - least, np.bincount(labels, minlength=len(least))
+    gains, is_stale = np.zeros(len(labels)), np.ones(len(labels), dtype=bool)
+    while is_stale.any():
         # Only changed cells and their neighbours: for a head's 720,000 cells a fifth of the time of
         # all.
         _fill_gains(gains, dual, labels, np.flatnonzero(is_stale))
         is_stale[:] = False
         active = np.flatnonzero(gains > LEAST_GAIN * dual.size)
         order = active[np.argsort(-gains[active], kind="stable")]
-        moved = _settle_once(dual, labels, order, room, n_of, is_stale, is_careful)
-        total += moved
-        if moved == 0:
-            return total
+        _settle_once(dual, labels, order, room, n_of, is_stale, is_careful)
 
 
 @helper
@@ -627,11 +641,11 @@ def _best_label(dual: Dual, labels: NDArray, cell: int) -> tuple:
     """The cheapest label among a cell's neighbours, and its gain; the cell's own label if
     nothing is gained.
     """
-    own = _price(dual, labels, cell, labels[cell])
-    best, gain = labels[cell], 0.0
+    own, best, gain = np.inf, labels[cell], 0.0
     for k in range(dual.across.shape[1]):
         other = dual.across[cell, k]
         if other >= 0 and labels[other] != labels[cell] and labels[other] != best:
+            own = _price(dual, labels, cell, labels[cell]) if own == np.inf else own
             more = own - _price(dual, labels, cell, labels[other])
             if more > gain or (more == gain and labels[other] < best):
                 best, gain = labels[other], more
@@ -653,13 +667,12 @@ def _settle_once(
     n_of: Ints1,
     is_stale: Bools1,
     is_careful: bool,
-) -> int:
+) -> None:
     """Let the cells of `order` take the best label of a neighbour one after the other, if that
     still gains.
 
     Changed cells and their neighbours are marked in `is_stale`.
     """
-    moved = 0
     for cell in order:
         old = labels[cell]
         new, gain = _best_label(dual, labels, cell)
@@ -676,12 +689,10 @@ def _settle_once(
         room[new] += dual.size[cell]
         n_of[old] -= 1
         n_of[new] += 1
-        moved += 1
         is_stale[cell] = True
         for k in range(dual.across.shape[1]):
             if dual.across[cell, k] >= 0:
                 is_stale[dual.across[cell, k]] = True
-    return moved
 
 
 @unit
@@ -781,9 +792,8 @@ def _without_fragments(
     aim: Floats,
     voxel: float,
     components: list[NDArray],
-) -> int:
-    """Bridge or relabel components of cells that no component of voxels justifies; return the
-    number of changed cells.
+) -> None:
+    """Bridge or relabel components of cells that no component of voxels justifies.
 
     A label's components are ranked by the number of its voxels that they contain. The first stays,
     and each further one if the component of voxels of the same rank is not far smaller. The others
@@ -804,18 +814,20 @@ def _without_fragments(
         of_component[order], of_component[order]
     )
     ranked = zip(of_component, rank, content, strict=True)
-    stays = [
-        k == 0 or (k < len(components[p]) and voxel * components[p][k] >= COMPONENT_FRACTION * c)
-        for p, k, c in ranked
-    ]
-    is_loose, moved = ~np.array(stays)[number], 0
+    is_fragment = np.array(
+        [
+            k > 0 and (k >= len(components[p]) or voxel * components[p][k] < COMPONENT_FRACTION * c)
+            for p, k, c in ranked
+        ]
+    )
+    is_loose = is_fragment[number]
     way, before, bridge = np.full(len(labels), np.inf), np.empty_like(labels), np.empty_like(labels)
     sorted_cells, n_of = (
         np.argsort(number, kind="stable"),
         np.bincount(labels, minlength=len(components)),
     )
     start = np.searchsorted(number[sorted_cells], np.arange(len(of_component) + 1))
-    for component in order[~np.array(stays)[order]]:
+    for component in order[is_fragment[order]]:
         own = sorted_cells[start[component] : start[component + 1]]
         if (labels[own] != of_component[component]).any():  # another bridge crosses it
             continue
@@ -827,10 +839,9 @@ def _without_fragments(
             n_of[of_component[component]] += count
             is_loose[bridge[:count]] = is_loose[own] = False
             is_bridge[bridge[:count]] = True
-            moved += count
         elif content[component] > FRAGMENT_FRACTION * aim[of_component[component]]:
             is_loose[own] = False
-    return moved + _give_away(dual, labels, is_loose)
+    _give_away(dual, labels, is_loose)
 
 
 @entry
@@ -850,12 +861,8 @@ def _bridge(
     others unchanged. `way` is infinite before and after.
     """
     label, end, count = labels[component[0]], -1, 0
-    heap = [(0.0, component[0])]
-    for cell in component:
-        way[cell], before[cell] = 0.0, -1
-        if cell != component[0]:
-            heapq.heappush(heap, (0.0, cell))
-    done = [component[0] for _ in range(0)]
+    heap, done = [(0.0, cell) for cell in component], list(component)  # ascending
+    way[component], before[component] = 0.0, -1
     while len(heap) > 0 and end < 0:
         so_far, cell = heapq.heappop(heap)
         if so_far > way[cell]:
@@ -881,19 +888,17 @@ def _bridge(
         count += 1
     for cell in done:
         way[cell] = np.inf
-    for cell in component:
-        way[cell] = np.inf
     return count
 
 
 @entry
-def _give_away(dual: Dual, labels: Ints1, is_loose: Bools1) -> int:
+def _give_away(dual: Dual, labels: Ints1, is_loose: Bools1) -> None:
     """Give loose cells the cheapest label among neighbours that are not loose, from the outside
     in.
     """
-    total, moved = 0, 1
-    while moved > 0:
-        moved = 0
+    has_moved = True
+    while has_moved:
+        has_moved = False
         for cell in range(len(labels)):
             if not is_loose[cell]:
                 continue
@@ -905,10 +910,7 @@ def _give_away(dual: Dual, labels: Ints1, is_loose: Bools1) -> int:
                     if price < least or (price == least and labels[other] < best):
                         best, least = labels[other], price
             if best >= 0:
-                labels[cell], is_loose[cell] = best, False
-                moved += 1
-        total += moved
-    return total
+                labels[cell], is_loose[cell], has_moved = best, False, True
 
 
 # Places that are not manifold, an edge (a, b) or a node (a, -1), and their repair.
@@ -920,11 +922,11 @@ class _Work(NamedTuple):
     star: Ints1  # the cells around one node or edge
     label: Ints1  # the distinct labels of these
     own: Ints1  # index of each cell's label among those
-    # positions in the star of the cells beyond facets: its length for the outside, -1 if not in it
-    beside: Ints2
     root: Ints1  # root of each cell in its fan, or of each fan among linked ones
     fan: Ints1  # the fan of each cell, and the outside's
     fan_label: Ints1  # index of each fan's label; -1 for the outside
+    # positions in the star of the cells beyond facets: its length for the outside, -1 if not in it
+    beside: Ints2
     is_linked: Bools2  # fans with a common facet
     place: Ints1  # (M,) position of a cell in the star; -1 between calls
     # (N,) steps between labels at facets around the edge from one node to another; 0 between calls
@@ -932,43 +934,40 @@ class _Work(NamedTuple):
 
 
 class _Marks(NamedTuple):
-    """Marks of nodes (N,) for mending."""
+    """What is known of a mesh's places from earlier passes of mending."""
 
-    is_near: Bools1  # of a changed cell: places there are to be searched
-    is_sound: Bools1  # no place there is known to have a fault
-    is_due: Bools1  # places there may be mended later
+    labels: Ints1  # (M,) of cells after the last pass; -1 before the first
+    # (M, n+1) least change of the energy if a cell gets the label across each facet
+    rise: Floats2
+    is_near: Bools1  # (N,) nodes of a changed cell: places there are to be searched
+    is_sound: Bools1  # (N,) no place there is known to have a fault
+    is_due: Bools1  # (N,) places there may be mended later
+    work: _Work
+
+
+def _marks(dual: Dual) -> _Marks:
+    marks = np.zeros((3, len(dual.scale)), dtype=bool)
+    nothing = np.full(len(dual.cells), -1), np.full(dual.cells.shape, -np.inf)
+    return _Marks(*nothing, *marks, _work(dual))
 
 
 def _work(dual: Dual) -> _Work:
     widest = int(np.diff(dual.star_start).max())
-    star, label, own, root, fan, fan_label = np.empty((6, widest + 1), dtype=np.int64)
-    is_linked = np.empty((widest + 1, widest + 1), dtype=bool)
-    beside, place = (
-        np.empty((widest, dual.cells.shape[1]), dtype=np.int64),
-        np.full(len(dual.cells), -1),
-    )
     return _Work(
-        star,
-        label,
-        own,
-        beside,
-        root,
-        fan,
-        fan_label,
-        is_linked,
-        place,
+        *np.empty((6, widest + 1), dtype=np.int64),
+        np.empty((widest, dual.cells.shape[1]), dtype=np.int64),
+        np.empty((widest + 1, widest + 1), dtype=bool),
+        np.full(len(dual.cells), -1),
         np.zeros(len(dual.scale), dtype=np.int64),
     )
 
 
-def _nonmanifold(dual: Dual, labels: Ints, is_near: Bools | None = None) -> tuple[Ints, Bools]:
-    """Edges (a, b) and nodes (a, -1) where a label's interface is not manifold, (F, 2), and a mask
-    of two-label ones.
-
-    All of them, or those with a node marked near.
+def _nonmanifold(dual: Dual, labels: Ints, is_near: Bools) -> tuple[Ints, Bools]:
+    """Edges (a, b) and nodes (a, -1) with a node marked near where a label's interface is not
+    manifold, (F, 2), and a mask of two-label ones.
     """
-    is_near = np.ones(len(dual.scale), dtype=bool) if is_near is None else is_near
-    is_around = _around(dual, is_near)
+    is_around = np.zeros_like(is_near)
+    is_around[dual.cells[is_near[dual.cells].any(axis=1)]] = True
 
     def find(first: int, stop: int) -> Ints:
         # The largest possible number; unwritten pages take no memory.
@@ -1024,17 +1023,6 @@ def _find_nonmanifold(
             for k in range(4):
                 work.steps[dual.cells[dual.star_cells[r], k]] = 0
     return count
-
-
-@entry
-def _around(dual: Dual, is_near: Bools1) -> Bools1:
-    """True for each node with a cell that has a node marked near."""
-    is_around = np.zeros(len(is_near), dtype=np.bool_)
-    for node in range(len(is_near)):
-        for r in range(dual.star_start[node], dual.star_start[node + 1] if is_near[node] else 0):
-            for k in range(dual.cells.shape[1]):
-                is_around[dual.cells[dual.star_cells[r], k]] = True
-    return is_around
 
 
 @helper
@@ -1240,7 +1228,6 @@ def _mend_places(
     faces: Ints2,
     has_pairs: bool,
     marks: _Marks,
-    work: _Work,
 ) -> None:
     """At each place that is not manifold, make the move that most lowers the energy including
     pinches.
@@ -1248,12 +1235,12 @@ def _mend_places(
     Moves are those of a cell or of a fan and, where none lowers the energy and if `has_pairs`, of
     two cells. Nodes of changed cells are marked near, and no longer sound. Nodes are marked due
     whose places may be mended later: those with a cell that has a node of a changed one, or that a
-    label's room kept.
+    label's room or a kept cell prevented.
     """
-    star, group = np.empty_like(work.star), np.empty_like(work.star)
+    star, group = np.empty_like(marks.work.star), np.empty_like(marks.work.star)
     for f in range(len(faces)):
         a, b = faces[f, 0], faces[f, 1]
-        if _fault(dual, labels, a, b, work)[0] == 0.0:
+        if _fault(dual, labels, a, b, marks.work)[0] == 0.0:
             continue
         count = _gather(dual, a, b, star)
         best, best_from, best_label = -LEAST_GAIN * dual.scale[a], -1, -1
@@ -1261,17 +1248,17 @@ def _mend_places(
             if i >= 2 * count and best_from >= 0:
                 break
             size = _group(dual, labels, a, b, star[:count], i, group)
-            if size == 0 or is_kept[group[:size]].any():
+            if size == 0:
                 continue
             volume = dual.size[group[:size]].sum()
-            if room[0, labels[group[0]]] < volume:
+            if room[0, labels[group[0]]] < volume or is_kept[group[:size]].any():
                 marks.is_due[a] = True
                 continue
             can_grow = room[1] >= volume
             for cell in star[:count]:
                 marks.is_due[a] = marks.is_due[a] or not can_grow[labels[cell]]
             new, change = _best_of_group(
-                dual, labels, group[:size], star[:count], best, can_grow, marks, work
+                dual, labels, group[:size], star[:count], best, can_grow, marks
             )
             if new >= 0:
                 best, best_from, best_label = change, i, new
@@ -1287,8 +1274,10 @@ def _mend_places(
                     node = dual.cells[cell, k]
                     marks.is_near[node], marks.is_sound[node] = True, False
                     for r in range(dual.star_start[node], dual.star_start[node + 1]):
+                        around = dual.star_cells[r]
                         for m in range(dual.cells.shape[1]):
-                            marks.is_due[dual.cells[dual.star_cells[r], m]] = True
+                            marks.is_due[dual.cells[around, m]] = True
+                            marks.rise[around, m] = -np.inf
 
 
 @unit
@@ -1332,35 +1321,37 @@ def _best_of_group(
     least: float,
     can_grow: Bools1,
     marks: _Marks,
-    work: _Work,
 ) -> tuple[int, float]:
-    """The label in the star that may grow and lowers the energy most for the group, and the change.
+    """The label in the place's star that may grow and lowers the energy most for the group, and the
+    change.
 
     The label is -1 unless the change is below `least`.
     """
     old, best, faces = labels[group[0]], -1, np.empty((0, 2), dtype=np.int64)
-    before, pinches = 0.0, 0.0
+    before, pinches, work = 0.0, 0.0, marks.work
     for j in range(len(star)):
         new = labels[star[j]]
-        is_new = new != old and can_grow[new] and _touches(dual, labels, group, new)
+        side = _side(dual, labels, group, new) if new != old and can_grow[new] else -1
+        is_new = side >= 0 and (len(group) > 1 or marks.rise[group[0], side] < least)
         for i in range(j):
             is_new = is_new and labels[star[i]] != new
         if not is_new:
             continue
         if len(faces) == 0:
             faces = _closure(dual, group)
-            before, pinches = _prices(dual, labels, group), 0.0
+            before = _prices(dual, labels, group)
             for f in range(len(faces)):
-                if not (
-                    marks.is_sound[faces[f, 0]]
-                    or (faces[f, 1] >= 0 and marks.is_sound[faces[f, 1]])
-                ):
-                    pinches += _pinches(dual, labels, faces[f : f + 1], 0.0, np.inf, work)
+                a, b = faces[f, 0], faces[f, 1]
+                if marks.is_sound[a] or (b >= 0 and marks.is_sound[b]):
+                    continue
+                pinches += _fault(dual, labels, a, b, work)[0] * dual.scale[a]
         for cell in group:
             labels[cell] = new
         change = _prices(dual, labels, group) - before - pinches
         if change < least:  # if all pinches vanish
             change += _pinches(dual, labels, faces, change, least, work)
+        if len(group) == 1:
+            marks.rise[group[0], side] = change
         for cell in group:
             labels[cell] = old
         if change < least:
@@ -1369,13 +1360,13 @@ def _best_of_group(
 
 
 @helper
-def _touches(dual: Dual, labels: NDArray, group: NDArray, label: int) -> bool:
-    """True if a cell of a label lies across a facet of the group."""
+def _side(dual: Dual, labels: NDArray, group: NDArray, label: int) -> int:
+    """The first facet of a cell of the group with a cell of a label across it; -1 if none."""
     for cell in group:
         for k in range(dual.across.shape[1]):
             if dual.across[cell, k] >= 0 and labels[dual.across[cell, k]] == label:
-                return True
-    return False
+                return k
+    return -1
 
 
 @helper
