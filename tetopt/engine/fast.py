@@ -208,8 +208,6 @@ def optimize(
     # Iterations that may exchange nodes: shape alone does not determine where to add nodes.
     n_early = int(EXCHANGING_FRACTION * iterations) if k_D > 0.0 or sizes.has_target else 0
     course = Course(
-        1,
-        iterations,
         iterations,
         n_early,
         min_dihedral,
@@ -224,24 +222,27 @@ def optimize(
         run.mend_surfaces(False, min_dihedral)
     if ended == "over":
         ended = "stopped" if stop is not None and stop() else "max_seconds"
-    result = MeshingResult(
-        run.mesh(), history, ended, mesh, labels=run.labels(), n_dropped=run.n_dropped
+    return MeshingResult(
+        run.mesh(),
+        history,
+        ended,
+        mesh,
+        labels=run.labels(),
+        n_dropped=run.n_dropped,
+        dropped=dict(run.dropped),
     )
-    return result._replace(dropped=dict(run.dropped))
 
 
 class Course(NamedTuple):
-    """The iterations of a run: all of them, or those of one round on a part of a mesh."""
+    """The iterations of a run."""
 
-    first: int
-    last: int
-    iterations: int  # in all
+    iterations: int
     n_early: int  # the first ones, which exchange nodes
     min_dihedral: float  # degrees
     tolerance: float  # as of `optimize`
     nodes: int | None  # as of `optimize`
     sizes: Sizes
-    carves: bool = False  # True if the last iteration removes cells at pinches of a mask's boundary
+    carves: bool  # True if the last iteration removes cells at pinches of a mask's boundary
 
 
 def follow_course(
@@ -265,12 +266,12 @@ def follow_course(
         if callback is not None:
             callback(history[-1])
 
-    record(course.first - 1, 0.0, False)
+    record(0, 0.0, False)
     if course.iterations > 0:
         run.keep_min_dihedral(min_dihedral)
     is_late = grace(begin, is_over)
     has_labels = run.content.memberships is not None and run.state.objective.image > 0.0
-    for iteration in range(course.first, course.last + 1):
+    for iteration in range(1, course.iterations + 1):
         before = run.state.complex.ticks.copy()
         # not of a run that ends here, whose mesh is first kept
         is_labelled = has_labels and gives_labels(iteration, course) and not is_over()
@@ -291,13 +292,12 @@ def follow_course(
         # 3. Exchange nodes: in every second of the first iterations.
         if nodes is not None and does_exchange and not is_over():
             n_changes += run.exchange_towards(nodes, course.sizes, is_over)
-        # 4. Lift flat cells and repair places that are not manifold: in the last iteration. Parts
-        # do so in every round, as nodes of flat cells may be fixed in the next one.
-        is_finished = is_finished and (iteration == course.last or not is_over())
+        # 4. Lift flat cells and repair places that are not manifold: in the last iteration.
+        is_finished = is_finished and (iteration == course.iterations or not is_over())
         if not is_finished and keep is not None:
             keep(run.mesh(), run.labels())
         is_last = (
-            iteration == course.last
+            iteration == course.iterations
             or not is_finished
             or (fall < course.tolerance and not is_early)
         )
