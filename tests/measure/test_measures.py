@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import tetopt
-from tetopt.measure.fidelity import label_fidelity, mask_fidelity
+from tetopt.measure import interfaces
+from tetopt.measure.fidelity import cell_labels, label_fidelity, mask_fidelity
 from tetopt.measure.interfaces import label_interfaces
 from tetopt.measure.measures import fidelity, measure_each
 from tetopt.measure.thin import label_contacts
@@ -71,3 +72,23 @@ def test_what_lies_far_from_a_mask_counts_for_no_measure(shape):
     assert close([row.surface for row in measured["labels"]], surfaces)
     assert close(measured["contacts"], label_contacts(labels, *rest))
     assert len(shape) == 2 or any(row.pieces.lost_components for row in measured["labels"])
+
+
+def test_what_the_voxels_are_is_measured_once(monkeypatch):
+    """For several meshes of the same labels, and anew within a mask or another one."""
+    labels = tetopt.load_phantom("sphere").label_image(voxel_mm=4)
+    meshes = [tetopt.lattice_mesh(labels, nodes=nodes) for nodes in (100, 300)]
+    nets, smooth = [], interfaces.smooth_surface
+    monkeypatch.setattr(interfaces, "smooth_surface", lambda *of: nets.append(of) or smooth(*of))
+
+    def areas(mask=None):
+        found = [fidelity(labels, mask, mesh, None)["interfaces"] for mesh in meshes]
+        assert found[0][1].area != found[1][1].area
+        return [row.smooth_area for row in found[0]], len(nets)
+
+    whole, n_nets = areas()
+    assert (whole, n_nets) == (areas()[0], 2)
+    half = tetopt.Image(np.indices(labels.shape)[0] < 8, labels.affine)
+    assert label_interfaces(labels, meshes[0], cell_labels(labels, meshes[0]), half)[1].euler == 2
+    assert len(nets) == 4
+    assert areas()[0] == whole

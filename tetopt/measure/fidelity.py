@@ -13,9 +13,11 @@ percentiles are by area.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
 from math import ceil
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import scipy
@@ -29,7 +31,7 @@ from tetopt.contents.labels import (
     check_labels,
     voxel_components,
 )
-from tetopt.energy.sampling import Overlap, cell_moments, cell_of_voxel, nearest_values, overlap_of
+from tetopt.energy.sampling import Overlap, cell_moments, cell_of_voxel, nearest_voxels, overlap_of
 from tetopt.errors import InputError
 from tetopt.geometry.check import facets_on_box, outside_fraction
 from tetopt.geometry.manifold import OUTSIDE_LABEL
@@ -361,6 +363,10 @@ class LabelFidelity(NamedTuple):
         return {"label": self.label, **numbers}
 
 
+Made = TypeVar("Made")
+RECORD = "voxels of labels"  # the name of a `VoxelRecord` among an image's attributes
+
+
 class OwnedVoxels(NamedTuple):
     """Voxels with labels, and the cells that own them."""
 
@@ -469,11 +475,11 @@ def cell_labels(labels: Image, mesh: Mesh) -> Ints:
     >>> np.bincount(of_cell).tolist()
     [1063, 137]
     """
-    labels = check_labels("labels", labels)
+    voxels = voxels_of(labels)
     outside_fraction(mesh, labels)
-    nearest = nearest_values(labels, centroids(mesh.points, mesh.cells)).astype(np.int64)
-    values, rows, nearest = by_row(labels_in_mask(labels, None), nearest)
-    return values[_most_frequent(rows, cell_of_voxel(labels, mesh), nearest)]
+    nearest = nearest_voxels(labels, centroids(mesh.points, mesh.cells))
+    nearest = voxels.rows[tuple(nearest.T)].astype(np.int64)
+    return voxels.labels[_most_frequent(voxels.rows, cell_of_voxel(labels, mesh), nearest)]
 
 
 def label_fidelity(
@@ -530,17 +536,17 @@ def label_fidelity(
     label 0: Dice 1.00, off by 0.5 mm
     label 1: Dice 1.00, off by 0.5 mm
     """
-    labels = check_labels("labels", labels)
+    record = voxels_of(labels, mask)
     owner = voxel_cells(labels, mesh) if owner is None else owner
     of_cell = cell_labels(labels, mesh) if of_cell is None else check_cell_labels(of_cell, mesh)
-    values, true, of_cell = by_row(labels_in_mask(labels, mask), of_cell)
+    values, true, of_cell = record.labels, record.rows, record.rows_of(of_cell)
     outside = BACKGROUND_LABEL if mask is None else OUTSIDE_LABEL
     is_covered = (owner >= 0) | (mask is not None)
     voxels = OwnedVoxels(values, true, owner, is_covered, outside, labels.affine)
     overlaps = _label_overlaps(labels, mesh, voxels, of_cell)
     distances = _label_distances(labels, mesh, true, of_cell, outside)
     one_layer = one_layer_fractions(mesh, of_cell, facets(mesh.cells))
-    boxes, rows = scipy.ndimage.find_objects(true + 1), []
+    boxes, rows = record.boxes, []
     if other := {known.label for known in extents}.difference(values.tolist()):
         raise InputError(f"extents: label {min(other)} is not in `labels`; measure them again")
     for known in extents or label_extents(voxels, mesh, of_cell):
@@ -901,18 +907,69 @@ def euler_characteristic(surface_facets: Ints) -> int:
     return total
 
 
-def labels_in_mask(labels: Image, mask: Image | None) -> NDArray[np.int32]:
-    """Labels of the voxels, `OUTSIDE_LABEL` where a mask is below 1/2; raise InputError for a
-    mask on other voxels.
-    """
-    data = labels.data.astype(np.int32)
-    if mask is not None and mask.shape != labels.shape:
-        raise InputError(
-            f"mask: expected the labels' shape {labels.shape}, got {mask.shape}; resample it first"
+@dataclass(frozen=True, eq=False)
+class VoxelRecord:
+    """What the voxels of labels are, whatever the mesh; made by `voxels_of`."""
+
+    image: Image
+    mask: Image | None
+    labels: Ints  # (K,) ascending, with 0
+    rows: NDArray[np.integer]  # row of `labels` of each voxel; `OUTSIDE_LABEL` beyond the mask
+
+    @cached_property
+    def boxes(self) -> list[tuple[slice, ...] | None]:
+        """The box of each label's voxels; None without any."""
+        boxes = scipy.ndimage.find_objects(self.rows + 1)
+        return [*boxes, *[None] * (len(self.labels) - len(boxes))]
+
+    def rows_of(self, of_cell: Ints) -> Ints:
+        """Return the rows of cells' labels, further ones for labels without a voxel."""
+        others = np.setdiff1d(of_cell, self.labels)
+        is_known = np.isin(of_cell, self.labels)
+        return np.where(
+            is_known,
+            np.searchsorted(self.labels, of_cell),
+            len(self.labels) + np.searchsorted(others, of_cell),
         )
-    if mask is not None:
-        data[mask.data < INSIDE_FRACTION] = OUTSIDE_LABEL
-    return data
+
+    def once(self, make: Callable[[VoxelRecord], Made]) -> Made:
+        """Return what a function makes of these voxels, at its first call alone."""
+        name = f"{make.__module__}.{make.__name__}"
+        if name not in vars(self):
+            vars(self)[name] = make(self)
+        return vars(self)[name]
+
+
+def voxels_of(labels: Image, mask: Image | None = None) -> VoxelRecord:
+    """Return the record of an image's labels within a mask: one for all measures of all meshes,
+    kept with the image like its range.
+
+    Raises
+    ------
+    InputError
+        Values that are not labels, or a mask on other voxels.
+    """
+    record: VoxelRecord | None = vars(labels).get(RECORD)
+    if record is None or record.mask is not mask:
+        data = check_labels("labels", labels).data
+        if mask is not None and mask.shape != labels.shape:
+            raise InputError(
+                f"mask: expected the labels' shape {labels.shape}, got {mask.shape}; resample it "
+                "first"
+            )
+        if mask is not None:
+            data = np.where(mask.data < INSIDE_FRACTION, OUTSIDE_LABEL, data)
+        parts = over_slabs(lambda first, stop: np.unique(data[first:stop]), len(data), data.size)
+        values = np.unique(np.concatenate([[OUTSIDE_LABEL, BACKGROUND_LABEL], *parts]))
+        rows = np.empty(data.shape, dtype=_narrow(np.arange(len(values))).dtype)
+
+        def fill(first: int, stop: int) -> None:
+            rows[first:stop] = np.searchsorted(values, data[first:stop]) - 1
+
+        over_slabs(fill, len(data), data.size)
+        record = VoxelRecord(labels, mask, values[1:].astype(np.int64), rows)
+        vars(labels)[RECORD] = record
+    return record
 
 
 def voxel_cells(image: Image, mesh: Mesh) -> NDArray[np.int32]:
@@ -986,22 +1043,6 @@ def check_cell_labels(of_cell: ArrayLike, mesh: Mesh) -> Ints:
             f"{values.min():g} to {values.max():g}"
         )
     return values.astype(np.int64)
-
-
-def by_row(labels: NDArray[np.int32], of_cell: Ints) -> tuple[Ints, NDArray[np.integer], Ints]:
-    """Return all labels (K,), ascending and from 0, and of voxels and cells their rows; -1 for
-    `OUTSIDE_LABEL`.
-    """
-    parts = over_slabs(lambda first, stop: np.unique(labels[first:stop]), len(labels), labels.size)
-    values = np.unique(np.concatenate([[OUTSIDE_LABEL, 0], *parts, of_cell]))
-    numbers = _narrow(np.arange(-1, len(values) - 1))
-    rows = np.empty(labels.shape, dtype=numbers.dtype)
-
-    def fill(first: int, stop: int) -> None:
-        rows[first:stop] = np.searchsorted(values, labels[first:stop]) - 1
-
-    over_slabs(fill, len(labels), labels.size)
-    return values[1:], rows, np.searchsorted(values[1:], of_cell)
 
 
 def one_layer_fractions(mesh: Mesh, of_cell: Ints, shared: Facets) -> dict[int, float]:

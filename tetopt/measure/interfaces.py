@@ -15,12 +15,12 @@ closes only in an edge or a node has no hole.
 from __future__ import annotations
 
 from itertools import product
+from typing import Any
 
 import numpy as np
-import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from tetopt.contents.labels import check_labels, component_runs
+from tetopt.contents.labels import component_runs
 from tetopt.geometry.manifold import (
     LabelSurfaces,
     Ridges,
@@ -34,11 +34,11 @@ from tetopt.image import Image, transform_vectors
 from tetopt.measure.fidelity import (
     FacetSurface,
     LabelInterface,
-    by_row,
+    VoxelRecord,
     check_cell_labels,
     facet_vectors,
-    labels_in_mask,
     surface_areas,
+    voxels_of,
 )
 from tetopt.mesh import Mesh
 from tetopt.system.arrays import Bools, Floats, Ints
@@ -94,15 +94,13 @@ def label_interfaces(
     >>> ball.nonmanifold_edges, ball.nonmanifold_nodes, ball.mesh_euler  # without handles
     (0, 0, 2)
     """
-    labels = check_labels("labels", labels)
-    values, voxels, of_cell = by_row(labels_in_mask(labels, mask), check_cell_labels(of_cell, mesh))
-    boxes = scipy.ndimage.find_objects(voxels + 1)
-    present = np.array([row for row, box in enumerate(boxes) if box is not None])
+    voxels = voxels_of(labels, mask)
+    of_cell = voxels.rows_of(check_cell_labels(of_cell, mesh))
     shared = facets(mesh.cells)
     surfaces = label_surfaces(shared, of_cell)
     ridges = surface_ridges(surfaces)
     fans = surface_fans(surfaces, ridges)
-    n_labels = len(values)
+    n_labels = max(len(voxels.labels), int(of_cell.max()) + 1)
 
     def counts(which: Ints, weights: NDArray | None = None) -> NDArray:
         """Counts by label, without the outside."""
@@ -131,33 +129,45 @@ def label_interfaces(
     area = counts(surfaces.label, surface_areas(FacetSurface(pieces.points, surfaces.nodes)))
     n_folded = counts(ridges.label[turns > FOLD_DEGREES])
     n_paired = counts(ridges.label[np.isfinite(turns)])
-    rows = []
-    for row in present.tolist():
-        is_label = np.pad(voxels[boxes[row]] == row, 1)
-        is_large = bool(np.count_nonzero(is_label) >= NET_VOXELS[mesh.ndim])
-        smooth_area = _smooth_area(is_label, labels, is_large)
-        rows.append(
-            LabelInterface(
-                label=int(values[row]),
-                area=float(area[row]),
-                smooth_area=smooth_area,
-                area_ratio=float(area[row]) / smooth_area
-                if area[row] > 0.0 and is_large
-                else np.nan,
-                folded=float(n_folded[row] / n_paired[row]) if n_paired[row] else np.nan,
-                euler=voxel_euler(is_label),
-                cavities=voxel_cavities(is_label),
-                **{name: int(counted[row]) for name, counted in of_label.items()},
-            )
+    return [
+        LabelInterface(
+            area=float(area[row]),
+            area_ratio=float(area[row]) / shape["smooth_area"]
+            if area[row] > 0.0 and is_large
+            else np.nan,
+            folded=float(n_folded[row] / n_paired[row]) if n_paired[row] else np.nan,
+            **shape,
+            **{name: int(counted[row]) for name, counted in of_label.items()},
         )
+        for row, is_large, shape in voxels.once(_voxel_shapes)
+    ]
+
+
+def _voxel_shapes(voxels: VoxelRecord) -> list[tuple[int, bool, dict[str, Any]]]:
+    """Measure the closed smooth surface of each label's voxels: its row, whether it has enough for
+    their volume, and its numbers.
+    """
+    rows, image = [], voxels.image
+    for row, box in enumerate(voxels.boxes):
+        if box is None:
+            continue
+        is_label = np.pad(voxels.rows[box] == row, 1)
+        n_voxels = np.count_nonzero(is_label)
+        is_large = bool(n_voxels >= NET_VOXELS[image.ndim])
+        nets = smooth_surface(is_label, image.affine)
+        smooth_area = (
+            area_at_volume(nets, n_voxels * image.voxel_volume)
+            if is_large
+            else float(surface_areas(nets).sum())
+        )
+        numbers = {
+            "label": int(voxels.labels[row]),
+            "smooth_area": smooth_area,
+            "euler": voxel_euler(is_label),
+            "cavities": voxel_cavities(is_label),
+        }
+        rows.append((row, is_large, numbers))
     return rows
-
-
-def _smooth_area(is_label: Bools, labels: Image, is_large: bool) -> float:
-    """Area of the smooth surface of a label's voxels; at their volume if these are enough."""
-    nets = smooth_surface(is_label, labels.affine)
-    volume = np.count_nonzero(is_label) * labels.voxel_volume
-    return area_at_volume(nets, volume) if is_large else float(surface_areas(nets).sum())
 
 
 def smooth_surface(is_label: Bools, affine: Floats) -> FacetSurface:

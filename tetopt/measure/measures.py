@@ -23,6 +23,7 @@ from tetopt.measure.fidelity import (
     label_fidelity,
     mask_fidelity,
     voxel_cells,
+    voxels_of,
 )
 from tetopt.measure.interfaces import label_interfaces
 from tetopt.measure.thin import contact_totals, label_contacts, label_thickness
@@ -64,7 +65,8 @@ def fidelity(
             else lambda: of_cell
         )
         measures["labels"] = lambda: label_fidelity(labels, mesh, own(), mask, owner(), extents)
-        if len(np.unique(labels.data if mask is None else labels.data[mask.data >= 0.5])) > 1:
+        # made before the threads that share it
+        if sum(box is not None for box in voxels_of(labels, mask).boxes) > 1:
             measures["thickness"] = lambda: label_thickness(whole(), mesh, own())
         measures["interfaces"] = lambda: label_interfaces(labels, mesh, own(), mask)
         measures["contacts"] = lambda: label_contacts(labels, mesh, own(), mask)

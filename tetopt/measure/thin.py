@@ -7,6 +7,7 @@ surfaces and between the facets of the mesh: the median for shells is within 3 %
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tetopt.contents.content import Content
-from tetopt.contents.labels import LARGEST_LABEL, check_labels
+from tetopt.contents.labels import LARGEST_LABEL
 from tetopt.contents.thickness import (
     BEYOND_REGION,
     THICKNESS_PERCENTILES,
@@ -29,12 +30,13 @@ from tetopt.measure.fidelity import (
     FacetSurface,
     LabelThickness,
     Thickness,
+    VoxelRecord,
     check_cell_labels,
-    labels_in_mask,
     painted_voxels,
     surface_areas,
     voxel_cells,
     voxel_counts,
+    voxels_of,
 )
 from tetopt.mesh import Mesh
 from tetopt.system.arrays import Floats, Ints
@@ -118,7 +120,7 @@ def label_contacts(
     ...     print(each.labels, f"{each.ratio:.2f}")
     (0, 1) 1.04
     """
-    labels = check_labels("labels", labels)
+    in_voxels = voxels_of(labels, mask).once(_voxel_contacts)
     of_cell = check_cell_labels(of_cell, mesh)
     pieces, n_pieces = mesh.straight_pieces()
     shared = facets(pieces.cells)
@@ -126,7 +128,6 @@ def label_contacts(
     is_contact = (shared.n_cells == 2) & (sides[:, 0] != sides[:, 1])
     area = surface_areas(FacetSurface(pieces.points, shared.nodes[is_contact]))
     in_mesh = _by_pair(sides[is_contact, 0], sides[is_contact, 1], area)
-    in_voxels = _voxel_contacts(labels, mask)
     return [
         LabelContact(
             (pair // LABEL_BASE, pair % LABEL_BASE),
@@ -150,19 +151,18 @@ def contact_totals(contacts: Sequence[LabelContact]) -> dict[str, float]:
     }
 
 
-def _voxel_contacts(labels: Image, mask: Image | None) -> dict[int, float]:
+def _voxel_contacts(voxels: VoxelRecord) -> dict[int, float]:
     """Contact area of each pair's voxels inside, as the area of smooth surfaces."""
-    data = labels_in_mask(labels, mask)
-    total: dict[int, float] = {}
-    for axis, edge in enumerate(labels.spacing):
-        along = np.moveaxis(data, axis, 0)
+    total, image = Counter[int](), voxels.image
+    for axis, edge in enumerate(image.spacing):
+        along = np.moveaxis(voxels.rows, axis, 0)
         is_contact = (along[:-1] != along[1:]) & (
             np.minimum(along[:-1], along[1:]) != OUTSIDE_LABEL
         )
-        face = STAIRS[labels.ndim] * float(np.prod(labels.spacing)) / float(edge)
-        of_axis = _by_pair(along[:-1][is_contact], along[1:][is_contact])
-        for pair, count in of_axis.items():
-            total[pair] = total.get(pair, 0.0) + face * count
+        face = STAIRS[image.ndim] * float(np.prod(image.spacing)) / float(edge)
+        sides = (voxels.labels[each[is_contact]] for each in (along[:-1], along[1:]))
+        for pair, count in _by_pair(*sides).items():
+            total[pair] += face * count
     return total
 
 
@@ -184,7 +184,7 @@ def label_thickness(what: Content, mesh: Mesh, of_cell: ArrayLike) -> dict[int, 
 
     Of a label of more than 5,000 voxels, as many are sampled, in which the thickness is exact. The
     sample's percentiles have ranks within 0.5 % of those of all voxels: of the tissues of the
-    MNI152, the 5th percentile is off by 3 % or less, median and 95th by 0.3 %.
+    MNI152, the 5th percentile is off by 4 % or less, the median by 3, and the 95th by 0.2.
 
     Parameters
     ----------
