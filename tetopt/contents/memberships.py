@@ -357,15 +357,13 @@ def _label_between(
     for m in range(1, 8):
         is_same = is_same and partition[corner[m, 0], corner[m, 1], corner[m, 2]] == best
     for m in range(8 * (not is_same)):
-        label, level, is_new = partition[corner[m, 0], corner[m, 1], corner[m, 2]], 0.0, True
-        for q in range(m):
-            is_new = is_new and partition[corner[q, 0], corner[q, 1], corner[q, 2]] != label
-        for q in range(8 * is_new):
+        label, level = partition[corner[m, 0], corner[m, 1], corner[m, 2]], 0.0
+        for q in range(8):
             weight = 1.0
             for d in range(3):
                 weight *= fraction[d] if q >> d & 1 else 1.0 - fraction[d]
             level += weight * levels[channel[label], corner[q, 0], corner[q, 1], corner[q, 2]]
-        if is_new and (level < least or (level == least and label < best)):
+        if level < least or (level == least and label < best):
             best, least = label, level
     return int(best)
 
