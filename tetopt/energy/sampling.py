@@ -24,8 +24,7 @@ axis of length 1.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from math import ceil, log2, prod
 from typing import Any, NamedTuple
 
@@ -423,14 +422,13 @@ def sampling_grid(image: Image, points: Floats) -> SamplingGrid:
     prefix = np.empty(
         (shape[0], shape[1], shape[2] + 1, 2), dtype=np.int32 if is_short else np.float64
     )
-    with few_threads(image.data.size // 50):
-        data: Any = image.data.reshape(shape)
-        is_single, nothing = data.dtype == np.float32, np.zeros((1, 1, 1))
-        single = data if is_single else nothing.astype(np.float32)
-        work = _Filling(
-            _volume(prefix, bits), nothing if is_single else data, single, is_single, float(shift)
-        )
-        run(_fill_prefix, shape[0], work)
+    data: Any = image.data.reshape(shape)
+    is_single, nothing = data.dtype == np.float32, np.zeros((1, 1, 1))
+    single = data if is_single else nothing.astype(np.float32)
+    work = _Filling(
+        _volume(prefix, bits), nothing if is_single else data, single, is_single, float(shift)
+    )
+    run(_fill_prefix, shape[0], work, image.data.size // 50)
     return SamplingGrid(prefix, bits, float(shift))
 
 
@@ -538,21 +536,6 @@ def from_ticks(ticks: Ints, grid: SamplingGrid, n: int) -> Floats:
     return ticks[:, 3 - n :].astype(np.float64) * 2.0**-grid.bits
 
 
-@contextmanager
-def few_threads(tasks: int) -> Iterator[None]:
-    """Use one thread per 2000 `tasks` at most; results do not depend on it.
-
-    Waking a second thread for a mesh of a hundred cells costs more than its work: on a busy machine
-    61 nodes took 20 times as long on two threads as on one.
-    """
-    threads = numba.get_num_threads()
-    numba.set_num_threads(min(threads, 1 + tasks // 2000))
-    try:
-        yield
-    finally:
-        numba.set_num_threads(threads)
-
-
 def check_orientations(image: Image, ticks: Ints, cells: Ints) -> None:
     """Raise InputError unless every cell, positive in the world, is positive on the fixed-point
     grid, too.
@@ -587,12 +570,10 @@ def moment_sums(
     sides = facets(cells) if sides is None else sides
     n_sums = grid.prefix.shape[3] + 1
     fluxes, sums = np.empty((len(sides.nodes), 1, n_sums)), np.empty((len(cells), n_sums))
-    with few_threads(len(fluxes)):
-        work = _Fluxes(fluxes, ticks, np.ascontiguousarray(sides.nodes), volume_of(grid))
-        run(_fill_fluxes, -(-len(fluxes) // CELLS_PER_CHUNK), work)
-    with few_threads(len(sums)):
-        summed = _Sums(sums, fluxes[:, 0], sides.of_cell, sides.sign, _hand(ticks, cells))
-        run(_fill_sums, -(-len(sums) // CELLS_PER_CHUNK), summed)
+    work = _Fluxes(fluxes, ticks, np.ascontiguousarray(sides.nodes), volume_of(grid))
+    run(_fill_fluxes, -(-len(fluxes) // CELLS_PER_CHUNK), work, len(fluxes))
+    summed = _Sums(sums, fluxes[:, 0], sides.of_cell, sides.sign, _hand(ticks, cells))
+    run(_fill_sums, -(-len(sums) // CELLS_PER_CHUNK), summed, len(sums))
     return sums
 
 

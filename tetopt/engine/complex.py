@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.energy.sampling import CELLS_PER_CHUNK, Volume, few_threads
+from tetopt.energy.sampling import CELLS_PER_CHUNK, Volume
 from tetopt.energy.sampling import put_flux as sampled_flux
 from tetopt.geometry.vectors import (
     cross,
@@ -164,13 +164,9 @@ def build(
 
 def remeasure(state: State) -> None:
     """Recompute fluxes, sums and shape energies of all cells."""
-    with few_threads(int(state.complex.n_cells[0]) * 4):
-        n_chunks, laid_out = (
-            (int(state.complex.n_cells[0]) + CELLS_PER_CHUNK - 1) // CELLS_PER_CHUNK,
-            pack_record(state),
-        )
-        run(_measure_cells, n_chunks, laid_out)
-        run(_sum_cells, n_chunks, laid_out)
+    n_cells, laid_out = int(state.complex.n_cells[0]), pack_record(state)
+    for task in (_measure_cells, _sum_cells):
+        run(task, -(-n_cells // CELLS_PER_CHUNK), laid_out, 4 * n_cells)
 
 
 def copy_state(state: State) -> State:
@@ -681,10 +677,9 @@ def node_stars(state: State) -> NodeStars:
     corner = np.empty(n_cells * n_corners, dtype=np.int64)
     twin = np.empty((n_cells * n_corners, n_corners), dtype=np.int64)
     _fill_stars(start, cells, corner, state.complex.cells, n_cells)
-    with few_threads(n_cells):
-        stars = NodeStars(start, cells, corner, twin)
-        n_chunks = (len(state.complex.ticks) + CELLS_PER_CHUNK - 1) // CELLS_PER_CHUNK
-        run(_fill_twins, n_chunks, Twins(stars, state.complex.across))
+    stars = NodeStars(start, cells, corner, twin)
+    n_chunks = -(-len(state.complex.ticks) // CELLS_PER_CHUNK)
+    run(_fill_twins, n_chunks, Twins(stars, state.complex.across), n_cells)
     return stars
 
 

@@ -20,7 +20,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.energy.sampling import few_threads
 from tetopt.engine.complex import (
     NODE_ROWS,
     NodeStars,
@@ -558,8 +557,7 @@ def best_splits(state: State, stars: NodeStars, may_split: Bools, limits: Limits
     """
     n_nodes = len(may_split)
     moves = EdgeMoves(may_split, np.full(n_nodes, -1, dtype=np.int64), np.full(n_nodes, -np.inf))
-    with few_threads(n_nodes * 20):
-        run(_fill_splits, n_nodes, Splits(moves, state, stars, limits))
+    run(_fill_splits, n_nodes, Splits(moves, state, stars, limits), n_nodes * 20)
     return moves
 
 
@@ -807,8 +805,8 @@ def best_collapses(
     moves = EdgeMoves(may_collapse, np.full(n_nodes, -1, dtype=np.int64), np.full(n_nodes, -np.inf))
     laid_out = pack_record(state), pack_record(stars), pack_record(groups)
     for chosen in colours_of(state, stars, groups):
-        with few_threads(len(chosen) * 10_000):
-            run(_fill_collapses, len(chosen), Collapses(moves, *laid_out, chosen, limits))
+        work = Collapses(moves, *laid_out, chosen, limits)
+        run(_fill_collapses, len(chosen), work, len(chosen) * 10_000)
     return moves
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from numba import get_num_threads
 from numpy.typing import NDArray
 
-from tetopt.energy.sampling import CELLS_PER_CHUNK, few_threads
+from tetopt.energy.sampling import CELLS_PER_CHUNK
 from tetopt.engine.complex import (
     Objective,
     State,
@@ -163,11 +163,10 @@ def _evaluate(gain: NDArray, move: NDArray, near: NDArray, is_dirty: NDArray, st
 
     The lowest dirty cell of each facet and edge evaluates it.
     """
-    with few_threads(len(near) * 4):
-        task = _evaluate_triangles if state.complex.cells.shape[1] == 3 else _evaluate_cells
-        rooms = [cavity(0, state.complex.fluxes.shape[2]) for _ in range(get_num_threads())]
-        work = Evaluation(gain, move, near, is_dirty, state, rooms)
-        run(task, (len(near) + CELLS_PER_CHUNK - 1) // CELLS_PER_CHUNK, work)
+    task = _evaluate_triangles if state.complex.cells.shape[1] == 3 else _evaluate_cells
+    rooms = [cavity(0, state.complex.fluxes.shape[2]) for _ in range(get_num_threads())]
+    work = Evaluation(gain, move, near, is_dirty, state, rooms)
+    run(task, -(-len(near) // CELLS_PER_CHUNK), work, len(near) * 4)
 
 
 class Evaluation(NamedTuple):

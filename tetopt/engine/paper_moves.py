@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.energy.geometric import volume_and_E_G, volume_gradient
-from tetopt.energy.sampling import cell_orientation, few_threads
+from tetopt.energy.sampling import cell_orientation
 from tetopt.engine.complex import FLAT_FRACTION, NodeStars, State, cell_energy
 from tetopt.engine.sliding import projection_at
 from tetopt.engine.smooth import Trial, TrialByValue, star_image, store, trial_of
@@ -42,8 +42,7 @@ def descend(moves: Moves) -> None:
     parabola through the three values. The node moves to the best of these if that lowers the
     energy.
     """
-    with few_threads(len(moves.nodes) * 100):
-        run(_descend, len(moves.nodes), moves)
+    run(_descend, len(moves.nodes), moves, len(moves.nodes) * 100)
 
 
 def relocate(moves: Moves) -> None:
@@ -54,8 +53,7 @@ def relocate(moves: Moves) -> None:
     edge of the box moves to the minimiser within it. A step that inverts a cell or, by rounding,
     raises E_G is halved up to four times, then skipped. Sums and fluxes are not updated.
     """
-    with few_threads(len(moves.nodes) * 10):
-        run(_relocate, len(moves.nodes), moves)
+    run(_relocate, len(moves.nodes), moves, len(moves.nodes) * 10)
 
 
 @helper

@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.energy.geometric import volume_and_E_G, volume_gradient
-from tetopt.energy.sampling import few_threads
 from tetopt.engine.complex import (
     NodeStars,
     Objective,
@@ -141,8 +140,8 @@ def sweep(
             return False
         # the longest first, so that no thread is left with one at the end
         chosen = chosen[np.argsort(-n_moving[chosen], kind="stable")]
-        with few_threads(len(chosen) * BLOCK_NODES * 100):
-            run(_sweep, len(chosen), Sweep(*laid_out, chosen, may_move, gains))
+        work = Sweep(*laid_out, chosen, may_move, gains)
+        run(_sweep, len(chosen), work, len(chosen) * BLOCK_NODES * 100)
     return True
 
 
@@ -842,8 +841,8 @@ def attract(state: State, stars: NodeStars, groups: Blocks, angle_limit: float) 
     is_beside = (state.complex.meeting[:, 1] >= 0) | state.complex.is_frozen[:, 3]
     laid_out = pack_record(lowered), pack_record(stars), pack_record(groups)
     for chosen in colours_of(state, stars, groups):
-        with few_threads(len(chosen) * BLOCK_NODES * 20):
-            run(_attract, len(chosen), Sweep(*laid_out, chosen, is_beside, np.zeros(0)))
+        work = Sweep(*laid_out, chosen, is_beside, np.zeros(0))
+        run(_attract, len(chosen), work, len(chosen) * BLOCK_NODES * 20)
 
 
 @unit

@@ -74,6 +74,9 @@ Bools3 = Annotated[NDArray[np.bool_], types.boolean[:, :, ::1]]
 # files.
 LOCK_NAME = f"compiling-{zlib.crc32(str(Path(__file__).parents[1]).encode()):08x}.lock"
 PIECES_PER_THREAD = 8  # pieces of a plain loop, as some take longer than others
+# Work for one more thread, about that of 2000 fluxes: waking it for a mesh of a hundred cells costs
+# more, and on a busy machine 61 nodes took 20 times as long on two threads as on one.
+THREAD_WORK = 2000
 POLLED_SECONDS = 0.1  # between polls of compiling processes
 LONGEST_WAIT_SECONDS = 600.0  # for another run to compile: all kernels take 145 s on a busy machine
 MOST_COMPILING = 4  # processes at most: each imports numba first, 1 s and 200 MB
@@ -505,8 +508,21 @@ def _run_linked(task: int, values: int, n: int) -> int:
     return int(links().run(task, values, n, taken.ctypes.data, numba.get_num_threads()))
 
 
-def run(task: Any, n: int, values: Any) -> None:
-    """Call a unit `task(values, number)` for all numbers below n, on numba's threads.
+def _n_failed(task: Any, n: int, values: Any) -> int:
+    if links() is None:
+        return _run_plain(task, n, values)
+    laid_out = pack_record(values)
+    if laid_out.type != task.signature.args[0]:
+        raise TypeError(
+            f"{task.__name__}: expected a {task.signature.args[0]}, got a {laid_out.type}"
+        )
+    with _LOOPING if numba.threading_layer() == "workqueue" else contextlib.nullcontext():
+        return _run_linked(task.address, laid_out.address, n)
+
+
+def run(task: Any, n: int, values: Any, work: int = sys.maxsize) -> None:
+    """Call a unit `task(values, number)` for all numbers below n, on numba's threads, at most one
+    per `THREAD_WORK` of the `work`.
 
     `values` is a record. The calls must be independent. If one fails, MemoryError is raised, the
     only error of units.
@@ -516,16 +532,12 @@ def run(task: Any, n: int, values: Any) -> None:
             task(values, number)
         return
     task.link()
-    if links() is None:
-        n_failed = _run_plain(task, n, values)
-    else:
-        laid_out = pack_record(values)
-        if laid_out.type != task.signature.args[0]:
-            raise TypeError(
-                f"{task.__name__}: expected a {task.signature.args[0]}, got a {laid_out.type}"
-            )
-        with _LOOPING if numba.threading_layer() == "workqueue" else contextlib.nullcontext():
-            n_failed = _run_linked(task.address, laid_out.address, n)
+    threads = numba.get_num_threads()
+    numba.set_num_threads(min(threads, 1 + work // THREAD_WORK))
+    try:
+        n_failed = _n_failed(task, n, values)
+    finally:
+        numba.set_num_threads(threads)
     if n_failed > 0:
         raise MemoryError(
             f"{task.__name__}: {n_failed} of {n} calls could not allocate their arrays"
