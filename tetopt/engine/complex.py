@@ -175,11 +175,15 @@ def copy_state(state: State) -> State:
 
 
 def grow_state(state: State, least: int = 64) -> State:
-    """The state with space for a quarter more cells, and at least `least`."""
+    """The state with space for a quarter more cells, and at least `least`; of zeros, as rows that
+    are never used take no memory then.
+    """
     more = int(state.complex.n_cells[0]) // 4 + least
 
     def wider(array: NDArray) -> NDArray:
-        return np.concatenate([array, np.full((more, *array.shape[1:]), -1, dtype=array.dtype)])
+        wide = np.zeros((len(array) + more, *array.shape[1:]), dtype=array.dtype)
+        wide[: len(array)] = array
+        return wide
 
     mesh = state.complex
     wide = {name: wider(getattr(mesh, name)) for name in CELL_ROWS}

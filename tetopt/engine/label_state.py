@@ -58,7 +58,7 @@ def with_labels(
         own_column=np.where(own_channel == 0, 1, 2 + own_channel),
         own_value=own_value.astype(np.float64),
     )
-    levels = members.levels.reshape(len(members.levels), *(1,) * (3 - image.ndim), *image.shape)
+    levels = members.levels.reshape(-1, *(1,) * (3 - image.ndim), *image.shape)
     state = state._replace(
         objective=objective, sides=state.sides._replace(levels=levels, channel=members.channel)
     )
@@ -98,7 +98,8 @@ def cell_contents(image: Image, members: Memberships, mesh: Mesh, voxels: LabelV
     shape, inner = (len(mesh.cells), len(members.labels)), PART_CENTRES[image.ndim]
     owner = cell_of_voxel(image, mesh).ravel()
     centres = count_pairs(owner, members.partition.ravel(), shape)
-    n_owned, is_sampled = centres.sum(axis=1), centres.sum(axis=1) < FEWEST_CENTRES
+    n_owned = centres.sum(axis=1)
+    is_sampled = n_owned < FEWEST_CENTRES
     sampled, index = np.flatnonzero(is_sampled), image.to_index(mesh.points)
 
     def sample(first: int, stop: int) -> Ints:
