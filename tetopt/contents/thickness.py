@@ -147,11 +147,11 @@ def thickness_at(
     # a ball's centre is as far away as its radius, and its chords end as far away as its size
     beyond = 1.5 * most
     reach = int(beyond / float(min(spacing))) + 1
-    has_levels = isinstance(surfaces, Memberships)
-    of_step = 0.0 if has_levels else CROSSING_BYTES
+    levels, corners = (surfaces, None) if isinstance(surfaces, Memberships) else (None, surfaces)
+    of_step = CROSSING_BYTES if levels is None else 0.0
     _check_room(partition.shape, BOUND_BYTES, of_step, spacing, beyond)
-    corners = None if has_levels else _in_planes(surfaces) if n == 2 else surfaces
-    labels = _labels_of(partition, surfaces if has_levels else None)
+    corners = _in_planes(corners) if corners is not None and n == 2 else corners
+    labels = _labels_of(partition, levels)
     balls, sizes = _ball_offsets(rays[2], most, axis), np.zeros(len(at), dtype=np.float32)
 
     def fill(slab: tuple[tuple[int, int], ...]) -> None:
@@ -181,7 +181,7 @@ def _ball_offsets(edges: Floats, most: float, axis: int) -> tuple[Ints, Floats]:
     """
     most_steps = (0.5 * most / edges).astype(int)
     most_steps[:axis] = 0
-    offsets = np.indices(2 * most_steps + 1).reshape(3, -1).T - most_steps
+    offsets = np.indices(tuple(2 * most_steps + 1)).reshape(3, -1).T - most_steps
     squares = ((offsets * edges) ** 2).cumsum(axis=1)[:, 2]
     is_near = squares <= 0.25 * most * most
     return offsets[is_near], squares[is_near]

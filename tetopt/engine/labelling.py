@@ -946,15 +946,21 @@ class _Marks(NamedTuple):
 
 
 def _marks(dual: Dual) -> _Marks:
-    marks = np.zeros((3, len(dual.scale)), dtype=bool)
-    nothing = np.full(len(dual.cells), -1), np.full(dual.cells.shape, -np.inf)
-    return _Marks(*nothing, *marks, _work(dual))
+    near, sound, due = np.zeros((3, len(dual.scale)), dtype=bool)
+    labels, rise = np.full(len(dual.cells), -1), np.full(dual.cells.shape, -np.inf)
+    return _Marks(labels, rise, near, sound, due, _work(dual))
 
 
 def _work(dual: Dual) -> _Work:
     widest = int(np.diff(dual.star_start).max())
+    star, label, own, root, fan, fan_label = np.empty((6, widest + 1), dtype=np.int64)
     return _Work(
-        *np.empty((6, widest + 1), dtype=np.int64),
+        star,
+        label,
+        own,
+        root,
+        fan,
+        fan_label,
         np.empty((widest, dual.cells.shape[1]), dtype=np.int64),
         np.empty((widest + 1, widest + 1), dtype=bool),
         np.full(len(dual.cells), -1),

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
 from math import ceil
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 import scipy
@@ -551,7 +551,7 @@ def label_fidelity(
         raise InputError(f"extents: label {min(other)} is not in `labels`; measure them again")
     for known in extents or label_extents(voxels, mesh, of_cell):
         row = int(np.searchsorted(values, known.label))
-        far = distances(row, boxes[row])
+        far = distances(row, cast("tuple[slice, ...]", boxes[row]))  # which has voxels
         rows.append(
             known._replace(
                 extent=known.extent._replace(one_layer_fraction=one_layer.get(row, np.nan)),

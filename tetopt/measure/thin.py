@@ -7,7 +7,7 @@ surfaces and between the facets of the mesh: the median for shells is within 3 %
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -153,7 +153,7 @@ def contact_totals(contacts: Sequence[LabelContact]) -> dict[str, float]:
 
 def _voxel_contacts(voxels: VoxelRecord) -> dict[int, float]:
     """Contact area of each pair's voxels inside, as the area of smooth surfaces."""
-    total, image = Counter[int](), voxels.image
+    total, image = defaultdict[int, float](float), voxels.image
     for axis, edge in enumerate(image.spacing):
         along = np.moveaxis(voxels.rows, axis, 0)
         is_contact = (along[:-1] != along[1:]) & (
@@ -182,9 +182,9 @@ def _by_pair(one: NDArray, other: NDArray, weights: Floats | None = None) -> dic
 def label_thickness(what: Content, mesh: Mesh, of_cell: ArrayLike) -> dict[int, LabelThickness]:
     """Measure the thickness of each label, between smooth surfaces and in cells, and their edges.
 
-    Of a label of more than 5,000 voxels, as many are sampled, in which the thickness is exact. The
-    sample's percentiles have ranks within 0.5 % of those of all voxels: of the tissues of the
-    MNI152, the 5th percentile is off by 4 % or less, the median by 3, and the 95th by 0.2.
+    Of a label of more than 5,000 voxels, as many are sampled, in which the thickness is exact. Of
+    the tissues of the MNI152 and 41 labels of a CT, the 5th percentile is off by 5 % or less, the
+    median by 3, and the 95th by 0.2.
 
     Parameters
     ----------
@@ -291,6 +291,8 @@ def _percentiles(thickness: NDArray[np.float32], labels: Ints, most: float) -> d
     """Percentiles of the thickness at voxels of some labels, by label."""
     percentiles = {}
     for label in np.unique(labels).tolist():
-        three = np.percentile(thickness[labels == label], THICKNESS_PERCENTILES)
-        percentiles[label] = Thickness(*three.astype(float).tolist(), float(np.float32(most)))
+        low, middle, high = np.percentile(
+            thickness[labels == label], THICKNESS_PERCENTILES
+        ).tolist()
+        percentiles[label] = Thickness(low, middle, high, float(np.float32(most)))
     return percentiles
