@@ -1,6 +1,7 @@
 """Measures taken at the same time."""
 
 import time
+import weakref
 from functools import partial
 
 import numba
@@ -92,3 +93,15 @@ def test_what_the_voxels_are_is_measured_once(monkeypatch):
     assert label_interfaces(labels, meshes[0], cell_labels(labels, meshes[0]), half)[1].euler == 2
     assert len(nets) == 4
     assert areas()[0] == whole
+
+
+def test_an_image_that_was_measured_ends_with_its_last_name():
+    """Not when Python next looks for cycles, which large arrays do not bring about."""
+    labels = tetopt.load_phantom("sphere").label_image(voxel_mm=8)
+    mesh = tetopt.lattice_mesh(labels, nodes=60)
+    of_cell = cell_labels(labels, mesh)
+    label_interfaces(labels, mesh, of_cell)
+    label_contacts(labels, mesh, of_cell)
+    held = weakref.ref(labels)
+    del labels
+    assert held() is None

@@ -909,9 +909,11 @@ def euler_characteristic(surface_facets: Ints) -> int:
 
 @dataclass(frozen=True, eq=False)
 class VoxelRecord:
-    """What the voxels of labels are, whatever the mesh; made by `voxels_of`."""
+    """What the voxels of labels are, whatever the mesh; made by `voxels_of`.
 
-    image: Image
+    It does not hold the image, which holds it: each would live until Python looks for cycles.
+    """
+
     mask: Image | None
     labels: Ints  # (K,) ascending, with 0
     rows: NDArray[np.integer]  # row of `labels` of each voxel; `OUTSIDE_LABEL` beyond the mask
@@ -932,11 +934,11 @@ class VoxelRecord:
             len(self.labels) + np.searchsorted(others, of_cell),
         )
 
-    def once(self, make: Callable[[VoxelRecord], Made]) -> Made:
-        """Return what a function makes of these voxels, at its first call alone."""
+    def once(self, make: Callable[[VoxelRecord, Image], Made], labels: Image) -> Made:
+        """Return what a function makes of the image's voxels, at its first call alone."""
         name = f"{make.__module__}.{make.__name__}"
         if name not in vars(self):
-            vars(self)[name] = make(self)
+            vars(self)[name] = make(self, labels)
         return vars(self)[name]
 
 
@@ -967,7 +969,7 @@ def voxels_of(labels: Image, mask: Image | None = None) -> VoxelRecord:
             rows[first:stop] = np.searchsorted(values, data[first:stop]) - 1
 
         over_slabs(fill, len(data), data.size)
-        record = VoxelRecord(labels, mask, values[1:].astype(np.int64), rows)
+        record = VoxelRecord(mask, values[1:].astype(np.int64), rows)
         vars(labels)[RECORD] = record
     return record
 

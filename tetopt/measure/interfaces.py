@@ -139,15 +139,15 @@ def label_interfaces(
             **shape,
             **{name: int(counted[row]) for name, counted in of_label.items()},
         )
-        for row, is_large, shape in voxels.once(_voxel_shapes)
+        for row, is_large, shape in voxels.once(_voxel_shapes, labels)
     ]
 
 
-def _voxel_shapes(voxels: VoxelRecord) -> list[tuple[int, bool, dict[str, Any]]]:
+def _voxel_shapes(voxels: VoxelRecord, image: Image) -> list[tuple[int, bool, dict[str, Any]]]:
     """Measure the closed smooth surface of each label's voxels: its row, whether it has enough for
     their volume, and its numbers.
     """
-    rows, image = [], voxels.image
+    rows = []
     for row, box in enumerate(voxels.boxes):
         if box is None:
             continue

@@ -120,7 +120,7 @@ def label_contacts(
     ...     print(each.labels, f"{each.ratio:.2f}")
     (0, 1) 1.04
     """
-    in_voxels = voxels_of(labels, mask).once(_voxel_contacts)
+    in_voxels = voxels_of(labels, mask).once(_voxel_contacts, labels)
     of_cell = check_cell_labels(of_cell, mesh)
     pieces, n_pieces = mesh.straight_pieces()
     shared = facets(pieces.cells)
@@ -151,9 +151,9 @@ def contact_totals(contacts: Sequence[LabelContact]) -> dict[str, float]:
     }
 
 
-def _voxel_contacts(voxels: VoxelRecord) -> dict[int, float]:
+def _voxel_contacts(voxels: VoxelRecord, image: Image) -> dict[int, float]:
     """Contact area of each pair's voxels inside, as the area of smooth surfaces."""
-    total, image = defaultdict[int, float](float), voxels.image
+    total = defaultdict[int, float](float)
     for axis, edge in enumerate(image.spacing):
         along = np.moveaxis(voxels.rows, axis, 0)
         is_contact = (along[:-1] != along[1:]) & (
