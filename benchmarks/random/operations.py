@@ -75,7 +75,7 @@ def operate(run, rng, made):
     elif kind == "lifts" and run.n == 3:
         made[kind] += run.lift(float(rng.uniform(2.0, 30.0)))
     elif kind == "moves to interfaces" and run.has_labels:
-        run.attract(float(rng.choice([0.0, 4.0, 12.0])), bool(rng.random() < 0.5))
+        run.attract(float(rng.choice([0.0, 4.0, 12.0])))
         made[kind] += int((run.state.complex.ticks != before).any(axis=1).sum())
     run.state = run.state._replace(
         objective=run.state.objective._replace(geometry=objective.geometry)

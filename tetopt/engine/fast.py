@@ -66,8 +66,7 @@ from tetopt.start.sizes import Sizes
 from tetopt.system.arrays import Bools, Floats, Ints
 from tetopt.system.kernels import link, roots
 
-# of the edge: distance that a node may be off its place at a surface. With 0 on a mask's, Dice of a
-# liver is .990, not .992, of a wall of 3 voxels .9993, not .9998 (benchmarks/masks_as_labels.py)
+# of the edge: distance that a node may be off its place at the surface between two labels
 BAND_FRACTION = 0.1
 MOST_OFFSET_FRACTION = 0.15  # of the edge: most that a node's place is off the surface
 FLIP_EDGES = 0.05  # of an edge: nodes that moved less need no new flips
@@ -318,9 +317,7 @@ def attract_nodes(run: Run, course: Course, iteration: int) -> NodeStars | None:
     if not (run.has_labels or run.state.sides.has_surface):
         return None
     is_early = iteration <= course.n_early
-    degrees = min(ATTRACTED_MIN_DIHEDRAL if is_early else 180.0, course.min_dihedral)
-    has_band = course.nodes is not None and not is_early and run.state.objective.surface > 0.0
-    return run.attract(degrees, has_band)
+    return run.attract(min(ATTRACTED_MIN_DIHEDRAL if is_early else 180.0, course.min_dihedral))
 
 
 def gives_labels(iteration: int, course: Course) -> bool:
@@ -561,21 +558,17 @@ class Run:
         self.hope[:] = np.inf
         self.ticks_flipped[:] = FAR_TICKS
 
-    def attract(self, degrees: float, has_band: bool) -> NodeStars:
+    def attract(self, degrees: float) -> NodeStars:
         """Move nodes between labels, and those of a mask's surface, to their places there.
 
         No angle falls below `degrees`; within a mask, where `lift` may be undone, none falls below
-        the minimum. `has_band` is for nodes of a mask's surface: where shapes alone decide, these
-        would lose volume, and while nodes are exchanged, fewer of those off the surface could be
-        removed (walls of 2 voxels would end with 8 % more). Returns the stars, whose cells do not
-        change.
+        the minimum. Returns the stars, whose cells do not change.
         """
         ticks = self.state.complex.ticks.copy()
         stars = node_stars(self.state)
         if self.content.is_flat:
             edge = self.edge / self.image.voxel_volume ** (1.0 / self.n)
-            is_off = has_band | ~self.state.complex.is_frozen[:, 3]
-            self.state.complex.band[:] = BAND_FRACTION * edge * is_off
+            self.state.complex.band[:] = BAND_FRACTION * edge
             fill_offsets(self.state, MOST_OFFSET_FRACTION * edge)
         lowest = angle_limit_of(degrees)[0]
         if self.content.region is not None:

@@ -271,13 +271,11 @@ def combined_ways(
 
 @helper
 def band_of(state: State, node: int) -> float:
-    """Allowed difference of a mask's level, or of two labels' levels, from its value at a node's
-    place; 0 where three of them meet.
+    """Allowed difference of two labels' levels at a node; 0 where a third label or a mask's
+    surface meets them.
     """
-    band, meeting = state.complex.band[node], state.complex.meeting[node]
-    if state.complex.is_frozen[node, 3]:
-        return band if meeting[1] < 0 else 0.0
-    return LEVELS_RISE * band if meeting[2] < 0 else 0.0
+    is_one = state.complex.meeting[node, 2] < 0 and not state.complex.is_frozen[node, 3]
+    return LEVELS_RISE * state.complex.band[node] if is_one else 0.0
 
 
 @helper
