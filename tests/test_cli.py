@@ -100,10 +100,11 @@ def inputs(tmp_path_factory):
     save_image(f"{folder}/flat.nii", Image(np.full((5, 6, 7), 3.0)))
     mesh = lattice_mesh(load_image(f"{folder}/sphere.nii.gz"), nodes=60)
     save_mesh(f"{folder}/lattice.vtu", mesh)
-    # Once more a cell, and not all of the others: together they hold no more voxels than there are.
-    save_mesh(
-        f"{folder}/twice.vtu", Mesh(mesh.points, np.vstack([mesh.cells[3:], mesh.cells[4:5]]))
-    )
+    # Nearly a cell once more, and not all others: together they hold no more voxels than there are.
+    again = mesh.points[mesh.cells[4]]
+    points = np.vstack([mesh.points, again + 0.01 * (again.mean(axis=0) - again)])
+    cells = np.vstack([mesh.cells[3:], len(mesh.points) + np.arange(4)])
+    save_mesh(f"{folder}/twice.vtu", Mesh(points, cells))
     save_mesh(f"{folder}/far.vtu", Mesh(mesh.points + 1000.0, mesh.cells))
     sphere = load_image(f"{folder}/sphere.nii.gz")
     shifted = sphere.affine.copy()

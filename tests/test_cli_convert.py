@@ -55,8 +55,10 @@ def folder(tmp_path_factory):
     grid.save(order_2)
     mesh, image = load_mesh(order_2).mesh, sample_image(3)
     save_mesh(f"{path}/bare.vtu", mesh)
-    thrice = tetopt.Mesh(mesh.points, np.vstack([mesh.cells, mesh.cells[[5, 5]]]))
-    save_mesh(f"{path}/thrice.vtu", thrice)
+    corners = mesh.points[mesh.cells[5]]
+    within = np.vstack([mesh.points, corners.mean(axis=0)])  # once more a cell, but for a node
+    more = np.append(mesh.cells[5, :3], len(mesh.points))
+    save_mesh(f"{path}/thrice.vtu", tetopt.Mesh(within, np.vstack([mesh.cells, more])))
     away = image.affine.copy()
     away[:3, 3] += 500.0
     save_image(f"{path}/away.nii.gz", Image(image.data, away))

@@ -38,7 +38,7 @@ from tetopt.geometry.manifold import OUTSIDE_LABEL
 from tetopt.geometry.nearest import triangle_distances
 from tetopt.geometry.simplex import centroids, volumes
 from tetopt.geometry.topology import Facets, components, facets, lexicographic_order
-from tetopt.image import Image, transform_vectors
+from tetopt.image import Image, check_image, transform_vectors
 from tetopt.mesh import Mesh
 from tetopt.system.arrays import Bools, Floats, Ints, plain_array
 from tetopt.system.kernel_cache import njit
@@ -951,7 +951,7 @@ def voxels_of(labels: Image, mask: Image | None = None) -> VoxelRecord:
     InputError
         Values that are not labels, or a mask on other voxels.
     """
-    record: VoxelRecord | None = vars(labels).get(RECORD)
+    record: VoxelRecord | None = vars(check_image("labels", labels)).get(RECORD)
     if record is None or record.mask is not mask:
         data = check_labels("labels", labels).data
         if mask is not None and mask.shape != labels.shape:
