@@ -23,7 +23,7 @@ def real_width(monkeypatch, wide_lines):
 
 @pytest.fixture
 def labels():
-    thick = Thickness(101.25, 1234.5, 12345.6, 12345.6)
+    thick = Thickness(10.25, 12.34, 23.45, 30.0)
     number = {
         name: 1.0 if name.endswith("o") or name == "folded" else 7
         for name in LabelInterface._fields[1:]
@@ -72,6 +72,17 @@ def test_tables_of_hundreds_of_labels(labels, capsys, every):
         assert len(shown) == 12
         assert shown[-1].startswith(f"{100000 + N_LABELS - 1} left")  # the worst
         assert any("12 of 300 labels that fit worst, by Dice or volume" in line for line in lines)
+
+
+def test_narrow_terminals_cut_no_number(labels, capsys, monkeypatch):
+    rows = []
+    for width in (60, 200):
+        monkeypatch.setattr(console, "LINE_WIDTH", width)
+        console.print_fidelity(labels, 3, every=True)
+        lines = capsys.readouterr().out.splitlines()
+        rows.append([line.split() for line in lines if " left superior" in line])
+    assert rows[0] == rows[1]
+    assert len(rows[0]) > 2 * N_LABELS
 
 
 def test_a_label_of_another_volume_is_among_the_worst(labels):

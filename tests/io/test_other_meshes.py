@@ -504,6 +504,9 @@ def write_abaqus(path, extra, change=lambda nodes: nodes):
     path.write_text(f"*Node\n{change(nodes)}*Element, type=C3D4\n{rows}{extra}")
 
 
+AGAIN = ", ".join(map(str, box_mesh(3).cells[3] + 1))
+
+
 @pytest.mark.parametrize(
     ("extra", "members"),
     [
@@ -512,6 +515,7 @@ def write_abaqus(path, extra, change=lambda nodes: nodes):
         ("*Elset, elset=One, generate\n1, 3\n5, 9, 2\n11, 12\n", [0, 1, 2, 4, 6, 8, 10, 11]),
         ("*Elset, elset=One, generate\n5, 9, 2\n11, 12\n", [4, 6, 8, 10, 11]),
         ("*Elset,\n  elset=One\n1, 2\n", [0, 1]),
+        (f"*Element, type=C3D4, elset=One\n999, {AGAIN}\n", [3]),
     ],
 )
 def test_sets_of_abaqus(extra, members, here):

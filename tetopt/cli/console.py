@@ -333,6 +333,11 @@ def _print_thin(measured: dict[str, Any], ndim: int) -> None:
 
 def print_table(table: Table) -> None:
     """Print a table in the width of the terminal, or in 100 columns into a pipe, which has no
-    width.
+    width; wider if words or numbers would be cut.
     """
-    _Console(file=out.file, width=width_of(out), highlight=False, emoji=False).print(table)
+    console = _Console(file=out.file, width=width_of(out), highlight=False, emoji=False)
+    for column in table.columns:
+        if column.no_wrap and column.max_width is None:  # whole numbers, words of the header
+            words = [*map(str, column.cells), *str(column.header).split()]
+            column.no_wrap, column.min_width = False, max(map(len, words))
+    console.print(table, crop=False)

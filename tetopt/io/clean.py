@@ -55,9 +55,15 @@ def without_copies(raw: Raw, kind: str) -> Raw:
     """Return a file's contents with one cell of a type for those with the same nodes."""
     cells = np.sort(raw.cells[kind], axis=1)
     order = np.lexsort(cells.T)  # stable: the first of its copies comes first
-    is_copy = np.zeros(len(cells), dtype=bool)
-    is_copy[order[1:]] = (cells[order[1:]] == cells[order[:-1]]).all(axis=1)
-    return _with_rows(raw, {kind: ~is_copy}, "cells that repeat the nodes of others")
+    is_first = np.append(True, (cells[order[1:]] != cells[order[:-1]]).any(axis=1))
+    first = np.empty_like(order)
+    first[order] = order[is_first][np.cumsum(is_first) - 1]
+    groups = [  # which keep the cells that copies stand for
+        group._replace(members=np.unique(first[group.members])) if group.kind == kind else group
+        for group in raw.groups
+    ]
+    is_kept = {kind: first == np.arange(len(cells))}
+    return _with_rows(raw._replace(groups=groups), is_kept, "cells that repeat the nodes of others")
 
 
 def _with_rows(raw: Raw, is_kept: dict[str, Bools], words: str) -> Raw:
