@@ -248,6 +248,13 @@ def test_images_without_padding_are_as_they_are(tmp_path, data):
     assert said == []
 
 
+def test_the_background_beside_constant_padding_has_the_noise_of_air():
+    image = Image(np.pad(scan(-1000.0)[0], 4, constant_values=-1000.0), AFFINE)
+    assert -1000.0 < background_level(image) < -900.0
+    body = np.pad(scan(0.0)[1] < 6.0, 4)
+    assert_array_equal(foreground_mask(image).data, body)
+
+
 def test_the_background_of_an_organ_that_was_cut_out_is_its_value():
     h, r = scan(-3024.0, beyond=5.0)
     save_image("a.nii.gz", Image(h, AFFINE))

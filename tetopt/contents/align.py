@@ -30,6 +30,7 @@ SAME_GRID_VOXELS = 1e-4
 SAME_BOX_VOXELS = 1.01  # the same of boxes: resampling rounds a box to whole voxels
 LEAST_COVERED_FRACTION = 0.5  # of the image's voxel centres, which a further contrast must cover
 # of the background's noise above its median, up to which voxels count as background
+LEAST_DARKER = 0.1  # of dark voxels: a CT's air beside a constant of -1000 has .24, an organ none
 BACKGROUND_SIGMAS = 4.0
 MAD_TO_SIGMA = 1.4826  # sigma of a normal distribution over its median absolute deviation
 COARSER_STEP = 1e-3  # of a voxel by which one may exceed another's size and count as equal
@@ -424,7 +425,8 @@ def background_level(image: Image) -> float:
     background, although a face may cut the body. The level is their median plus 4 sigma, with sigma
     from the median absolute deviation, which is robust against body on the faces (Hampel, The
     influence curve and its role in robust estimation, JASA 69, 1974). The level of a constant
-    background, as around an extracted brain, is its value.
+    background, as around an extracted brain, is its value; if a tenth of the other dark voxels are
+    darker, as noise of air beside padding is, their level counts.
 
     Raises
     ------
@@ -447,7 +449,13 @@ def background_level(image: Image) -> float:
     if len(dark) == 0:
         raise _no_background(f"no voxel on the faces of the box is dark ({threshold:.4g} or less)")
     middle = np.median(dark)
-    level = float(middle + BACKGROUND_SIGMAS * MAD_TO_SIGMA * np.median(np.abs(dark - middle)))
+    spread = np.median(np.abs(dark - middle))
+    if spread == 0.0:
+        others = image.data[(image.data <= threshold) & (image.data != middle)].astype(np.float64)
+        if np.count_nonzero(others < middle) > LEAST_DARKER * len(others):
+            middle = np.median(others)
+            spread = np.median(np.abs(others - middle))
+    level = float(middle + BACKGROUND_SIGMAS * MAD_TO_SIGMA * spread)
     if level >= threshold:
         raise _no_background(
             f"the dark voxels on the faces of the box range up to {level:.4g}, which is not "
