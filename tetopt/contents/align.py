@@ -29,8 +29,8 @@ from tetopt.system.arrays import Bools, Floats, Ints
 SAME_GRID_VOXELS = 1e-4
 SAME_BOX_VOXELS = 1.01  # the same of boxes: resampling rounds a box to whole voxels
 LEAST_COVERED_FRACTION = 0.5  # of the image's voxel centres, which a further contrast must cover
-# of the background's noise above its median, up to which voxels count as background
 LEAST_DARKER = 0.1  # of dark voxels: a CT's air beside a constant of -1000 has .24, an organ none
+# of the background's noise above its median, up to which voxels count as background
 BACKGROUND_SIGMAS = 4.0
 MAD_TO_SIGMA = 1.4826  # sigma of a normal distribution over its median absolute deviation
 COARSER_STEP = 1e-3  # of a voxel by which one may exceed another's size and count as equal
