@@ -62,8 +62,20 @@ def without_copies(raw: Raw, kind: str) -> Raw:
         group._replace(members=np.unique(first[group.members])) if group.kind == kind else group
         for group in raw.groups
     ]
-    is_kept = {kind: first == np.arange(len(cells))}
-    return _with_rows(raw._replace(groups=groups), is_kept, "cells that repeat the nodes of others")
+    every = np.arange(len(cells))
+    of_cells = {name: each[kind] for name, each in raw.cell_data.items() if kind in each}
+    words = f"cells that repeat the nodes of others{_differing_words(of_cells, every, first)}"
+    return _with_rows(raw._replace(groups=groups), {kind: first == every}, words)
+
+
+def _differing_words(data: Arrays, those: Ints, first: Ints) -> str:
+    """Return the end of a note on rows that `first` ones stand for: data that differ, if any."""
+    differing = [
+        name
+        for name, values in data.items()
+        if not np.array_equal(values[first], values[those], equal_nan=values.dtype.kind == "f")
+    ]
+    return f"; their {list_names(differing)} differ: using the first" if differing else ""
 
 
 def _with_rows(raw: Raw, is_kept: dict[str, Bools], words: str) -> Raw:
@@ -125,13 +137,8 @@ def with_merged_nodes(raw: Raw, kind: str) -> Raw:
     first = np.full(count, len(points))
     np.minimum.at(first, number, np.arange(len(points)))
     to = first[number]
-    differing = [
-        name
-        for name, values in raw.point_data.items()
-        if not np.array_equal(values[to[used]], values[used], equal_nan=values.dtype.kind == "f")
-    ]
     words = f"merged {len(points) - count} nodes with others at the same place"
-    words += f"; their {list_names(differing)} differ: using the first" if differing else ""
+    words += _differing_words(raw.point_data, used, to[used])
     return raw._replace(
         cells={name: to[rows] for name, rows in raw.cells.items()},
         middles={name: to[rows] for name, rows in raw.middles.items()},

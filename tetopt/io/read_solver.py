@@ -73,7 +73,8 @@ def read_inp(path: Path) -> Raw:
     lines = [line[3:] for line in text.splitlines() if line.startswith("** ")]
     raw = _raw_of(_abaqus(text), lines)
     words = "its last line has no end, so that the file may have been cut short"
-    return raw._replace(notes=(*raw.notes, *[words] * (not text.endswith("\n"))))
+    is_whole = text.rstrip(" \t").endswith("\n")
+    return raw._replace(notes=(*raw.notes, *[words] * (not is_whole)))
 
 
 def read_feb(path: Path) -> Raw:
@@ -220,8 +221,8 @@ def _abaqus(text: str) -> FileNumbers:
             if len(values) == len(names):  # more depend on temperature
                 constants = file.constants.setdefault(material, {})
                 constants |= dict(zip(names, values[:, None], strict=True))
-        elif card == "SOLID SECTION":
-            file.parts[options.get("ELSET", "")] = options.get("MATERIAL", "")
+        elif card == "SOLID SECTION" and "ELSET" in options:
+            file.parts[options["ELSET"]] = options.get("MATERIAL", "")
     # sections may stand before their sets
     parts = {_set_name(name, file.cells): material for name, material in file.parts.items()}
     return file._replace(parts=parts)
