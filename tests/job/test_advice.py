@@ -204,8 +204,8 @@ def test_pieces_that_merge_and_cavities_that_open_are_counted():
     assert line == (
         "labels: of 6 and label 0, 2 with components without a cell (matters if these carry load): "
         "1 (2 of 3, voxels: 43), 3 (2 of 9, voxels: 43); "
-        "2 with fewer pieces of cells than of voxels (matters for what is connected): 3 (3 for 9), "
-        "2 (2 for 3); "
+        "2 with fewer pieces of cells than of voxels (matters for what is connected): "
+        "3 (3 for 7 of 9), 2 (2 for 3); "
         "1 with fewer cavities in cells than in voxels (matters for fluid in them): 6 (1 of 3)"
     )
 
@@ -230,7 +230,8 @@ def test_pieces_that_merge_and_cavities_that_open_are_counted():
                 "lost_components": (LostComponent(7, (0.0, 0.0)), LostComponent(2, (1.0, 0.0))),
             },
             "with components without a cell (matters if these carry load) (2 of 4, voxels: 9); "
-            "with fewer pieces of cells than of voxels (matters for what is connected) (1 for 4)",
+            "with fewer pieces of cells than of voxels (matters for what is connected) "
+            "(1 for 2 of 4)",
         ),
     ],
 )

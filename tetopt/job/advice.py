@@ -303,7 +303,8 @@ def _faults(
     if n_pieces > max(n_all, 1) or (is_whole and 0 < n_pieces < n_kept):
         which, rank = ("more", -n_pieces) if n_pieces > n_all else ("fewer", n_pieces - n_kept)
         what = f"with {which} pieces of cells than of voxels (matters for what is connected)"
-        yield what, rank, f"{n_pieces} for {n_all}"
+        n_due = n_all if which == "more" else n_kept  # lost and small ones are not due
+        yield what, rank, f"{n_pieces} for {n_due}{f' of {n_all}' * (n_due < n_all)}"
     if surface is not None and is_whole and n_pieces and surface.mesh_cavities < surface.cavities:
         n_left, n_all = surface.mesh_cavities, surface.cavities
         what = "with fewer cavities in cells than in voxels (matters for fluid in them)"
