@@ -684,8 +684,8 @@ surface mesh.vtu -o s.obj --label 1
     ending in .stl or .ply or .vtp or .vtk
 view mesh.vtu --html a.png
     a.png
-view mesh.vtu --html b.html --field young
-    --field: the mesh has no field "young"; it has label, mean
+view mesh.vtu --html b.html --show young
+    --show: the mesh has no field "young"; it has label, mean
 view mesh.vtu --html b.html --range 3
     --range: expected LOW,HIGH, such as 0,120
 view mesh.vtu --html b.html --range low,3
@@ -734,7 +734,7 @@ def test_a_page_to_look_at():
     assert "min_dihedral" in page
     assert not re.search(r'(src|href)="(?!data:|#)', page)
     assert_refuses("view mesh.vtu --html a.html", "a.html")
-    assert_done("view mesh.vtu --html b.html --field rho --range 0.1,0.3")
+    assert_done("view mesh.vtu --html b.html --show rho --range 0.1,0.3")
     field = page_data(Path("b.html"))["fields"][0]
     assert (field["name"], field["limits"]) == ("rho", [0.1, 0.3])
 

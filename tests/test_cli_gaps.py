@@ -106,7 +106,7 @@ def test_beyond_a_mesh_and_in_labels_no_value_is_needed(words):
 
 
 def test_our_own_images_of_fields_are_read():
-    assert_done("convert a.vtu own.nii.gz --like whole.nii.gz --field mean")
+    assert_done("convert a.vtu own.nii.gz --like whole.nii.gz --fields mean")
     own = load_image("own.nii.gz")
     assert own.has_gaps
     save_image("valued.nii.gz", Image(1.0 * ~np.isnan(own.data), own.affine))
@@ -121,11 +121,11 @@ def test_our_own_images_of_fields_are_read():
 def test_the_grid_of_any_volume_in_any_format(suffix):
     four = nibabel.Nifti1Image(np.zeros((*SHAPE, 3), "i2"), AFFINE)
     nibabel.save(four, "four.nii.gz")
-    assert_done("convert a.vtu own.nii.gz --like whole.nii.gz --field mean")
+    assert_done("convert a.vtu own.nii.gz --like whole.nii.gz --fields mean")
     is_gap = np.isnan(load_image("own.nii.gz").data)
-    assert_refuses("convert a.vtu b.mha --like whole.nii.gz --field mean", r"\.vtu.*\.mgz, \.nrrd")
+    assert_refuses("convert a.vtu b.mha --like whole.nii.gz --fields mean", r"\.vtu.*\.mgz, \.nrrd")
     for like in ("whole.nii.gz", "four.nii.gz:1", "four.nii.gz"):
-        assert_done(f"convert a.vtu own{suffix} --like {like} --field mean --force")
+        assert_done(f"convert a.vtu own{suffix} --like {like} --fields mean --force")
         image = load_image(f"own{suffix}")
         assert image.shape == SHAPE
         assert_allclose(image.affine, AFFINE, atol=1e-6)

@@ -111,25 +111,25 @@ convert a.vtu c.vtu --results c.vtu --force
     is also an input
 convert a.vtu u.nii.gz --like i.nii.gz
     which field
-convert a.vtu u.nii.gz --like i.nii.gz --field displacment
+convert a.vtu u.nii.gz --like i.nii.gz --fields displacment
     no field "displacment"; it has .*displacement_step7
-convert a.vtu u.nii.gz --field heat
+convert a.vtu u.nii.gz --fields heat
     which image
-convert a.vtu u.nii.gz --like i.nii.gz --field heat --young 3
+convert a.vtu u.nii.gz --like i.nii.gz --fields heat --young 3
     --young: has no effect
-convert a.vtu u.nii.gz --field mean --warp i.nii.gz
+convert a.vtu u.nii.gz --fields mean --warp i.nii.gz
     displacement of nodes, but mean in .* is a field of cells
-convert a.vtu u.nii.gz --field displacement_step7 --warp i.nii.gz --outside nan
+convert a.vtu u.nii.gz --fields displacement_step7 --warp i.nii.gz --outside nan
     --outside: expected a
-convert a.vtu u.nii.gz --field displacement_step7 --warp i.nii.gz --space lps
+convert a.vtu u.nii.gz --fields displacement_step7 --warp i.nii.gz --space lps
     --space: has no effect
-convert i.nii.gz a.vtu u.nii.gz --field heat --like i.nii.gz
+convert i.nii.gz a.vtu u.nii.gz --fields heat --like i.nii.gz
     give only one image
-convert a.vtu u.nii.gz --like i.nii.gz --field heat --nearest
+convert a.vtu u.nii.gz --like i.nii.gz --fields heat --nearest
     --nearest: needs --warp
 convert a.vtu u.inp --like i.nii.gz
     --like: has no effect
-convert a.vtu u.nii.gz --field heat --like far.nii.gz
+convert a.vtu u.nii.gz --fields heat --like far.nii.gz
     no voxel centre is inside
 """
 )
@@ -173,7 +173,7 @@ def test_a_displacement_goes_onto_the_voxels_of_an_image(order):
     affine[:3, 3] = low - 0.1 * (high - low)
     image = Image(np.arange(210.0).reshape(7, 6, 5) % 97, affine)
     save_image("i.nii.gz", image)
-    field = "--results a.frd --field displacement --like i.nii.gz --json u.json"
+    field = "--results a.frd --fields displacement --like i.nii.gz --json u.json"
     said = run_command(f"convert a.vtu u.nii.gz {field}").out
     file = nibabel.load("u.nii.gz")
     assert file.header.get_intent()[0] == "vector"
@@ -186,10 +186,10 @@ def test_a_displacement_goes_onto_the_voxels_of_an_image(order):
     assert f"on {n_voxels} of 210 voxels" in " ".join(said.split())
     assert numbers_in("u.json")["n_voxels"] == n_voxels
     assert_done("convert a.vtu b.vtu --results a.frd")
-    assert_done("convert i.nii.gz b.vtu t.nii --field displacement --space lps --outside 0")
+    assert_done("convert i.nii.gz b.vtu t.nii --fields displacement --space lps --outside 0")
     lps = nibabel.load("t.nii").get_fdata()[:, :, :, 0]
     assert_array_equal(lps, np.nan_to_num(values * [-1, -1, 1]))
-    moved = "convert b.vtu w.nii.gz --field displacement --warp i.nii.gz"
+    moved = "convert b.vtu w.nii.gz --fields displacement --warp i.nii.gz"
     assert_done(moved)
     again = tetopt.warped_image(mesh, load_mesh("b.vtu").point_data["displacement"], image)
     assert_allclose(load_image("w.nii.gz").data, again.data, atol=1e-5)

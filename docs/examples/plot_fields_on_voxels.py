@@ -38,7 +38,7 @@ print(f"stress: off by {difference:.1e} kPa after voxels and back")
 
 # %% Displacements are evaluated at voxel centres by the cells' shape functions, here linear, and
 # nibabel writes them as an image of three volumes. ``tetopt convert pressed.vtu u.nii.gz --like
-# T1.nii.gz --field displacement`` does both.
+# T1.nii.gz --fields displacement`` does both.
 
 on_voxels = tetopt.field_on_image(mesh, solution.u, image)
 with tempfile.TemporaryDirectory() as folder:

@@ -332,7 +332,7 @@ def test_partial_values_are_missing_voxels(here):
     few = np.arange(0, len(mesh.cells), 2)
     views = [(b"ElementData", b"x", 100 + few, np.ones(len(few)))]
     write_22(here / "a.msh", mesh, 100 + np.arange(len(mesh.cells)), views, False)
-    assert_done("convert a.msh x.nii.gz --like i.nii.gz --field x")
+    assert_done("convert a.msh x.nii.gz --like i.nii.gz --fields x")
     import nibabel
 
     values = nibabel.load("x.nii.gz").get_fdata()

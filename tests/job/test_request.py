@@ -70,7 +70,7 @@ VALUES = {
     "nonlinear": True,
     "units": "MPa",
     "space": "lps",
-    "fields": "mean",
+    "written_fields": "mean",
     "keep_components": True,
     "free_volumes": True,
     "keep_labels": "2,liver",

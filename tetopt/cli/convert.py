@@ -78,6 +78,7 @@ def convert_command(
                     mesh_path,
                     output,
                     voxels,
+                    field=solver.written_fields,
                     like=image_path,
                     results=results_path,
                     space=solver.space,
@@ -119,7 +120,7 @@ def _check_options(
     else:
         own = replace(part, registered=False, **vars(MeshPart()))
         wrong = given_options(own) | given_options(choice)
-        wrong |= given_options(replace(solver, space="ras"))
+        wrong |= given_options(replace(solver, space="ras", written_fields=None))
         what = "an image, on all voxels of `like`"
     if wrong:
         raise InputError(f"--{next(iter(wrong))}: has no effect on {output}, {what}")

@@ -79,7 +79,7 @@ class ShownOptions:
     html: Annotated[
         Path | None, Option("OUT.html", "Write the page to this file; open no browser.")
     ] = None
-    field: Annotated[
+    show: Annotated[
         str | None,
         Option(
             "NAME",

@@ -66,7 +66,7 @@ def view_command(
         mesh, fields, image, mesh_path.name, triples, loaded.point_data, _reactions(loaded), table
     )
     page = Path(tempfile.mkdtemp(prefix="tetopt-")) / "view.html" if html is None else html
-    save_explorer(page, opened_on(shown, how.field or _only_labels(loaded), limits))
+    save_explorer(page, opened_on(shown, how.show or _only_labels(loaded), limits))
     words = "opened in the browser" if html is None and _is_opened(page) else "open it in a browser"
     print_line(f"{page}: {words}; {page.stat().st_size / 1e6:.1f} MB, self-contained")
     return 0

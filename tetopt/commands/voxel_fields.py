@@ -33,6 +33,7 @@ def write_on_image(
     output: Path,
     options: VoxelOptions,
     *,
+    field: str | None,
     like: Path | None,
     results: Path | None,
     space: str,
@@ -47,6 +48,8 @@ def write_on_image(
     output : Path
         NIfTI, MGZ or NRRD.
     options : VoxelOptions
+    field : str, optional
+        Its name.
     like : Path, optional
         The image whose voxels get the field, unless `options` name one.
     results : Path, optional
@@ -72,7 +75,7 @@ def write_on_image(
     assert path is not None, "the check requires one"
     loaded = read_mesh(mesh, part)
     loaded = loaded if results is None else with_results(loaded, results)
-    name, values, at = _field_of(loaded, mesh, options, space)
+    name, values, at = _field_of(loaded, mesh, field, options, space)
     is_grid = path is not options.warp
     image = _read(loaded, mesh, path, part.registered, is_grid=is_grid)
     check_overlap(mesh, loaded.mesh, image)
@@ -164,19 +167,18 @@ def _read(
 
 
 def _field_of(
-    loaded: MeshFile, mesh: Path, options: VoxelOptions, space: str
+    loaded: MeshFile, mesh: Path, name: str | None, options: VoxelOptions, space: str
 ) -> tuple[str, NDArray, At]:
     """Return a field of nodes or cells, and which; raise InputError with the known fields if
     there is none.
     """
-    name = options.field_name
     fields: dict[str, tuple[NDArray, At]] = {
         each: (rows, "cells") for each, rows in loaded.cell_data.items()
     }
     fields |= {each: (rows, "nodes") for each, rows in loaded.point_data.items()}
     if name is None or name not in fields:
         known = ", ".join(fields) or "none"
-        problem = "which field? pass `field`" if name is None else f'has no field "{name}"'
+        problem = "which field? pass `written_fields`" if name is None else f'has no field "{name}"'
         raise InputError(f"{mesh}: {problem}; it has {known}")
     if name in loaded.cell_data and name in loaded.point_data:
         note(f'{mesh}: has "{name}" at nodes and in cells; that at nodes is written')

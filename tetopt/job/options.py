@@ -169,14 +169,6 @@ class LabelledPart(MaskedPart):
 class VoxelOptions:
     """A mesh's field on the voxels of an image, in place of a solver's file."""
 
-    field_name: Annotated[
-        str | None,
-        Option(
-            "NAME",
-            "Write this field of nodes or cells on an image's voxels (.nii, .nii.gz, .mgz, .nrrd).",
-            "field",
-        ),
-    ] = None
     like: Annotated[Path | None, Option("IMAGE", "The image whose voxels get the field.")] = None
     outside: Annotated[
         float | None,
@@ -185,7 +177,8 @@ class VoxelOptions:
     warp: Annotated[
         Path | None,
         Option(
-            "IMAGE", "Write this image moved by `field`, a displacement, linear between voxels."
+            "IMAGE",
+            "Write this image moved by `written_fields`, a displacement, linear between voxels.",
         ),
     ] = None
     nearest: Annotated[
@@ -550,12 +543,14 @@ class SolverOptions(ModelOptions):
             "name none; with Pa, the file's lengths are in m.",
         ),
     ] = "kPa"
-    fields: Annotated[
+    written_fields: Annotated[
         str | None,
         Option(
-            "none|mean|all",
+            "none|mean|all|NAME",
             "Fields of cells to write besides labels and results (default none in .msh; all in "
-            ".vtu, .vtk, .xdmf).",
+            ".vtu, .vtk, .xdmf); to an image (.nii, .nii.gz, .mgz, .nrrd), the field of nodes or "
+            "cells of this name.",
+            "fields",
         ),
     ] = None
     space: SpaceOption = "ras"

@@ -79,11 +79,13 @@ def check_solver_options(
         raise InputError("`average`: needs `young`")
     if solver.units not in STRESS_UNITS:
         raise InputError(f"`units`: expected one of {', '.join(STRESS_UNITS)}, got {solver.units}")
-    if solver.fields is not None and (solver.fields not in FIELDS or not form.fields):
+    if solver.written_fields is not None and (
+        solver.written_fields not in FIELDS or not form.fields
+    ):
         able = ", ".join(name for name, kind in FORMATS.items() if kind.fields)
         raise InputError(
-            f"`fields`: expected {', '.join(FIELDS)} and a file {able}, got {solver.fields} for "
-            f"{output}"
+            f"`written_fields`: expected {', '.join(FIELDS)} and a file {able}, got "
+            f"{solver.written_fields} for {output}"
         )
     if solver.space not in SPACES:
         raise InputError(f"`space`: expected {' or '.join(SPACES)}, got {solver.space}")
@@ -342,17 +344,17 @@ def warn_of_units(model: Model) -> None:
 def save_for_solver(output: Path, model: Model, solver: SolverOptions) -> None:
     """Write the file with the fields of cells that the options or the format choose."""
     # a format without a place for them lists them
-    choice = solver.fields or format_of(output).fields or "all"
+    choice = solver.written_fields or format_of(output).fields or "all"
     names = [name for name in model.cell_data if name != LABEL_FIELD and not is_result(name)]
     left = [
         name
         for name in names
         if choice == "none" or (choice == "mean" and not re.fullmatch(MEAN_FIELD, name))
     ]
-    if left and solver.fields is None:
+    if left and solver.written_fields is None:
         note(
-            f"{output}: {len(left)} fields of cells are not written (`fields` all writes them): "
-            f"{', '.join(left)}"
+            f"{output}: {len(left)} fields of cells are not written (`written_fields` all "
+            f"writes them): {', '.join(left)}"
         )
     model = model._replace(
         cell_data={name: rows for name, rows in model.cell_data.items() if name not in left}

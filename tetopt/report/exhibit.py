@@ -169,7 +169,7 @@ def opened_on(
     names = [field.name for field in shown.fields]
     if name is not None and name not in names:
         raise InputError(
-            f'`field`: the mesh has no field "{name}"; it has {", ".join(dict.fromkeys(names))}'
+            f'`show`: the mesh has no field "{name}"; it has {", ".join(dict.fromkeys(names))}'
         )
     fields = sorted(
         shown.fields, key=lambda field: field.name != (names[0] if name is None else name)
@@ -182,7 +182,7 @@ def opened_on(
         if fields[0].categories:
             raise InputError(
                 f'range: "{fields[0].name}" has labels, which have fixed colours; give another '
-                "`field`"
+                "`show`"
             )
         first = fields[0].name
         fields = [
