@@ -29,6 +29,7 @@ from .fem.solution import (
     solution_fields as solution_fields,
     solve as solve,
 )
+from .fields.field import Field as Field
 from .geometry.surface import extract_surface as extract_surface
 from .image import Image as Image
 from .io.formats import (

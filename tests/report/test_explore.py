@@ -79,7 +79,7 @@ def test_a_field_is_the_first_within_limits(mesh, cell_data):
     within = opened_on(shown, "mean", (-5.0, 120.0)).fields
     assert within == [mean._replace(limits=(-5.0, 120.0)), label]
     for words, match in (
-        (("rho",), "field`: .* it has mean, label"),
+        (("rho",), "show`: .* it has mean, label"),
         (("mean", (3.0, 3.0)), "range: .* got 3,3"),
         (("mean", (np.nan, 3.0)), "range: expected LOW,HIGH"),
         (("label", (0.0, 3.0)), 'range: "label"'),

@@ -50,7 +50,7 @@ MOST_TIMES = 5.0  # the initial factor: beyond, cells lose their shapes
 ROUND_NUMBERS = (1.0, 2.0, 5.0, 10.0)  # times powers of ten, the values of the factor
 
 
-class Field(NamedTuple):
+class ShownField(NamedTuple):
     """One number per cell or node, and its colouring."""
 
     name: str
@@ -68,7 +68,7 @@ class Exhibit(NamedTuple):
     """A tetrahedral mesh to view, and all data shown with it."""
 
     mesh: Mesh
-    fields: list[Field]  # at least one
+    fields: list[ShownField]  # at least one
     skipped: list[str]  # names of data not shown
     image: Image | None  # 3-D
     title: str
@@ -260,7 +260,7 @@ def _nodal(
     return numbers, dict(sorted(displacements.items())), others
 
 
-def _by_step(fields: list[Field], displacements: dict[int, Floats]) -> list[Field]:
+def _by_step(fields: list[ShownField], displacements: dict[int, Floats]) -> list[ShownField]:
     """Assign steps to fields, and remove the step number from their names."""
     if len(displacements) < 2:
         return fields
@@ -276,14 +276,14 @@ def _by_step(fields: list[Field], displacements: dict[int, Floats]) -> list[Fiel
 
 def _field(
     name: str, values: NDArray, nodes: NDArray | None = None, table: LabelTable = NO_TABLE
-) -> Field:
+) -> ShownField:
     """Create a field of cells, or of nodes with its mean over the corners of each cell."""
     values, at_nodes = _single(values), None if nodes is None else _single(nodes)
     shown = values if at_nodes is None else at_nodes
     finite = shown[np.isfinite(shown)].astype(np.float64)
     unit = FIELD_UNITS.get(STEP_NAME.sub(r"\1", name), "")
     if len(finite) == 0:
-        return Field(name, unit, values, (0.0, 1.0), [], at_nodes)
+        return ShownField(name, unit, values, (0.0, 1.0), [], at_nodes)
     low, high = (
         float(limit)
         for limit in np.percentile(finite, [OUTLIERS_PERCENT, 100.0 - OUTLIERS_PERCENT])
@@ -293,7 +293,7 @@ def _field(
     is_quantity = unit or at_nodes is not None
     categories = [] if is_quantity else _categories(finite, table)
     names = table_of_labels(table, [label for label, _ in categories]).names
-    return Field(name, unit, values, limits, categories, at_nodes, names=names)
+    return ShownField(name, unit, values, limits, categories, at_nodes, names=names)
 
 
 def _single(values: NDArray) -> NDArray[np.float32]:

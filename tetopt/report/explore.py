@@ -23,7 +23,7 @@ from tetopt.report.exhibit import (
     LABEL_FIELD,
     NO_VALUE,
     Exhibit,
-    Field,
+    ShownField,
     first_axis,
     loaded_side,
     warp_factors,
@@ -104,7 +104,7 @@ def explorer_html(shown: Exhibit) -> str:
     )
 
 
-def _packed_field(field: Field) -> dict[str, Any]:
+def _packed_field(field: ShownField) -> dict[str, Any]:
     nodes = None if field.nodes is None else encode_numbers(field.nodes, "<f4")
     return {**field._asdict(), "values": encode_numbers(field.values, "<f4"), "nodes": nodes}
 
