@@ -10,6 +10,7 @@ from numpy.testing import assert_array_equal
 
 import tetopt
 from tetopt import Image, InputError, Mesh
+from tetopt.geometry.simplex import edge_pairs
 
 TRIANGLE = [[0, 0], [1, 0], [0, 1]]
 
@@ -126,3 +127,32 @@ def test_unused_nodes_are_allowed():
 def test_what_is_no_mesh_is_refused(points, cells, message):
     with pytest.raises(InputError, match=message):
         Mesh(points, cells)
+
+
+def test_moved_nodes_and_midpoints_keep_their_cells(n):
+    points = np.vstack([np.zeros(n), np.eye(n)])
+    midpoints = np.array([(points[a] + points[b]) / 2 for a, b in edge_pairs(n)]) + 0.01
+    mesh = Mesh(points, [np.arange(n + 1)], midpoints)
+    A = np.eye(n + 1) + 0.1 * np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
+    A[n] = np.eye(n + 1)[n]
+    for transform in (A, lambda x: x @ A[:n, :n].T + A[:n, n]):
+        moved = mesh.moved(transform)
+        for before, after in ((points, moved.points), (midpoints, moved.midpoints)):
+            np.testing.assert_allclose(after, before @ A[:n, :n].T + A[:n, n], rtol=1e-14)
+        np.testing.assert_array_equal(moved.cells, mesh.cells)
+
+
+@pytest.mark.parametrize(
+    ("transform", "words"),
+    [
+        (np.eye(2), r"matrix of 3 x 3 numbers .* got an array of shape \(2, 2\)"),
+        (2 * np.eye(3), r"with the last row \[0.0, 0.0, 1.0\]"),
+        ("affine.mat", "expected a callable or a matrix"),
+        (lambda x: x[:2], r"expected \(3, 2\) coordinates of the points, got \(2, 2\)"),
+        (np.diag([-1, 1, 1]), "Mesh.moved: mesh cells: 1 of 1 are flat or inverted"),
+        (lambda x: x + np.inf, "Mesh.moved: mesh points: .*finite"),
+    ],
+)
+def test_maps_that_leave_no_mesh_are_refused(transform, words):
+    with pytest.raises(InputError, match=words):
+        Mesh(TRIANGLE, [[0, 1, 2]]).moved(transform)

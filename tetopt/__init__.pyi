@@ -42,6 +42,7 @@ from .io.images import load_image as load_image, save_image as save_image
 from .io.label_tables import load_label_table as load_label_table
 from .io.meshes import load_mesh as load_mesh
 from .io.surfaces import save_surface as save_surface
+from .io.transforms import load_transform as load_transform
 from .job.job import Job as Job
 from .job.plan import Plan as Plan, plan as plan
 from .job.read import read as read

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tetopt.errors import InputError
+from tetopt.errors import InputError, prefix_errors
 from tetopt.geometry.quadratic import curved_volumes, numbered_edges, quadratic, straight_pieces
 from tetopt.geometry.simplex import volumes
 from tetopt.interop import conversions, notebook
@@ -139,6 +140,44 @@ class Mesh:
         )
         points, cells = straight_pieces(self.points, self.cells, self.midpoints)
         return Mesh(points, cells), len(cells) // len(self.cells)
+
+    def moved(self, transform: Callable[[Floats], ArrayLike] | ArrayLike) -> Mesh:
+        """Move the nodes, with mid-edge nodes, by a map; cells and numbers of nodes stay.
+
+        Parameters
+        ----------
+        transform : callable or (n+1, n+1) array
+            A map of points (K, n), mm, such as `tetopt.load_transform` reads, or an affine matrix.
+            By a registration, nodes of the fixed image's mesh move to the moving image by the map
+            that resamples images from the moving to the fixed one.
+
+        Returns
+        -------
+        Mesh
+            With the same cells.
+
+        Raises
+        ------
+        InputError
+            A matrix of another shape; places of another shape or not finite; cells that the map
+            inverts (`tetopt convert --transform` untangles them).
+
+        See Also
+        --------
+        load_transform : Read a transform of ITK, ANTs, FSL, AFNI or SPM.
+
+        Examples
+        --------
+        >>> mesh = tetopt.Mesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
+        >>> mesh.moved([[2, 0, 5], [0, 1, 0], [0, 0, 1]]).points.tolist()
+        [[5.0, 0.0], [7.0, 0.0], [5.0, 1.0]]
+        >>> mesh.moved(lambda points: points + 1).points.tolist()
+        [[1.0, 1.0], [2.0, 1.0], [1.0, 2.0]]
+        """
+        move = transform if callable(transform) else _affine_map(transform, self.ndim)
+        midpoints = None if self.midpoints is None else _moved(move, self.midpoints)
+        with prefix_errors("Mesh.moved"):
+            return Mesh(_moved(move, self.points), self.cells, midpoints)
 
     def __repr__(self) -> str:
         kind = "tetrahedra" if self.ndim == 3 else "triangles"
@@ -422,6 +461,29 @@ class Mesh:
         from tetopt.geometry.topology import boundary_facets
 
         return conversions.to_trimesh(self.points, boundary_facets(self.cells))
+
+
+def _affine_map(matrix: ArrayLike, n: int) -> Callable[[Floats], Floats]:
+    try:
+        A = np.asarray(matrix, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"transform: expected a callable or a matrix ({error})") from error
+    if A.shape != (n + 1, n + 1) or not np.array_equal(A[n], np.eye(n + 1)[n]):
+        raise InputError(
+            f"transform: expected a callable, or an affine matrix of {n + 1} x {n + 1} numbers "
+            f"with the last row {np.eye(n + 1)[n].tolist()}, got an array of shape {A.shape}"
+        )
+    # without BLAS, whose rounding depends on the number of threads
+    return lambda points: (points[:, None, :] * A[:n, :n]).sum(axis=2) + A[:n, n]
+
+
+def _moved(move: Callable[[Floats], ArrayLike], points: Floats) -> Floats:
+    places = np.asarray(move(points), dtype=np.float64)
+    if places.shape != points.shape:
+        raise InputError(
+            f"transform: expected {points.shape} coordinates of the points, got {places.shape}"
+        )
+    return places
 
 
 def _check_midpoints(midpoints: ArrayLike, cells: Ints, n: int) -> Floats:

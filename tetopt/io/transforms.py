@@ -1,0 +1,352 @@
+"""Spatial transforms of registrations: files of ITK and ANTs, FSL, AFNI and SPM, as maps of points.
+
+A transform maps points of the fixed image to the moving image, in world coordinates: it is the map
+by which images are resampled from the moving to the fixed image. Files are read here, not by
+nitransforms 25.1, whose maps differ from ITK's: cubic instead of linear between the voxels of a
+dense field (by 0.6 mm on a rough one), identity outside of it without a word, 32-bit numbers from
+text, and no single transform in HDF5.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import nibabel
+import numpy as np
+from numpy.typing import NDArray
+from scipy.io import loadmat
+from scipy.ndimage import map_coordinates
+from scipy.spatial.transform import Rotation
+
+from tetopt.errors import InputError, prefix_errors
+from tetopt.image import Image, transform_vectors
+from tetopt.io.apart import read_apart
+from tetopt.system.arrays import Floats
+from tetopt.system.extras import install_hint
+from tetopt.system.incoming import regular_file
+
+LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
+MATLAB_SUFFIX, HDF5_SUFFIXES, NIFTI_SUFFIXES = ".mat", (".h5", ".hdf5"), (".nii", ".nii.gz")
+TEXT_HEAD = "#Insight Transform File"
+VECTOR_INTENTS = {1007: "lps", 1006: "ras"}  # of ITK's files: vectors, displacements
+EDGE_VOXELS = 0.5 + 1e-6  # beyond the outer voxel centres, to the field's end
+LEAST_DETERMINANT = 1e-9  # of a linear transform, over the product of its columns' lengths
+INVERSE_MM = 1e-9  # of a coordinate: an inverse is exact to this
+INVERSE_STEPS = 60  # at most, by Newton's method
+
+Step = Callable[[Floats], Floats]
+"""A map of points (K, 3) in RAS+ mm."""
+
+
+class Linear(NamedTuple):
+    """An affine map of points."""
+
+    matrix: Floats  # (4, 4), RAS+ mm
+
+    def __call__(self, points: Floats) -> Floats:
+        """Map points (K, 3), mm."""
+        return transform_vectors(points, self.matrix[:3, :3]) + self.matrix[:3, 3]
+
+    def inverse(self) -> Linear:
+        """Return the inverse map."""
+        return Linear(np.linalg.inv(self.matrix))
+
+
+class Dense(NamedTuple):
+    """A field of displacements, linear between voxel centres."""
+
+    shifts: Floats  # (i, j, k, 3), RAS+ mm
+    affine: Floats  # (4, 4), from voxel index to RAS+ mm
+
+    def __call__(self, points: Floats) -> Floats:
+        """Map points (K, 3), mm; InputError for points that the field does not cover."""
+        index = Linear(np.linalg.inv(self.affine))(points)
+        most = np.array(self.shifts.shape[:3]) - 1.0 + EDGE_VOXELS
+        moved = points + self._shifts_at(index)
+        is_out = ((index < -EDGE_VOXELS) | (index > most)).any(axis=1)
+        is_out |= ~np.isfinite(moved).all(axis=1)
+        if is_out.any():
+            raise InputError(
+                f"its field does not cover {int(is_out.sum())} of {len(points)} points, such as "
+                f"{np.round(points[is_out][0], 1).tolist()} mm; is it the transform of another "
+                "space, or in another place of the order?"
+            )
+        return moved
+
+    def _shifts_at(self, index: Floats) -> Floats:
+        parts = [
+            map_coordinates(part, index.T, order=1, mode="nearest")
+            for part in np.moveaxis(self.shifts, -1, 0)
+        ]
+        return np.column_stack(parts)
+
+    def inverse(self) -> Step:
+        """Return the inverse map, by Newton's method; it raises InputError where it finds none."""
+        if not np.isfinite(self.shifts).all():
+            raise InputError("its field has NaN, so no inverse; pass the file of the inverse")
+        to_index = Linear(np.linalg.inv(self.affine))
+        steps = 0.5 * np.diag(np.linalg.norm(self.affine[:3, :3], axis=0))
+
+        def moved(points: Floats) -> Floats:
+            return points + self._shifts_at(to_index(points))
+
+        def solve(points: Floats) -> Floats:
+            places = points.copy()
+            for _ in range(INVERSE_STEPS):
+                rest = moved(places) - points
+                if not (np.abs(rest) > INVERSE_MM).any():
+                    self(places)  # that the field covers
+                    return places
+                slopes = [
+                    (moved(places + step) - moved(places - step)) / (2.0 * step.sum())
+                    for step in steps
+                ]
+                ways = np.linalg.pinv(np.stack(slopes, axis=-1)) @ rest[..., None]
+                places = places - ways[..., 0]
+            n_left = int((np.abs(rest) > INVERSE_MM).any(axis=1).sum())
+            raise InputError(
+                f"its field has no inverse at {n_left} of {len(points)} points: it folds, or ends "
+                "there; pass the file of the inverse (ANTs: 1InverseWarp.nii.gz) instead"
+            )
+
+        return solve
+
+
+class Chain(NamedTuple):
+    """Maps, one after the other, with their files."""
+
+    steps: Sequence[Any]
+    names: Sequence[str]
+
+    def __call__(self, points: Floats) -> Floats:
+        """Map points (K, 3), mm; InputError for points that a dense field does not cover."""
+        for step, name in zip(self.steps, self.names, strict=True):
+            with prefix_errors(name):
+                points = step(points)
+        return points
+
+
+def load_transform(
+    *paths: str | Path,
+    inverse: bool = False,
+    fixed: Image | None = None,
+    moving: Image | None = None,
+) -> Step:
+    """Read the transform of a registration: one file, or several as antsApplyTransforms has them.
+
+    Parameters
+    ----------
+    *paths : str or Path
+        ITK and ANTs (`.tfm`, `.txt`, `.mat`, `.h5`; a dense field as NIfTI with the intent
+        "vector", LPS), FSL's matrix of flirt, AFNI's `.aff12.1D` (DICOM axes; of images that are
+        not oblique) or SPM's deformation (`y_*.nii`). Points of the fixed image pass the first file
+        first.
+    inverse : bool
+        Return the inverse of the whole: from the moving to the fixed image.
+    fixed, moving : Image, optional
+        The two images, whole, for FSL's matrix, which is of their voxels.
+
+    Returns
+    -------
+    callable
+        A map of points (K, 3), RAS+ mm; it raises InputError for points that a dense field does not
+        cover.
+
+    Raises
+    ------
+    InputError
+        A file is missing, damaged, of another kind, or singular; h5py is not installed; an image
+        is missing for FSL's matrix.
+
+    See Also
+    --------
+    Mesh.moved : Move a mesh by it.
+
+    Examples
+    --------
+    >>> move = tetopt.load_transform("1Warp.nii.gz", "0GenericAffine.mat")  # doctest: +SKIP
+    >>> moved = mesh.moved(move)  # doctest: +SKIP
+    """
+    steps: list[Any] = []
+    names: list[str] = []
+    for path in map(Path, paths):
+        regular_file(path, "transform")
+        with prefix_errors(path):
+            made = _steps_of(path, fixed, moving)
+        steps += made
+        names += [str(path)] * len(made)
+    if not inverse:
+        return Chain(steps, names)
+    return Chain([step.inverse() for step in reversed(steps)], names[::-1])
+
+
+def _steps_of(path: Path, fixed: Image | None, moving: Image | None) -> list[Any]:
+    name = path.name.lower()
+    if name.endswith(NIFTI_SUFFIXES):
+        return [_dense_of(path)]
+    if name.endswith(HDF5_SUFFIXES) and importlib.util.find_spec("h5py") is None:
+        raise InputError(f"transforms in HDF5 need h5py; {install_hint('h5py')}")
+    numbers, items = read_apart(_read_numbers, path, library="h5py or SciPy")
+    if numbers is not None:
+        return [_check_linear(_matrix_of(np.asarray(numbers), fixed, moving))]
+    if is_composite := bool(items) and items[0][0].startswith("CompositeTransform"):
+        items = items[1:]
+    if not items or (len(items) > 1 and not is_composite):
+        raise InputError(f"expected one transform or a composite one, got {len(items)}")
+    # ITK's composite applies the transform that was added last to points first
+    return [_itk_step(*item) for item in reversed(items)]
+
+
+def _read_numbers(path: str) -> tuple[NDArray | None, list[tuple[str, NDArray, NDArray]]]:
+    """Return the numbers of a plain matrix, or the kind, parameters and fixed parameters of each of
+    ITK's transforms; runs in a child.
+    """
+    if path.lower().endswith(HDF5_SUFFIXES):
+        return None, _read_hdf5(path)
+    raw = Path(path).read_bytes()
+    if path.lower().endswith(MATLAB_SUFFIX) and b"\0" in raw:
+        table = {name: each for name, each in loadmat(path).items() if name[0] != "_"}
+        centre = np.asarray(table.pop("fixed", []), dtype=np.float64).ravel()
+        return None, [(kind, np.ravel(each), centre) for kind, each in table.items()]
+    text = raw.decode()
+    if not text.startswith(TEXT_HEAD):
+        lines = [line for line in text.splitlines() if line.strip() and line.strip()[0] != "#"]
+        return np.array(" ".join(lines).split(), dtype=np.float64), []
+    rows = [line.partition(":") for line in text.splitlines() if line[:1] != "#" and line.strip()]
+    kinds = [value.strip() for key, _, value in rows if key == "Transform"]
+    values = {
+        name: [np.array(value.split(), dtype=np.float64) for key, _, value in rows if key == name]
+        for name in ("Parameters", "FixedParameters")
+    }
+    return None, list(zip(kinds, *values.values(), strict=True))
+
+
+def _read_hdf5(path: str) -> list[tuple[str, NDArray, NDArray]]:
+    import h5py
+
+    with h5py.File(path) as file:
+        groups = [group for _, group in sorted(file["TransformGroup"].items(), key=_number_of)]
+        return [
+            (
+                group["TransformType"][0].decode(),
+                *(
+                    # older versions of ITK misspelt the names
+                    np.asarray(group.get(f"Transform{what}", group.get(f"Tranform{what}", [])))
+                    for what in ("Parameters", "FixedParameters")
+                ),
+            )
+            for group in groups
+        ]
+
+
+def _number_of(item: tuple[str, Any]) -> int:
+    return int(item[0])
+
+
+def _itk_step(kind: str, values: NDArray, fixed: NDArray) -> Linear | Dense:
+    """Return a transform of ITK's, in LPS, as one in RAS+."""
+    name, _, axes = kind.partition("_")
+    values, fixed = np.asarray(values, dtype=np.float64), np.asarray(fixed, dtype=np.float64)
+    if not axes.endswith("3_3"):
+        raise InputError(f"expected a transform in 3-D, got {kind}")
+    if name == "DisplacementFieldTransform":
+        shape, origin = fixed[:3].astype(np.int64), fixed[3:6]
+        affine = np.eye(4)
+        affine[:3, :3] = fixed[9:18].reshape(3, 3) * fixed[6:9]
+        affine[:3, 3] = origin
+        shifts = values.reshape(*shape[::-1], 3).transpose(2, 1, 0, 3)
+        return Dense(shifts * np.diag(LPS)[:3], LPS @ affine)
+    if name in ("AffineTransform", "MatrixOffsetTransformBase"):
+        turn, shift = values[:9].reshape(3, 3), values[9:12]
+    elif name == "Euler3DTransform":
+        x, y, z = values[:3]
+        is_zyx = len(fixed) > 3 and fixed[3] != 0.0
+        order, angles = ("ZYX", [z, y, x]) if is_zyx else ("ZXY", [z, x, y])
+        turn, shift = Rotation.from_euler(order, angles).as_matrix(), values[3:6]
+    elif name in ("VersorRigid3DTransform", "Similarity3DTransform"):
+        w = np.sqrt(max(1.0 - (values[:3] ** 2).sum(), 0.0))
+        size = values[6] if name == "Similarity3DTransform" else 1.0
+        turn, shift = size * Rotation.from_quat([*values[:3], w]).as_matrix(), values[3:6]
+    elif name == "TranslationTransform":
+        turn, shift, fixed = np.eye(3), values[:3], np.zeros(3)
+    else:
+        raise InputError(
+            f"{name}: no such transform is read; write it as a dense field (antsApplyTransforms "
+            "-o [field.nii.gz,1], or 3D Slicer's Convert)"
+        )
+    matrix = np.eye(4)
+    matrix[:3, :3] = turn
+    matrix[:3, 3] = shift + fixed[:3] - transform_vectors(fixed[:3], turn)
+    return _check_linear(LPS @ matrix @ LPS)
+
+
+def _matrix_of(numbers: NDArray, fixed: Image | None, moving: Image | None) -> Floats:
+    """Return AFNI's 12 numbers or FSL's 16 as a matrix from the fixed to the moving image."""
+    if len(numbers) == 12:
+        return np.asarray(LPS @ np.vstack([numbers.reshape(3, 4), [0.0, 0.0, 0.0, 1.0]]) @ LPS)
+    if len(numbers) != 16:
+        raise InputError(
+            f"expected a transform of ITK, ANTs, FSL (16 numbers), AFNI (12) or SPM, got "
+            f"{len(numbers)} numbers"
+        )
+    if fixed is None or moving is None or {fixed.ndim, moving.ndim} != {3}:
+        raise InputError("FSL's matrix is of two volumes' voxels: pass `fixed` and `image`")
+    matrix = numbers.reshape(4, 4)
+    _check_linear(matrix)
+    return np.asarray(
+        moving.affine
+        @ np.linalg.inv(_fsl_axes(moving))
+        @ np.linalg.inv(matrix)  # of flirt: from the moving to the fixed image
+        @ _fsl_axes(fixed)
+        @ np.linalg.inv(fixed.affine)
+    )
+
+
+def _fsl_axes(image: Image) -> Floats:
+    """Return the map from voxel index to FSL's mm: x is flipped if the determinant is positive."""
+    axes = np.diag([*np.linalg.norm(image.affine[:3, :3], axis=0), 1.0])
+    if np.linalg.det(image.affine) > 0.0:
+        axes[0, 3] = axes[0, 0] * (image.shape[0] - 1)
+        axes[0, 0] *= -1.0
+    return axes
+
+
+def _check_linear(matrix: Floats) -> Linear:
+    lengths = np.linalg.norm(matrix[:3, :3], axis=0)
+    size = np.linalg.det(matrix[:3, :3])
+    if not (np.isfinite(matrix).all() and abs(size) > LEAST_DETERMINANT * lengths.prod() > 0.0):
+        raise InputError("its matrix is singular or has NaN; no map between two images has such")
+    return Linear(np.asarray(matrix, dtype=np.float64))
+
+
+def _dense_of(path: Path) -> Dense:
+    """Return the dense field in a NIfTI file: displacements of ITK's, or SPM's deformation."""
+    values, affine, intent, is_deformation = read_apart(_read_nifti, path, library="nibabel")
+    if values.ndim != 5 or values.shape[3:] != (1, 3) or min(values.shape) < 1:
+        raise InputError(
+            f"expected a dense field, (i, j, k, 1, 3) values, got {values.shape}; of fnirt, write "
+            "one with convertwarp and ITK's tools"
+        )
+    values = np.asarray(values[..., 0, :], dtype=np.float64)
+    if is_deformation:
+        index = np.moveaxis(np.indices(values.shape[:3], dtype=np.float64), 0, -1)
+        return Dense(values - Linear(affine)(index), affine)
+    if intent not in VECTOR_INTENTS:
+        raise InputError(
+            f"its vectors' axes are not stated: expected the intent 1007 of ITK's fields, or SPM's "
+            f"y_*.nii, got intent {intent}"
+        )
+    return Dense(values * np.diag(LPS)[:3] if VECTOR_INTENTS[intent] == "lps" else values, affine)
+
+
+def _read_nifti(path: str) -> tuple[NDArray, NDArray, int, bool]:
+    """Return values, affine, intent, and whether they are places, as SPM's; runs in a child."""
+    image: Any = nibabel.load(path)
+    header = image.header
+    is_places = Path(path).name.startswith(("y_", "iy_")) or b"eformation" in bytes(
+        header["descrip"]
+    )
+    return np.asanyarray(image.dataobj), image.affine, int(header["intent_code"]), is_places
