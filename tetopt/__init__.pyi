@@ -30,6 +30,7 @@ from .fem.solution import (
     solve as solve,
 )
 from .fields.field import Field as Field
+from .fields.onto_cells import CellField as CellField, cell_field as cell_field
 from .geometry.surface import extract_surface as extract_surface
 from .image import Image as Image
 from .io.formats import (

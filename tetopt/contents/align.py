@@ -99,6 +99,15 @@ def resample_mask(mask: Image, image: Image, name: str = "mask") -> Image:
     return Image(moved, image.affine)
 
 
+def is_in_mask(mask: Image, image: Image, name: str = "mask") -> Bools:
+    """Return which of the image's voxels are in a mask as `resample_mask` takes it, whether or not
+    all of it is there.
+    """
+    _check_axes(name, mask, image)
+    inside = _mask_values(name, mask.with_zeros().data)
+    return _values_at(Image(inside, mask.affine), image) >= INSIDE_FRACTION
+
+
 def resample_labels(
     labels: Image, image: Image, name: str = "labels", *, may_miss: bool = False
 ) -> Image:
