@@ -30,6 +30,7 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from tetopt.contents.content import Content, check_values, continue_image
@@ -370,6 +371,17 @@ def nearest_values(image: Image, points: Floats) -> Floats:
     border's value.
     """
     return image.data[tuple(nearest_voxels(image, points).T)].astype(np.float64)
+
+
+def linear_values(image: Image, points: Floats) -> Floats:
+    """Value of the image, linear between voxel centres, at each world point (K, n), (K,) float64;
+    points beyond the outermost centres get the value of the nearest place between them.
+    """
+    return np.asarray(
+        scipy.ndimage.map_coordinates(
+            image.data, image.to_index(points).T, np.float64, order=1, mode="nearest"
+        )
+    )
 
 
 def nearest_voxels(image: Image, points: Floats) -> Ints:

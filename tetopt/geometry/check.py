@@ -343,14 +343,14 @@ def _box_overlap(mesh: Mesh, image: Image, mm: float) -> float:
     return float(both / (np.prod(high - low) + shape.prod() - both))
 
 
-def check_place(mesh: Mesh, image: Image) -> None:
+def check_place(mesh: Mesh, image: Image, name: str = "the image or its mask") -> None:
     """Raise InputError for a mesh outside the image, as `outside_fraction`; warn of one partly
     outside.
     """
     if (outside := outside_fraction(mesh, image)) > 0.0:
         warn(
-            f"{outside:.1%} of the nodes lie outside the image or its mask: cells there take the "
-            "nearest voxel's value"
+            f"{outside:.1%} of the nodes lie outside {name}: cells there take the nearest voxel's "
+            "value"
         )
 
 

@@ -13,13 +13,15 @@ Power means lie between them; power 0 is the geometric mean (Lichtenecker, Physi
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
+from itertools import permutations, product
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from tetopt.energy.sampling import (
     cell_of_voxel,
+    linear_values,
     nearest_values,
     nearest_voxels,
     ranges_of,
@@ -30,13 +32,19 @@ from tetopt.geometry.quadratic import gauss_rule
 from tetopt.geometry.simplex import centroids, volume_gradients, volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.model.mappings import ModulusMapping, mapped_values, young_from
+from tetopt.model.formula import Named
+from tetopt.model.mappings import ModulusMapping, finite_values, young_from
 from tetopt.system.arrays import Bools, Floats, Ints
 
 DEFAULT_AVERAGE = "gauss"  # of moduli (docs/understand/moduli.md); the paper's figures keep Eq. (2)
 # in absolute value; beyond it a power mean is almost the largest or the smallest value
 LARGEST_POWER = 10.0
 VOXELS_PER_CHUNK = 2**20  # whose positions in their cells are computed at once, 100 MB
+# along an edge of a cell, for the average "linear": of cells 4 voxels wide or wider, whose values
+# have 2,048 places in a tetrahedron
+MOST_PARTS = 8
+
+Images = Image | Mapping[str, Image]  # the image, or those that a formula names, without gaps
 
 
 class Average(NamedTuple):
@@ -45,8 +53,9 @@ class Average(NamedTuple):
     words: str  # as a user writes it
     # of the power mean; None: Hill's average, halfway between the powers 1 and -1
     power: float | None
-    # one average per cell, per node, or per Gauss point of a cell
-    place: Literal["cells", "nodes", "gauss"] = "cells"
+    # one average per cell, per node, or per Gauss point of a cell; or per cell, linear in between
+    # voxel centres
+    place: Literal["cells", "nodes", "gauss", "linear"] = "cells"
 
 
 AVERAGES = {
@@ -58,6 +67,7 @@ AVERAGES = {
         Average("hill", None),
         Average("gauss", 0.0, "gauss"),
         Average("nodes", 0.0, "nodes"),
+        Average("linear", 1.0, "linear"),
     )
 }
 
@@ -70,8 +80,8 @@ def parse_average(text: str) -> Average:
     text : str
         "mean" (Eq. (2), Voigt; power 1), "geometric" (power 0), "harmonic" (Reuss; power -1),
         "power:P" with P from -10 to 10, "hill" (halfway between mean and harmonic), "gauss"
-        (geometric around each Gauss point of a cell) or "nodes" (geometric around each node, and
-        linear between nodes).
+        (geometric around each Gauss point of a cell), "nodes" (geometric around each node, and
+        linear between nodes) or "linear" (the mean of the image linear between voxel centres).
 
     Raises
     ------
@@ -113,19 +123,24 @@ def young_image(image: Image, mapping: ModulusMapping) -> Image:
 
 
 def cell_young(
-    image: Image, mesh: Mesh, mapping: ModulusMapping = None, average: str = "mean"
+    image: Images, mesh: Mesh, mapping: ModulusMapping = None, average: str = "mean"
 ) -> Floats:
     """Return the modulus of each cell, (M,) float64, kPa: an average of the modulus field over it.
 
     Parameters
     ----------
-    image : Image
+    image : Image, or dict of str to Image
+        The source of intensities, or of all values that a formula names, on any grids. Of several
+        images, the average is over the voxels of the finest (least volume of a voxel, then the
+        first name), at whose centres the others are linear.
     mesh : Mesh
     mapping : callable, (K, 2) table or None
-        From intensity to kPa, see `tetopt.model.mappings.mapped_values`.
+        From intensity, or for several images a `tetopt.model.formula.Formula`, to kPa, see
+        `tetopt.model.mappings.mapped_values`.
     average : str
         See `parse_average`. "mean" is Eq. (2). "nodes" gives the mean of `node_young` over the
-        cell's corners, and thus over the cell; "gauss" gives the geometric mean.
+        cell's corners, and thus over the cell; "gauss" gives the geometric mean. "linear" is
+        Eq. (2) for images that are linear between voxel centres, by the rule of `_linear_means`.
 
     A cell without a voxel centre gets the modulus at its centroid, see
     `tetopt.energy.sampling.cell_moments`. Every average lies within the range of the cell's voxels;
@@ -140,32 +155,33 @@ def cell_young(
     parsed = parse_average(average)
     if parsed.place == "nodes":
         return gauss_young(node_young(image, mesh, mapping), mesh, 1)[:, 0]
+    if parsed.place == "linear":
+        return _linear_means(image, mesh, lambda values: young_from(mapping, values))
     field, owner = _moduli(image, mesh, mapping, parsed)
     return _of_cells(field, mesh, owner, parsed.power)
 
 
-def cell_values(image: Image, mesh: Mesh, mapping: ModulusMapping) -> Floats:
+def cell_values(
+    image: Images, mesh: Mesh, mapping: ModulusMapping, *, is_linear: bool = False
+) -> Floats:
     """Return the mean over each cell of another quantity, such as Poisson's ratio or density; it
     may be negative.
+
+    Images and mapping are as in `cell_young`, the average is "mean", or "linear" if `is_linear`.
 
     Raises
     ------
     InputError
-        For the reasons of `mapped_values` and `tetopt.energy.sampling.cell_of_voxel`; values that
-        are not finite.
+        For the reasons of `finite_values` and `tetopt.energy.sampling.cell_of_voxel`.
     """
-    seen, owner = _see_voxels(image, mesh)
-    values = mapped_values(mapping, seen.data)
-    if not np.isfinite(values).all():
-        at = seen.data[~np.isfinite(values)].ravel()[0]
-        raise InputError(
-            f"mapping: no value at intensity {at:g}; give a mapping (`nu`, `density`) defined for "
-            "all intensities in the mesh"
-        )
-    return _of_cells(Image(values, image.affine), mesh, owner, 1.0)
+    if is_linear:
+        return _linear_means(image, mesh, lambda values: finite_values(mapping, values))
+    seen = _see_voxels(image, mesh)
+    field = Image(finite_values(mapping, seen.values), seen.affine)
+    return _of_cells(field, mesh, seen.owner, 1.0)
 
 
-def node_young(image: Image, mesh: Mesh, mapping: ModulusMapping = None) -> Floats:
+def node_young(image: Images, mesh: Mesh, mapping: ModulusMapping = None) -> Floats:
     """Return the modulus of each node, (N,) float64, kPa, for moduli that are linear within cells.
 
     This is the geometric mean of the voxels in the cells around the node, each weighted by the
@@ -201,7 +217,7 @@ def node_young(image: Image, mesh: Mesh, mapping: ModulusMapping = None) -> Floa
 
 
 def element_young(
-    image: Image, mesh: Mesh, mapping: ModulusMapping = None, average: str = "mean", order: int = 1
+    image: Images, mesh: Mesh, mapping: ModulusMapping = None, average: str = "mean", order: int = 1
 ) -> Floats:
     """Return moduli for `tetopt.fem.elasticity.stiffness`: `cell_young` (M,), or at Gauss points
     (M, Q), kPa.
@@ -220,7 +236,7 @@ def element_young(
     parsed = parse_average(average)
     if parsed.place == "nodes":
         return gauss_young(node_young(image, mesh, mapping), mesh, order)
-    if parsed.place == "cells" or order == 1:
+    if parsed.place != "gauss" or order == 1:
         return cell_young(image, mesh, mapping, average)
     field, owner = _moduli(image, mesh, mapping, parsed)
     places, _ = gauss_rule(mesh.ndim, order)
@@ -247,24 +263,99 @@ def gauss_young(node_young: Floats, mesh: Mesh, order: int) -> Floats:
     return np.clip(np.einsum("qa,ca->cq", places, corners), low, high)
 
 
-def _see_voxels(image: Image, mesh: Mesh) -> tuple[Image, Ints]:
-    """Return the image with unused values replaced, and the cell of each voxel, (V,), -1 outside.
+class _Seen(NamedTuple):
+    """What mappings are applied to, on the voxels of one grid."""
+
+    values: Floats | Named  # in the grid's shape
+    affine: Floats
+    owner: Ints  # (V,) the cell of each voxel, -1 outside
+
+
+def _see_voxels(image: Images, mesh: Mesh) -> _Seen:
+    """Return the values on the voxels of the finest grid, with unused ones replaced.
 
     Averages use voxels in cells, and those nearest to nodes and centroids, which stand in for cells
     without voxels. All other voxels get the value of a used one, because a mapping need not be
     defined for the air around an organ.
     """
-    image = without_gaps(image, mesh)
-    owner = cell_of_voxel(image, mesh).ravel()
+    if isinstance(image, Image):
+        grid = image = without_gaps(image, mesh)
+    else:
+        grid = min(sorted(image.items()), key=lambda named: named[1].voxel_volume)[1]
+    owner = cell_of_voxel(grid, mesh).ravel()
     is_seen = owner >= 0
-    if is_seen.all():
-        return image, owner
-    for points in (mesh.points, centroids(mesh.points, mesh.cells)):
-        is_seen[np.ravel_multi_index(tuple(nearest_voxels(image, points).T), image.shape)] = True
-    data = image.data.ravel()
-    return Image(
-        np.where(is_seen, data, data[np.argmax(is_seen)]).reshape(image.shape), image.affine
-    ), owner
+    if not is_seen.all():
+        for points in (mesh.points, centroids(mesh.points, mesh.cells)):
+            is_seen[np.ravel_multi_index(tuple(nearest_voxels(grid, points).T), grid.shape)] = True
+    used = np.flatnonzero(is_seen)
+
+    def values(each: Image) -> Floats:
+        data = each.data.ravel()
+        if each.shape != grid.shape or not np.array_equal(each.affine, grid.affine):
+            data = np.empty(len(owner))
+            for start in range(0, len(used), VOXELS_PER_CHUNK):
+                part = used[start : start + VOXELS_PER_CHUNK]
+                index = np.stack(np.unravel_index(part, grid.shape), axis=1)
+                data[part] = linear_values(each, grid.to_world(index))
+        if len(used) < len(data):
+            data = np.where(is_seen, data, data[used[0]])
+        return data.reshape(grid.shape)
+
+    if isinstance(image, Image):
+        return _Seen(values(image), grid.affine, owner)
+    return _Seen({name: values(each) for name, each in image.items()}, grid.affine, owner)
+
+
+def _linear_means(image: Images, mesh: Mesh, mapped: Callable[[Floats | Named], Floats]) -> Floats:
+    """Return the mean over each straight cell, (M,), of a mapping of images that are linear between
+    voxel centres.
+
+    A cell that is w voxels wide, along the axis of a grid where it is widest, is divided into k^n
+    parts of equal volume, about half a voxel wide or less: k is the next whole number above 2 w, at
+    most `MOST_PARTS`. Each part has the rule of n + 1 points, exact for quadratic functions.
+    """
+    images = {"": without_gaps(image, mesh)} if isinstance(image, Image) else image
+    width = np.max(
+        [
+            np.ptp(each.to_index(mesh.points)[mesh.cells], axis=1).max(axis=1)
+            for each in images.values()
+        ],
+        axis=0,
+    )
+    n_parts = np.minimum(np.floor(2.0 * width).astype(np.int64) + 1, MOST_PARTS)
+    means = np.empty(len(mesh.cells))
+    for k in np.unique(n_parts).tolist():
+        places = _parts_places(mesh.ndim, k)
+        cells = np.flatnonzero(n_parts == k)
+        n_at_once = max(1, VOXELS_PER_CHUNK // len(places))
+        for start in range(0, len(cells), n_at_once):
+            part = cells[start : start + n_at_once]
+            corners = mesh.points[mesh.cells[part]]
+            points = np.einsum("qa,cad->cqd", places, corners).reshape(-1, mesh.ndim)
+            values = {name: linear_values(each, points) for name, each in images.items()}
+            found = mapped(values[""] if isinstance(image, Image) else values)
+            found = found.reshape(len(part), len(places))
+            low, high = found.min(axis=1), found.max(axis=1)
+            means[part] = np.clip(found.mean(axis=1), low, high)
+    return means
+
+
+def _parts_places(n: int, k: int) -> Floats:
+    """Return places of equal weight, barycentric, (Q, n+1): the Gauss points of the k^n parts of a
+    simplex in Kuhn's subdivision, which has those of k^n cubes that lie where x_1 >= ... >= x_n.
+    """
+    lows = np.array(list(product(range(k), repeat=n)))
+    parts = []
+    for order in permutations(range(n)):
+        steps = np.zeros((n + 1, n), dtype=np.int64)
+        for row, axis in enumerate(order, start=1):
+            steps[row:, axis] = 1
+        corners = lows[:, None] + steps
+        parts.append(corners[(np.diff(corners, axis=2) <= 0).all(axis=(1, 2))])
+    corners = np.concatenate(parts) / k
+    ends = np.pad(corners, ((0, 0), (0, 0), (1, 1)), constant_values=((0, 0), (0, 0), (1, 0)))
+    barycentric = -np.diff(ends, axis=2)
+    return np.einsum("qa,pab->pqb", gauss_rule(n, 2)[0], barycentric).reshape(-1, n + 1)
 
 
 def _places(image: Image, mesh: Mesh, owner: Ints) -> Iterator[tuple[Ints, Floats]]:
@@ -287,21 +378,23 @@ def _places(image: Image, mesh: Mesh, owner: Ints) -> Iterator[tuple[Ints, Float
 
 
 def _moduli(
-    image: Image, mesh: Mesh, mapping: ModulusMapping, average: Average
+    image: Images, mesh: Mesh, mapping: ModulusMapping, average: Average
 ) -> tuple[Image, Ints]:
     """Return the modulus field, with unused voxels as in `_see_voxels`, and the cell of each voxel.
 
     Raises InputError if an average would be 0 because of a single modulus of 0.
     """
-    seen, owner = _see_voxels(image, mesh)
-    field = young_image(seen, mapping)
+    seen = _see_voxels(image, mesh)
+    field, owner = Image(young_from(mapping, seen.values), seen.affine), seen.owner
     if average.power is not None and average.power > 0.0:
         return field, owner
     empty = np.flatnonzero((owner >= 0) & (field.data.ravel() == 0.0))
     if len(empty):
+        index = np.array(np.unravel_index(empty[0], field.shape))
+        place = ", ".join(f"{x:.5g}" for x in field.to_world(index))
         raise InputError(
             f"average: expected moduli above 0 kPa for {average.words}, got 0 in {len(empty)} "
-            f"voxels of the mesh, e.g. at intensity {image.data.ravel()[empty[0]]:g}; give empty "
+            f"voxels of the mesh, e.g. at ({place}) mm; give empty "
             'space a small modulus, as in `young` "0:0.1,255:6", or use `average` mean'
         )
     return field, owner

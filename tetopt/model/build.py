@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import json
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from tetopt.contents.align import resample_mask
 from tetopt.contents.content import Content, continue_image
-from tetopt.contents.domain import mask_text
-from tetopt.energy.sampling import mask_of_values
+from tetopt.contents.domain import INSIDE_FRACTION, mask_text
+from tetopt.energy.sampling import cell_of_voxel, mask_of_values
 from tetopt.engine.loop import MeshingResult
-from tetopt.errors import InputError, Note, warn
+from tetopt.errors import InputError, Note, prefix_errors, warn
 from tetopt.geometry.check import check_place
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image, check_image
@@ -19,6 +21,7 @@ from tetopt.measure.judge import warn_of_other_mask
 from tetopt.mesh import Mesh
 from tetopt.model.averages import (
     DEFAULT_AVERAGE,
+    Images,
     cell_values,
     cell_young,
     element_young,
@@ -29,10 +32,12 @@ from tetopt.model.fields import cell_fields
 from tetopt.model.file import (
     MASK_TEXT,
     MATERIAL_FIELDS,
+    OWN_MASK,
     MeshFile,
     complete_model,
     count_of_other_voxels,
     loads_in,
+    mask_in,
     moduli_in,
     own_mask,
     sets_beside,
@@ -40,6 +45,7 @@ from tetopt.model.file import (
     without_stale_results,
     words_of_other_box,
 )
+from tetopt.model.formula import INTENSITY, Formula, check_field_names
 from tetopt.model.label_names import (
     LABEL_FIELD,
     TABLE_TEXT,
@@ -60,7 +66,6 @@ from tetopt.model.mappings import (
 )
 from tetopt.model.materials import (
     DEFAULT_NU,
-    Materials,
     Spacing,
     bin_moduli,
     by_label,
@@ -80,6 +85,7 @@ def build_model(
     nu: str | float | Floats | ModulusMapping | ByLabel = None,
     density: str | float | Floats | ModulusMapping | ByLabel = None,
     average: str = DEFAULT_AVERAGE,
+    fields: Mapping[str, Image] | None = None,
     sets: Iterable[str] = (),
     loads: Iterable[str] = (),
     bins: int | None = None,
@@ -117,7 +123,12 @@ def build_model(
         The average of Young's modulus over voxels, see `tetopt.model.averages.parse_average`;
         "mean" is Eq. (2). With "gauss" and quadratic cells, moduli vary within a cell in
         `tetopt.fem.solution.solve`, not in files. Ratios and densities are always averaged by the
-        mean.
+        mean, with "linear" of images that are linear between voxel centres.
+    fields : dict of str to Image, optional
+        Further images, on any grids in the world, whose names mappings may use as they use h:
+        ``young="3*mu"``. Such a mapping needs no `image` unless it names h. It is averaged over the
+        voxels of the finest grid that it names (`tetopt.model.averages.cell_young`). A voxel of a
+        field without a value (NaN), or outside the mesh's mask, has that of the nearest one.
     sets : iterable of str
         Additional sets, see `tetopt.model.sets.with_requested`.
     loads : iterable of str
@@ -152,13 +163,15 @@ def build_model(
     ------
     InputError
         For the reasons of the functions named above; an invalid dimension or order; gravity without
-        a density; an image beside a result of `mesh_image`.
+        a density; an image beside a result of `mesh_image`; a field that lies elsewhere, or without
+        a value in the mesh.
 
     Warns
     -----
     UserWarning
         Sets of the file had to be renamed; its loads or moduli no longer fit; the content's mask is
-        another one.
+        another one; part of the mesh lies outside the image or a field, has no value of a field, or
+        is outside of the range of a mapping.
 
     See Also
     --------
@@ -181,6 +194,7 @@ def build_model(
     [2.0, 10.0]
     """
     choices = Choices(young, nu, density, average, _texts(sets), _texts(loads), bins, spacing)
+    choices = choices._replace(fields={} if fields is None else dict(fields))
     if isinstance(mesh, MeshingResult):
         mesh, image, order, cell_data = _of_result(mesh, image, order, cell_data)
     image, whole, about = _voxels(image, mesh, about or {})
@@ -200,11 +214,11 @@ def build_model(
     box = box_of(whole) if box is None and whole is not None else box
     choices = choices._replace(order=1 if order is None else order)
     if loaded is None:
-        fields = cell_fields(mesh, image) if cell_data is None else dict(cell_data)
-        cells = _cells_of(mesh, image, fields, about)
+        of_cells = cell_fields(mesh, image) if cell_data is None else dict(cell_data)
+        cells = _cells_of(mesh, image, of_cells, about)
         if known_sets is None:
             known_sets = standard_sets(mesh, box, cells.labels, cells.names)
-        return _model(cells, choices, fields, about, known_sets)
+        return _model(cells, choices, of_cells, about, known_sets)
     if cell_data is None:
         cell_data = loaded.cell_data | ({} if image is None else cell_fields(mesh, image))
     return model_of_file(
@@ -229,6 +243,7 @@ class Choices(NamedTuple):
     spacing: Spacing = "equal"
     order: int = 1
     units: str = "kPa"  # of moduli and pressures in texts without a unit
+    fields: Mapping[str, Image] = {}  # that mappings may name
 
     @property
     def is_new(self) -> bool:
@@ -290,8 +305,14 @@ def _model(
     nodal = None
     at_gauss = None
     if choices.young is not None:
-        nodal, at_gauss = _varying_moduli(cells, choices)
-        table = _materials(cells, choices)
+        laws = _laws(choices)
+        cells = _with_fields(cells, choices.fields, laws, about)
+        nodal, at_gauss = _varying_moduli(cells, laws.young, choices)
+        values = [
+            None if law is None else _values(law, name, cells, choices.average)
+            for name, law in laws._asdict().items()
+        ]
+        table = materials(values[0], values[1], len(cells.mesh.cells), values[2])
         if bins is not None:
             table = bin_moduli(table, volumes(mesh.points, mesh.cells), bins, choices.spacing)
     elif bins is not None:
@@ -386,9 +407,17 @@ def _with_table_in_words(about: Json, labels: Ints | None) -> Json:
     }
 
 
-def _materials(cells: _ModelCells, choices: Choices) -> Materials:
-    """Build materials from mappings; ratio and density default to columns of the file that the
-    modulus names.
+class _Laws(NamedTuple):
+    """The values or mappings of the choices, parsed; moduli in kPa."""
+
+    young: Any
+    nu: Any
+    density: Any  # None for none
+
+
+def _laws(choices: Choices) -> _Laws:
+    """Return the parsed choices; ratio and density default to columns of the file that the modulus
+    names.
     """
     young = choices.young
     nu = choices.nu
@@ -397,22 +426,67 @@ def _materials(cells: _ModelCells, choices: Choices) -> Materials:
         nu = young if isinstance(young, str) and has_column(young, "nu") else DEFAULT_NU
     if density is None and isinstance(young, str) and has_column(young, "density"):
         density = young
-    moduli = _values(_mapping(young, "young", choices.units), "young", cells, choices.average)
-    ratios = _values(_mapping(nu, "nu"), "nu", cells)
-    masses = None if density is None else _values(_mapping(density, "density"), "density", cells)
-    return materials(moduli, ratios, len(cells.mesh.cells), masses)
+    check_field_names(choices.fields)
+    return _Laws(
+        *(
+            parse_any_mapping(law, name, choices.units, choices.fields)
+            if isinstance(law, str)
+            else law
+            for name, law in (("young", young), ("nu", nu), ("density", density))
+        )
+    )
 
 
-def _varying_moduli(cells: _ModelCells, choices: Choices) -> tuple[Floats | None, Floats | None]:
-    """Return `node_young` and moduli at Gauss points from a mapping of the intensity; None if
-    the average has none.
+def _with_fields(
+    cells: _ModelCells, fields: Mapping[str, Image], laws: _Laws, about: Json
+) -> _ModelCells:
+    """Return the cells with the fields that laws name, each with a value in every voxel.
+
+    A voxel without one, or outside the mask among the texts, has that of the nearest other.
     """
-    young = choices.young
+    named = [law.names for law in laws if isinstance(law, Formula)]
+    text = about.get(MASK_TEXT)
+    mask = None if text is None else mask_in(json.loads(text) if isinstance(text, str) else text)
+    images = dict(cells.images)
+    for name in sorted(fields.keys() & frozenset().union(*named)):
+        with prefix_errors(f"field {name}"):
+            images[name] = _whole_field(name, fields[name], cells.mesh, mask)
+    return cells._replace(images=images)
+
+
+def _whole_field(name: str, field: Image, mesh: Mesh, mask: Image | None) -> Image:
+    """Return a field of which every voxel has a value; warn of voxels of the mesh that have none.
+
+    Raises InputError for a field that lies elsewhere than the mesh, or has no value in it.
+    """
+    check_place(mesh, check_image(f"field {name}", field), f"field {name}")
+    has_value = ~np.isnan(field.data)
+    if field.has_gaps:
+        is_good = has_value[cell_of_voxel(field, mesh) >= 0]
+        if is_good.size and not is_good.any():
+            raise InputError("no voxel in the mesh has a value; do both use the same world?")
+        if not is_good.all():
+            warn(
+                f"field {name}: {1.0 - is_good.mean():.1%} of the voxels in the mesh have no value "
+                "(NaN) and take the nearest one's"
+            )
+    if mask is not None:
+        has_value &= resample_mask(mask, field, OWN_MASK).data >= INSIDE_FRACTION
+    return field if has_value.all() else continue_image(field, Image(has_value, field.affine))
+
+
+def _varying_moduli(
+    cells: _ModelCells, young: Any, choices: Choices
+) -> tuple[Floats | None, Floats | None]:
+    """Return `node_young` and moduli at Gauss points from a mapping of images; None if the average
+    has none.
+    """
     average = choices.average
     order = choices.order
-    mapping = _mapping(young, "young", choices.units)
     place = parse_average(average).place
-    if cells.image is None or not (callable(mapping) or np.ndim(mapping) == 2):
+    if place not in ("nodes", "gauss") or not (callable(young) or np.ndim(young) == 2):
+        return None, None
+    if (images := _images_for(young, "young", cells)) is None:
         return None, None
     if place == "nodes" and choices.bins is not None:
         raise InputError(
@@ -420,9 +494,9 @@ def _varying_moduli(cells: _ModelCells, choices: Choices) -> tuple[Floats | None
             f"{average}"
         )
     if place == "nodes":
-        return node_young(cells.image, cells.mesh, mapping), None
-    if place == "gauss" and order == 2 and choices.bins is None:
-        return None, element_young(cells.image, cells.mesh, mapping, average, order)
+        return node_young(images, cells.mesh, young), None
+    if order == 2 and choices.bins is None:
+        return None, element_young(images, cells.mesh, young, average, order)
     return None, None
 
 
@@ -430,7 +504,7 @@ class _ModelCells(NamedTuple):
     """The data of cells that mappings are applied to."""
 
     mesh: Mesh
-    image: Image | None
+    images: Mapping[str, Image]  # by their names in formulas, "h" if there is an image
     mean: Floats | None  # (M,)
     labels: Ints | None  # (M,)
     names: Names  # of labels
@@ -441,16 +515,26 @@ def _cells_of(mesh: Mesh, image: Image | None, cell_data: Arrays, about: Json) -
     mean = cell_data.get("mean")
     mean = mean if mean is not None and mean.ndim == 1 else None
     labels = labels_of(cell_data, len(mesh.cells))
-    return _ModelCells(mesh, image, mean, labels, _table_of(about).names)
+    images = {} if image is None else {INTENSITY: image}
+    return _ModelCells(mesh, images, mean, labels, _table_of(about).names)
 
 
-def _mapping(value: Any, name: str, units: str = "kPa") -> Any:
-    """Return the mapping that a text describes; moduli in kPa."""
-    return parse_any_mapping(value, name, units) if isinstance(value, str) else value
+def _images_for(mapping: Any, name: str, cells: _ModelCells) -> Images | None:
+    """Return the image, or images, that a mapping is applied to; None if it has no voxels."""
+    if not isinstance(mapping, Formula) or mapping.names <= {INTENSITY}:
+        return cells.images.get(INTENSITY)
+    if missing := mapping.names - cells.images.keys():
+        raise InputError(
+            f"{name} depends on the intensity {''.join(missing)} beside fields; give the image "
+            "(`image`)"
+        )
+    return {each: cells.images[each] for each in sorted(mapping.names)}
 
 
-def _values(mapping: Any, name: str, cells: _ModelCells, average: str = "mean") -> Floats:
-    """Return the value of each cell, or one for all."""
+def _values(mapping: Any, name: str, cells: _ModelCells, average: str) -> Floats:
+    """Return the value of each cell, or one for all; the average is of moduli alone, unless it is
+    "linear".
+    """
     if isinstance(mapping, dict):
         raise InputError(
             f"{name}: expected a number, array, mapping or text, got a dict; use "
@@ -460,9 +544,13 @@ def _values(mapping: Any, name: str, cells: _ModelCells, average: str = "mean") 
         return plain_array(name, mapping).astype(np.float64)
     if isinstance(mapping, ByLabel):
         return by_label(mapping, cells.labels, cells.names)
-    if cells.image is not None:  # map each voxel, then average, as in Eq. (2)
-        by_voxel = (cells.image, cells.mesh, mapping)
-        return cell_young(*by_voxel, average) if name == "young" else cell_values(*by_voxel)
+    images = _images_for(mapping, name, cells)
+    is_linear = parse_average(average).place == "linear"
+    if images is not None:  # map each voxel, then average, as in Eq. (2)
+        _warn_of_range(mapping, name, cells, images, is_linear=is_linear)
+        if name == "young":
+            return cell_young(images, cells.mesh, mapping, average)
+        return cell_values(images, cells.mesh, mapping, is_linear=is_linear)
     if cells.mean is None:
         raise InputError(
             f"{name} depends on intensity, but the mesh has no cell means; give the image (`image`)"
@@ -471,6 +559,25 @@ def _values(mapping: Any, name: str, cells: _ModelCells, average: str = "mean") 
         raise InputError(f"average: {average} needs the image's voxels; give the image (`image`)")
     # The mapping of each cell's mean equals the mean of the mapping only where the mapping is
     # linear.
+    _warn_of_range(mapping, name, cells, None)
     return (
         young_from(mapping, cells.mean) if name == "young" else mapped_values(mapping, cells.mean)
     )
+
+
+def _warn_of_range(
+    mapping: Any, name: str, cells: _ModelCells, images: Images | None, *, is_linear: bool = False
+) -> None:
+    """Warn of the share of the mesh's volume outside of the range that a mapping states."""
+    if not isinstance(mapping, Formula) or mapping.outside is None:
+        return
+    if images is None:
+        outside = mapping.outside(cells.mean)
+    else:
+        outside = cell_values(images, cells.mesh, mapping.outside, is_linear=is_linear)
+    volumes = cells.mesh.cell_volumes
+    if (share := float((volumes * outside).sum() / volumes.sum())) > 0.0:
+        warn(
+            f"{name}: {100.0 * share:.3g} % of the mesh's volume is outside of the range of the "
+            f"mapping, {mapping.range_text}, which is extrapolated there"
+        )

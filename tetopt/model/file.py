@@ -45,6 +45,7 @@ MATERIAL_FIELDS = ("young", "nu", "density", "material", GAUSS_MODULI)
 MODULUS_ROUNDING = 1e-9
 # text of a mesh's file: `tetopt.contents.domain.mask_text` of what the mesh was built within
 MASK_TEXT = "mask"
+OWN_MASK = "the mesh's own mask"
 # text of a mesh's file: `place_words` of the built mesh, or that its nodes were moved since
 PLACE_TEXT = "place"
 MOVE_ROUNDING = 1e-6  # of a coordinate, relative to the largest
@@ -261,12 +262,8 @@ def own_mask(loaded: MeshFile, image: Image) -> Image | None:
         raise InputError(
             f"image: expected a {loaded.mesh.ndim}-D image like the mesh, got a {image.ndim}-D one"
         )
-    if MASK_TEXT in loaded.field_data:
-        mask = None
-        with suppress(ValueError, TypeError, KeyError, OverflowError):  # another program's "mask"
-            mask = mask_of(loaded.table(MASK_TEXT))
-        if mask is not None:
-            return resample_mask(mask, image, "the mesh's own mask")
+    if MASK_TEXT in loaded.field_data and (mask := mask_in(loaded.table(MASK_TEXT))) is not None:
+        return resample_mask(mask, image, OWN_MASK)
     inputs = loaded.table("inputs")
     name = inputs.get("mask")
     level = inputs.get("background")
@@ -279,6 +276,13 @@ def own_mask(loaded: MeshFile, image: Image) -> Image | None:
         f"the mesh was built within {name}, which its file does not contain: pass `mask`, or in "
         "Python tetopt.content with the mask instead of the image"
     )
+
+
+def mask_in(text: Json) -> Image | None:
+    """Return the mask that a text of a mesh's file describes; None for another program's "mask"."""
+    with suppress(ValueError, TypeError, KeyError, OverflowError):
+        return mask_of(text)
+    return None
 
 
 def table_in(text: str | None) -> LabelTable:

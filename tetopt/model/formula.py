@@ -1,11 +1,15 @@
-"""Formulas of the intensity h, as written on a command line, parsed without executing code."""
+"""Formulas of the intensity h and of named fields, as written on a command line, parsed without
+executing code.
+"""
 
 from __future__ import annotations
 
 import ast
+import keyword
 import operator
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import reduce
 from itertools import pairwise
 from typing import Any
@@ -46,16 +50,51 @@ COMPARISONS: dict[type[ast.cmpop], Callable[..., Any]] = {
     ast.Eq: operator.eq,
     ast.NotEq: operator.ne,
 }
-FORMULA_PARTS = f"numbers, h, + - * / **, brackets and {', '.join(FORMULA_FUNCTIONS)}"
+INTENSITY = "h"  # in formulas, of the image
+
+Named = Mapping[str, Floats]  # values by name, in the same places
 
 
-def parse_formula(text: str) -> Callable[[Floats], Floats]:
-    """Convert a formula of h to a function of intensities; operators and precedence are Python's.
+@dataclass(frozen=True, eq=False)
+class Formula:
+    """A function of named values, see `parse_formula`; callable, if it names no field.
 
-    Formulas contain numbers, ``h``, ``+ - * / **``, brackets, ``abs``, ``sqrt``, ``exp`` and
-    ``log`` of one argument, ``min`` and ``max`` of two, and ``where(condition, a, b)``. Comparisons
-    (``0 < h <= 5``, with ``and`` and ``or``) are 1 where they hold, else 0; none is a formula.
-    Where a formula is undefined (1/0, log of 0) the function returns inf or NaN.
+    Parameters
+    ----------
+    names : frozenset of str
+        "h" and the fields that it names.
+    function : callable
+        From arrays by name to an array, or a number.
+    outside : Formula, optional
+        1 outside of the range that the text states after "for", else 0.
+    range_text : str
+        That range.
+    """
+
+    names: frozenset[str]
+    function: Callable[[Named], Any]
+    outside: Formula | None = None
+    range_text: str = ""
+
+    def __call__(self, h: Floats) -> Floats:
+        """Return the values, float64, at intensities."""
+        return self.at({INTENSITY: h})
+
+    def at(self, values: Named) -> Floats:
+        """Return the value, float64, in each place of the arrays by name, which have one shape."""
+        shape = np.shape(next(iter(values.values())))
+        with np.errstate(all="ignore"):  # undefined values are rejected where the modulus is used
+            return np.array(np.broadcast_to(self.function(values), shape), dtype=np.float64)
+
+
+def parse_formula(text: str, fields: Iterable[str] = ()) -> Formula:
+    """Convert a formula of h, and of the fields of these names, to a function of their values;
+    operators and precedence are Python's.
+
+    Formulas contain numbers, ``h``, names of fields, ``+ - * / **``, brackets, ``abs``, ``sqrt``,
+    ``exp`` and ``log`` of one argument, ``min`` and ``max`` of two, and ``where(condition, a, b)``.
+    Comparisons (``0 < h <= 5``, with ``and`` and ``or``) are 1 where they hold, else 0; none is a
+    formula. Where a formula is undefined (1/0, log of 0) the function returns inf or NaN.
 
     Raises
     ------
@@ -68,7 +107,42 @@ def parse_formula(text: str) -> Callable[[Floats], Floats]:
     array([  50.,  100., 1000.])
     >>> parse_formula("where(h < 1, 2*h, 5)")(np.array([0.5, 1.0]))
     array([1., 5.])
+    >>> parse_formula("3*mu", ["mu"]).at({"mu": np.array([2.0])})
+    array([6.])
     """
+    return _parse(text, frozenset({INTENSITY, *fields}))
+
+
+def parse_range(text: str, fields: Iterable[str] = ()) -> Formula:
+    """Convert a condition, such as ``0.1 < h <= 1.8``, to a formula that is 1 where it does not
+    hold, else 0.
+
+    Raises
+    ------
+    InputError
+        The text is no comparison.
+
+    Examples
+    --------
+    >>> parse_range("0.1 < h <= 1.8")(np.array([0.1, 1.0, 1.9]))
+    array([1., 0., 1.])
+    """
+    condition = _parse(text, frozenset({INTENSITY, *fields}), is_condition=True)
+    return Formula(condition.names, lambda values: 1.0 - condition.function(values))
+
+
+def check_field_names(names: Iterable[str]) -> None:
+    """Raise InputError for a name that a formula could not use."""
+    for name in names:
+        is_taken = name in (INTENSITY, *FORMULA_FUNCTIONS) or keyword.iskeyword(name)
+        if is_taken or not (name.isidentifier() and name.isascii()):
+            raise InputError(
+                f"field: expected a name of letters, digits and _, other than h, of formulas and "
+                f'of functions, got "{_formula_text(name)}"'
+            )
+
+
+def _parse(text: str, names: frozenset[str], *, is_condition: bool = False) -> Formula:
     if len(text) > MOST_FORMULA_LETTERS:
         raise InputError(
             f"formula: expected at most {MOST_FORMULA_LETTERS} characters, got "
@@ -78,7 +152,9 @@ def parse_formula(text: str) -> Callable[[Floats], Floats]:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # for "1if h" Python only issues a warning
             tree = ast.parse(text.strip(), mode="eval").body
-        value = _compile_node(tree, text, 0)
+        if is_condition and not isinstance(tree, ast.Compare | ast.BoolOp):
+            raise ValueError("no comparison")
+        value = _compile_node(tree, text, names, int(is_condition))
     except (
         SyntaxError,
         SyntaxWarning,
@@ -89,15 +165,19 @@ def parse_formula(text: str) -> Callable[[Floats], Floats]:
     ) as error:
         if isinstance(error, InputError):
             raise
+        what = "a range, such as 0.1 < h <= 1.8, of" if is_condition else ""
         raise InputError(
-            f'formula: expected {FORMULA_PARTS}, got "{_formula_text(text)}"'
+            f"formula: expected {what}{' ' * is_condition}{_parts(names)}, got "
+            f'"{_formula_text(text)}"'
         ) from error
+    used = {each.id for each in ast.walk(tree) if isinstance(each, ast.Name)}
+    return Formula(names & used, value)
 
-    def mapping(h: Floats) -> Floats:
-        with np.errstate(all="ignore"):  # undefined values are rejected where the modulus is used
-            return np.array(np.broadcast_to(value(h), h.shape), dtype=np.float64)
 
-    return mapping
+def _parts(names: frozenset[str]) -> str:
+    """What a formula may contain, for a message."""
+    known = ", ".join([INTENSITY, *sorted(names - {INTENSITY})])
+    return f"numbers, {known}, + - * / **, brackets and {', '.join(FORMULA_FUNCTIONS)}"
 
 
 def _formula_text(text: str) -> str:
@@ -106,19 +186,22 @@ def _formula_text(text: str) -> str:
     return line if len(line) <= 60 else f"{line[:57]}..."
 
 
-def _hints(node: ast.expr) -> str:
+def _hints(node: ast.expr, names: frozenset[str]) -> str:
     """Return how to write what other programs write otherwise, for the end of a message."""
     inside = list(ast.walk(node))
-    names = {each.id for each in inside if isinstance(each, ast.Name)} - {"h", *FORMULA_FUNCTIONS}
-    hints = ["; write h for the intensity"] if names else []
+    used = {each.id for each in inside if isinstance(each, ast.Name)}
+    unknown = sorted(used - names - FORMULA_FUNCTIONS.keys())
+    hints = [f"; write h for the intensity, or give `fields` {each}=FILE" for each in unknown[:1]]
     hints += ["; write ** for powers"] * any(isinstance(each, ast.BitXor) for each in inside)
     if isinstance(node, ast.Compare | ast.BoolOp):
         hints.append("; a comparison is a condition of where(h < 1.2, 2*h, 3*h)")
     return "".join(hints)
 
 
-def _compile_node(node: ast.expr, text: str, depth: int) -> Callable[[Floats], Any]:
-    """Convert a syntax tree to a function of h.
+def _compile_node(
+    node: ast.expr, text: str, names: frozenset[str], depth: int
+) -> Callable[[Named], Any]:
+    """Convert a syntax tree to a function of values by name.
 
     InputError if the tree contains anything not allowed, or is deeper than
     `MOST_NESTED_OPERATIONS`.
@@ -131,9 +214,9 @@ def _compile_node(node: ast.expr, text: str, depth: int) -> Callable[[Floats], A
     match node:
         case ast.Constant(value=float() | int() as value) if not isinstance(value, bool):
             number = np.float64(value)  # OverflowError for integers beyond 1e308
-            return lambda h: number
-        case ast.Name(id="h"):
-            return lambda h: h
+            return lambda values: number
+        case ast.Name(id=name) if name in names:
+            return lambda values: values[name]
         case ast.BinOp(left=left, op=op, right=right) if type(op) in BINARY_OPERATORS:
             function = BINARY_OPERATORS[type(op)]
             operands = [left, right]
@@ -159,11 +242,11 @@ def _compile_node(node: ast.expr, text: str, depth: int) -> Callable[[Floats], A
         case _:
             part = ast.get_source_segment(text.strip(), node) or text
             raise InputError(
-                f'formula: expected {FORMULA_PARTS}; cannot use "{_formula_text(part)}"'
-                f"{_hints(node)}"
+                f'formula: expected {_parts(names)}; cannot use "{_formula_text(part)}"'
+                f"{_hints(node, names)}"
             )
-    values = [_compile_node(operand, text, depth + 1) for operand in operands]
-    return lambda h: function(*(value(h) for value in values))
+    inner = [_compile_node(operand, text, names, depth + 1) for operand in operands]
+    return lambda values: function(*(value(values) for value in inner))
 
 
 def _chain(compare: Sequence[Callable[..., Any]]) -> Callable[..., Any]:

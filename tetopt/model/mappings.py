@@ -1,5 +1,5 @@
-"""Modulus mappings from an intensity or a label to a value such as Young's modulus, as text,
-files or arrays.
+"""Modulus mappings from an intensity, named fields or a label to a value such as Young's modulus,
+as text, files or arrays.
 """
 
 from __future__ import annotations
@@ -7,7 +7,8 @@ from __future__ import annotations
 import contextlib
 import csv
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tetopt.errors import InputError, prefix_errors
-from tetopt.model.formula import parse_formula
+from tetopt.model.formula import INTENSITY, Formula, Named, parse_formula, parse_range
 from tetopt.system.arrays import Bools, Floats
 from tetopt.system.incoming import text_of, toml_of
 
@@ -26,6 +27,7 @@ BY_LABEL = re.compile("(?<![<>=!])=(?!=)")  # not a comparison
 MODULUS_UNITS = {"Pa": 1e-3, "kPa": 1.0, "MPa": 1e3, "GPa": 1e6}  # kPa
 # not the end of a name, as in h*hPa
 UNIT_AT_END = re.compile(rf"(.*[\d.)\s])\s*({'|'.join(MODULUS_UNITS)})\s*", re.I | re.S)
+RANGE_AT_END = re.compile(r"(.*\S)\s+for\s+(.*)", re.S)  # "for" is no name in formulas
 COLUMN_WITH_UNIT = re.compile(rf"young[\s_]*[\[(]?({'|'.join(MODULUS_UNITS)})[\])]?", re.I)
 
 ModulusMapping = (
@@ -58,8 +60,9 @@ class ByLabel(NamedTuple):
     rest: float | None = None
 
 
-def mapped_values(mapping: ModulusMapping, intensities: ArrayLike) -> Floats:
-    """Apply a mapping to intensities; returns float64 values of the same shape.
+def mapped_values(mapping: ModulusMapping, intensities: ArrayLike | Named) -> Floats:
+    """Apply a mapping to intensities, or a formula to values by name; returns float64 values of the
+    same shape.
 
     Parameters
     ----------
@@ -67,13 +70,17 @@ def mapped_values(mapping: ModulusMapping, intensities: ArrayLike) -> Floats:
         A function of a float64 array; or pairs (intensity, value) with strictly increasing
         intensities, interpolated linearly and constant beyond the ends; or None for the intensity
         itself.
-    intensities : array of real numbers
+    intensities : array of real numbers, or dict of arrays
+        Of all names in a formula (`tetopt.model.formula.Formula`), in the same places.
 
     Raises
     ------
     InputError
         The table is invalid, or the function returns another shape.
     """
+    if isinstance(intensities, Mapping):
+        assert isinstance(mapping, Formula), "only formulas name their values"
+        return mapping.at(intensities)
     intensities = np.asarray(intensities, dtype=np.float64)
     if mapping is None:
         return intensities.copy()
@@ -89,8 +96,9 @@ def mapped_values(mapping: ModulusMapping, intensities: ArrayLike) -> Floats:
     return values
 
 
-def young_from(mapping: ModulusMapping, intensities: ArrayLike) -> Floats:
-    """Map intensities to Young's moduli, kPa, float64 of the same shape: `mapped_values`, checked.
+def young_from(mapping: ModulusMapping, intensities: ArrayLike | Named) -> Floats:
+    """Map intensities, or values by name, to Young's moduli, kPa, float64 of the same shape:
+    `mapped_values`, checked.
 
     Raises
     ------
@@ -104,24 +112,53 @@ def young_from(mapping: ModulusMapping, intensities: ArrayLike) -> Floats:
     >>> young_from([(0, 1.0), (100, 5.0)], [-10, 50, 100, 300])
     array([1., 3., 5., 5.])
     """
-    intensities = np.asarray(intensities, dtype=np.float64)
     young = mapped_values(mapping, intensities)
     is_bad = ~(np.isfinite(young) & (young >= 0.0))
     if is_bad.any():
-        at, first_of = np.unique(intensities[is_bad], return_index=True)
-        pairs = zip(young[is_bad][first_of[:3]], at[:3], strict=True)
-        first = ", ".join(f"{modulus:g} at intensity {intensity:g}" for modulus, intensity in pairs)
+        first = ", ".join(f"{young[is_bad][k]:g} at {at}" for k, at in _places(intensities, is_bad))
         undefined = (
             " (undefined, as the root or fractional power of a negative number: write max(h, 0))"
             if np.isnan(young).any()
             else ""
         )
+        where = "in the whole mesh"
+        if not isinstance(intensities, Mapping):
+            where = f"from {np.min(intensities):g} to {np.max(intensities):g}"
         raise InputError(
             f"modulus: expected 0 kPa or more, got {int(is_bad.sum())} invalid values, such as "
-            f"{first}{undefined}; give a modulus mapping (`young`) that is positive from "
-            f"{intensities.min():g} to {intensities.max():g}, or leave out other tissue (`mask`)"
+            f"{first}{undefined}; give a modulus mapping (`young`) that is positive {where}, or "
+            "leave out other tissue (`mask`)"
         )
     return young
+
+
+def finite_values(mapping: ModulusMapping, intensities: ArrayLike | Named) -> Floats:
+    """Map intensities, or values by name, to another quantity: `mapped_values`, checked.
+
+    Raises
+    ------
+    InputError
+        For the reasons of `mapped_values`; a value is not finite.
+    """
+    values = mapped_values(mapping, intensities)
+    if not (is_good := np.isfinite(values)).all():
+        ((_, at), *_) = _places(intensities, ~is_good)
+        raise InputError(
+            f"mapping: no value at {at}; give a mapping (`nu`, `density`) defined in the whole mesh"
+        )
+    return values
+
+
+def _places(intensities: ArrayLike | Named, is_bad: Bools) -> list[tuple[int, str]]:
+    """Return the number, among those that are bad, of up to three different places, and what they
+    are in words.
+    """
+    if not isinstance(intensities, Mapping):
+        values, first = np.unique(np.asarray(intensities)[is_bad], return_index=True)
+        words = [f"intensity {value:g}" for value in values[:3]]
+        return list(zip(first[:3].tolist(), words, strict=True))
+    bad = {name: values[is_bad] for name, values in intensities.items()}
+    return [(0, ", ".join(f"{name} = {values[0]:g}" for name, values in sorted(bad.items())))]
 
 
 def parse_table(text: str) -> list[tuple[float, float]]:
@@ -170,8 +207,8 @@ def _scale_mapping(mapping: Any, factor: float) -> Any:
     """Multiply the values of a mapping, of any form but one by label."""
     if factor == 1.0:
         return mapping
-    if callable(mapping):
-        return lambda h: factor * mapping(h)
+    if isinstance(mapping, Formula):
+        return replace(mapping, function=lambda values: factor * mapping.function(values))
     return factor * mapping if isinstance(mapping, float) else [(h, factor * v) for h, v in mapping]
 
 
@@ -256,7 +293,7 @@ def parse_mapping(text: str) -> ModulusMapping:
 
 
 def parse_any_mapping(
-    text: str, quantity: str = "young", units: str = "kPa"
+    text: str, quantity: str = "young", units: str = "kPa", fields: Iterable[str] = ()
 ) -> ModulusMapping | ByLabel | float:
     """Parse a mapping from a command line.
 
@@ -264,34 +301,59 @@ def parse_any_mapping(
     ----------
     text : str
         A number; a table of intensities, "0:1,100:5.5"; values by label or name,
-        "1=2.1,liver=1.9,*=0.5"; a formula of h (`parse_formula`); or a file named .toml or .csv
-        (`load_mapping`). Moduli may name their unit: "3 MPa", "2017*h**2.5 MPa", "1=2 kPa,2=1 GPa".
+        "1=2.1,liver=1.9,*=0.5"; a formula of h and fields (`parse_formula`); or a file named .toml
+        or .csv (`load_mapping`). Moduli may name their unit: "3 MPa", "2017*h**2.5 MPa",
+        "1=2 kPa,2=1 GPa". Formulas and tables may state the range in which they hold,
+        "2017*h**2.5 MPa for 0.1 < h < 1.8"; outside of it they are used, too, and
+        `tetopt.build_model` warns.
     quantity : str
         The file's column; "young" is returned in kPa.
     units : {"Pa", "kPa", "MPa", "GPa"}
         Of moduli without a unit.
+    fields : iterable of str
+        Names of fields that formulas may use.
 
     Raises
     ------
     InputError
-        For the reasons of `parse_table`, `parse_labels`, `parse_formula` and `load_mapping`.
+        For the reasons of `parse_table`, `parse_labels`, `parse_formula`, `parse_range` and
+        `load_mapping`.
     """
     if (file := named_file(text)) is not None:
         return load_mapping(file, quantity, units)
     if BY_LABEL.search(text):
         return parse_labels(text, units if quantity == "young" else None)
+    ranged = RANGE_AT_END.fullmatch(text)
+    law = text if ranged is None else ranged[1]
+    unit = "kPa"
     if quantity == "young":
-        text, unit = without_unit(text, units)
-        return _scale_mapping(_parse_by_intensity(text), MODULUS_UNITS[unit])
-    return _parse_by_intensity(text)
+        law, unit = without_unit(law, units)
+    mapping = _scale_mapping(_parse_by_intensity(law, fields), MODULUS_UNITS[unit])
+    return mapping if ranged is None else _within_range(mapping, ranged[2].strip(), fields)
 
 
-def _parse_by_intensity(text: str) -> ModulusMapping | float:
+def _within_range(
+    mapping: ModulusMapping | float, text: str, fields: Iterable[str]
+) -> ModulusMapping:
+    """Return a number, table or formula as a formula with the range in which it holds."""
+    outside = parse_range(text, fields)
+    if isinstance(mapping, float):
+        mapping = parse_formula(repr(mapping))
+    if not isinstance(mapping, Formula):
+        table = mapping
+        mapping = Formula(
+            frozenset({INTENSITY}), lambda values: mapped_values(table, values[INTENSITY])
+        )
+    names = mapping.names | outside.names
+    return replace(mapping, names=names, outside=outside, range_text=text)
+
+
+def _parse_by_intensity(text: str, fields: Iterable[str]) -> ModulusMapping | float:
     """Parse a number, a table or a formula."""
     with contextlib.suppress(ValueError):
         if np.isfinite(value := float(text)):
             return value
-    return _check_pairs(parse_table(text)) if ":" in text else parse_formula(text)
+    return _check_pairs(parse_table(text)) if ":" in text else parse_formula(text, fields)
 
 
 def named_file(text: str) -> Path | None:
