@@ -33,6 +33,7 @@ from .fields.field import Field as Field
 from .fields.onto_cells import CellField as CellField, cell_field as cell_field
 from .geometry.surface import extract_surface as extract_surface
 from .image import Image as Image
+from .io.components import load_field as load_field
 from .io.formats import (
     register_format as register_format,
     save_mesh as save_mesh,

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from tetopt.errors import InputError
 from tetopt.image import Image, check_affine, transform_vectors
 from tetopt.system.arrays import Floats, plain_array
+from tetopt.system.slabs import over_slabs
 
 Kind = Literal["scalar", "vector", "direction", "tensor"]
 N_COMPONENTS = {"vector": 3, "direction": 3, "tensor": 6}
@@ -123,8 +124,7 @@ class Field:
                 f"field: expected shape (s_0, s_1, s_2, {N_COMPONENTS[kind]}) for a {kind}, got "
                 f"{values.shape}"
             )
-        if np.isinf(values.min()) or np.isinf(values.max()) or np.isinf(values).any():
-            raise InputError("field: expected finite components, or NaN where there is no data")
+        _check_finite(values)
         if np.isnan(values).any(axis=-1).all():
             raise InputError("field: expected data in some voxel, got NaN in all")
         values.setflags(write=False)
@@ -145,18 +145,29 @@ class Field:
         return Image(np.zeros(self.shape, dtype=np.float32), self.affine)
 
 
+def _check_finite(components: NDArray) -> None:
+    if np.isinf(components).any():
+        raise InputError("field: expected finite components, or NaN where there is no data")
+
+
 def world_field(components: NDArray, affine: Floats, kind: Kind, frame: Convention) -> Field:
     """Return the field of a file's components (s_0, s_1, s_2, C) of a frame with axes and order."""
+    _check_finite(components)
     turn = axes_of(frame.axes, affine) if frame.turn is None else frame.turn
-    if kind != "tensor":
-        return Field(transform_vectors(components.astype(np.float64), turn), affine, kind)
-    # each component of T = turn D turn^T is linear in the six of D
-    unit = np.eye(6)[:, NINE_OF_SIX].reshape(6, 3, 3)
-    by_component = np.einsum("ia,kab,jb->ijk", turn, unit, turn)[ROWS, COLUMNS]
-    places = list(ORDERS[frame.order or "upper"])
-    return Field(
-        transform_vectors(components.astype(np.float64)[..., places], by_component), affine, kind
-    )
+    if kind == "tensor":  # each component of T = turn D turn^T is linear in the six of D
+        assert frame.order is not None, "a tensor's components have an order"
+        unit = np.eye(6)[:, NINE_OF_SIX].reshape(6, 3, 3)
+        by_component = np.einsum("ia,kab,jb->ijk", turn, unit, turn)[ROWS, COLUMNS]
+        turn = np.empty((6, 6))
+        turn[:, ORDERS[frame.order]] = by_component
+    world = np.empty(components.shape)
+
+    def fill(first: int, stop: int) -> None:
+        part = components[first:stop].astype(np.float64)
+        world[first:stop] = transform_vectors(part, turn)
+
+    over_slabs(fill, len(world), world.size)
+    return Field(world, affine, kind)
 
 
 def axes_of(axes: str | None, affine: Floats) -> Floats:

@@ -122,7 +122,7 @@ def cell_field(field: Image | Field, mesh: Mesh, mask: Image | None = None) -> C
     del features
     centroids = mesh.points[mesh.cells].mean(axis=1)
     small = np.flatnonzero(np.bincount(owner[owner >= 0], minlength=n_cells) == 0)
-    means[:, small] = _interpolated(rows, kind, grid, is_in, centroids[small])
+    means[:, small] = _features_at(rows, kind, grid, is_in, centroids[small])
     is_known = np.isfinite(means[0])
     if not is_known.any():
         where = "" if mask is None else " in the mask"
@@ -177,7 +177,7 @@ def _means(features: Floats, owner: Ints, n_cells: int) -> Floats:
         return sums / np.bincount(own, minlength=n_cells)
 
 
-def _interpolated(
+def _features_at(
     rows: NDArray, kind: Kind, grid: Image, is_in: Bools | None, points: Floats
 ) -> Floats:
     """Return the features (F, K) at world points (K, n), linear between the centres of voxels with
@@ -210,7 +210,7 @@ def _values(means: Floats, kind: Kind) -> tuple[Floats, Floats | None]:
         return np.ascontiguousarray(means.T), None
     values, vectors = _eigen(means)
     if kind == "tensor":
-        return np.ascontiguousarray(_composed(np.exp(values), vectors)[NINE_OF_SIX].T), None
+        return np.ascontiguousarray(_tensors_of(np.exp(values), vectors)[NINE_OF_SIX].T), None
     every = np.arange(means.shape[1])
     main = values.argmax(axis=0)
     unit = vectors[:, main, every]
@@ -228,10 +228,10 @@ def _logarithms(components: Floats) -> tuple[Floats, Bools]:
     is_repaired = (values < least).any(axis=0) & (largest > 0.0)
     values = np.maximum(values, least)
     values[:, ~(largest > 0.0)] = np.nan
-    return _composed(np.log(values), vectors), is_repaired
+    return _tensors_of(np.log(values), vectors), is_repaired
 
 
-def _composed(values: Floats, vectors: Floats) -> Floats:
+def _tensors_of(values: Floats, vectors: Floats) -> Floats:
     """Return the tensors (6, K) of eigenvalues (3, K) and eigenvectors (3, 3, K), in columns."""
     scaled = vectors * values
     return np.stack(

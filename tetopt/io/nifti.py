@@ -31,6 +31,7 @@ from nibabel.wrapstruct import WrapStructError
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
+from tetopt.fields.field import Convention
 from tetopt.image import shifted_affine
 from tetopt.io.apart import DEFLATE_RATIO
 from tetopt.io.contradictions import note_other_place, note_rest
@@ -57,6 +58,7 @@ EXTENSION_BYTES = 2**26  # 67 MB before the voxels: a NIfTI file's extensions ar
 PLANES_BYTES = 2**28  # of a file, read at a time for a crop of it
 MGH_FLAG = slice(28, 30)  # the bytes of an MGH header that are 0 if it has no sizes and directions
 CIFTI_INTENTS = range(3000, 3100)  # of NIfTI-2 files without a grid of voxels
+MATRIX_INTENT = 1005  # of NIfTI: components of a symmetric matrix
 PACKED_SUFFIXES = (".gz", ".mgz")
 CARET = re.compile(rb"<CaretExtension.*?</CaretExtension>", re.DOTALL)  # names of labels
 PAIR = re.compile(r"(.*)\.(hdr|img)(\.gz)?", re.IGNORECASE | re.DOTALL)
@@ -77,11 +79,7 @@ def read_nibabel(path: Path, request: Request) -> Voxels:
     header_file, voxel_file = _files_of(path)
     header, head = _header_of(header_file)
     shape = _shape_of(header)
-    _note_place(header, shape, head)
-    lengths = _units(header)
-    affine = np.array(header.get_best_affine(), dtype=np.float64)
-    affine[:3] *= 1.0 if lengths is None else lengths[:, None]
-    note_size(shape, affine, lengths)
+    affine = _affine_of(header, shape, head)
     volume_index(shape[3:], request.volume)
     bounds = request.box(shape[:3])
     data = _voxels(voxel_file, header, shape, request.volume or 0, bounds)
@@ -90,6 +88,35 @@ def read_nibabel(path: Path, request: Request) -> Voxels:
     if data.ndim == 2:
         return data, plane_affine(affine[:3, :2], affine[:3, 3])
     return data, affine
+
+
+def _affine_of(header: Any, shape: Shape, head: bytes) -> Floats:
+    _note_place(header, shape, head)
+    lengths = _units(header)
+    affine = np.array(header.get_best_affine(), dtype=np.float64)
+    affine[:3] *= 1.0 if lengths is None else lengths[:, None]
+    note_size(shape, affine, lengths)
+    return affine
+
+
+def nifti_components(path: Path) -> tuple[NDArray, Floats, Convention]:
+    """Return all volumes of a file, along the fourth axis or beyond, as components.
+
+    The standard has rows of the lower triangle in files whose intent is a symmetric matrix (1005),
+    and nowhere axes.
+    """
+    header_file, voxel_file = _files_of(path)
+    header, head = _header_of(header_file)
+    shape = _shape_of(header)
+    affine = _affine_of(header, shape, head)
+    is_matrix = (
+        isinstance(header, nibabel.Nifti1Header) and int(header["intent_code"]) == MATRIX_INTENT
+    )
+    # volumes follow one another like planes
+    planes = (*shape[:2], math.prod(shape[2:]))
+    data = _voxels(voxel_file, header, planes, 0, [(0, size) for size in planes])
+    data = data.reshape((*shape[:3], -1), order="F")
+    return data, affine, Convention(order="lower" if is_matrix else None)
 
 
 def nibabel_shape(path: Path) -> Shape:
@@ -149,6 +176,7 @@ NIFTI = Reader(
     shape=nibabel_shape,
     other_files=other_file,
     reads_crop=True,
+    components=nifti_components,
 )
 
 

@@ -12,14 +12,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tetopt.errors import InputError
+from tetopt.fields.field import Convention
 from tetopt.io.apart import read_apart
 from tetopt.io.contradictions import note_metaimage, note_nrrd, note_rest
 from tetopt.io.itk_headers import (
     LIST_KINDS,
     NRRD_SUFFIXES,
     SPACE_KINDS,
+    VoxelHeader,
     check_header,
     header_sizes,
     list_header,
@@ -39,26 +42,84 @@ ITK_READERS = {
     ".mha": "MetaImageIO",
     ".mhd": "MetaImageIO",
 }
+SURE_CONFIDENCE = 0.5  # of a tensor, in NRRD's masked ones from 0 to 1
 OTHER_READERS = {".gipl": "GiplImageIO", ".gz": "GiplImageIO", ".vtk": "VTKImageIO"}
 
 
 def read_itk(path: Path, request: Request) -> Voxels:
     """Return data and affine of a file; InputError without a leading path."""
+    header, size = _checked_header(path)
+    segments = segments_of(header.texts)
+    others = other_axes(header)
+    is_list = not segments and bool(others) and set(others.values()) <= set(LIST_KINDS)
+    data, affine = _read(path, header, size, request.volume, bool(segments), is_list)
+    return labels_of_layers(data, segments) if segments else data, affine
+
+
+def itk_components(path: Path) -> tuple[NDArray, Floats, Convention]:
+    """Return the components of a file, on an axis of NRRD or MetaImage's channels, wherever the
+    confidence of a masked tensor is a half or more, else NaN.
+
+    NRRD's measurement frame maps components to its space; without it, axes are not stated.
+    """
+    header, size = _checked_header(path)
+    others = other_axes(header)
+    turn = _measurement_turn(header.fields)
+    data, affine = _read(path, header, size, None, True, bool(others))
+    kind = next(iter(others.values()), "")
+    if kind == "3d-masked-symmetric-matrix":
+        data = np.where(data[..., :1] >= SURE_CONFIDENCE, data[..., 1:], np.nan)
+    return (
+        data,
+        affine,
+        Convention(
+            order="upper" if kind.endswith("symmetric-matrix") else None,
+            turn=turn,
+        ),
+    )
+
+
+def _measurement_turn(fields: dict[str, str]) -> Floats | None:
+    """Return the matrix from a header's measurement frame to RAS+; None if it states none."""
+    if (words := fields.get("measurementframe")) is None:
+        return None
+    space = fields.get("space", "").lower().removesuffix("-time")
+    letters = space if len(space) == 3 else "".join(word[0] for word in space.split("-"))
+    numbers = re.findall(r"[^\s(),]+", words)
+    try:
+        columns = np.array(numbers, dtype=np.float64).reshape(3, 3)
+        signs = [{"r": 1.0, "l": -1.0}[letters[0]], {"a": 1.0, "p": -1.0}[letters[1]]]
+        signs.append({"s": 1.0, "i": -1.0}[letters[2]])
+    except (ValueError, LookupError) as error:
+        raise InputError(
+            "measurement frame: expected three vectors in a space such as "
+            f'left-posterior-superior, got {words[:80]} in "{space[:40]}"'
+        ) from error
+    return columns.T * np.array(signs)[:, None]
+
+
+def _checked_header(path: Path) -> tuple[VoxelHeader, int]:
+    """Return a file's header, checked, and the number of bytes of all its files."""
     check_itk()
     header, size = check_header(path)
-    is_nrrd = path.suffix.lower() in NRRD_SUFFIXES
-    if is_nrrd:
+    if path.suffix.lower() in NRRD_SUFFIXES:
         note_nrrd(header.fields, header.sizes)
     else:
         note_metaimage(header.fields)
     if header.ratio == 1 and header.skip.isdecimal():  # neither packed nor text
         rest = size - header.n_bytes - int(header.skip) - header.value_bytes
         note_rest(rest, header.sizes, header.value_bytes // max(math.prod(header.sizes), 1))
+    return header, size
+
+
+def _read(
+    path: Path, header: VoxelHeader, size: int, volume: int | None, has_layers: bool, is_list: bool
+) -> Voxels:
+    """Return the data, with layers or components on a last axis, and the affine in mm."""
     units = [header.fields.get("DistanceUnits", "").strip("?")] * 3
+    is_nrrd = path.suffix.lower() in NRRD_SUFFIXES
     lengths = _nrrd_units(header.fields) if is_nrrd else mm_of_axes(units, "DistanceUnits")
-    segments = segments_of(header.texts)
     others = other_axes(header)
-    is_list = not segments and bool(others) and set(others.values()) <= set(LIST_KINDS)
     if is_list and len(others) > 1:
         raise InputError(f"expected one axis beside those of space, got {len(others)}")
     with tempfile.TemporaryDirectory() as folder:
@@ -69,15 +130,13 @@ def read_itk(path: Path, request: Request) -> Voxels:
         data, affine = read_apart(
             volume_of,
             source,
-            request.volume,
-            bool(segments),
+            volume,
+            has_layers,
             is_list,
             size=size,
             value_bytes=header.value_bytes,
             library="SimpleITK",
         )
-    if segments:
-        data = labels_of_layers(data, segments)
     n = len(affine) - 1
     affine[:n] *= 1.0 if lengths is None else lengths[:n, None]
     note_size(data.shape, affine, lengths)
@@ -95,6 +154,7 @@ ITK = Reader(
     read_itk,
     shape=header_sizes,
     other_files=lambda path: read_header(path).files,
+    components=itk_components,
 )
 
 
@@ -139,14 +199,14 @@ def volume_of(path: str, volume: int | None, has_layers: bool, is_list: bool) ->
                 "first"
             )
         size = reader.GetSize()
-        index = volume_index((count,) if is_list else size[3:], volume)
+        index = volume_index((count,) if is_list and not has_layers else size[3:], volume)
         if index and not is_list:
             reader.SetExtractSize([*size[:3], *(0 for _ in index)])
             reader.SetExtractIndex([0, 0, 0, *index])
         data = sitk.GetArrayFromImage(reader.Execute())
         if has_layers or is_list:  # components vary fastest
             data = np.moveaxis(data.reshape(*size[::-1], count), -1, 0)
-            data = data[index[0]] if is_list else data
+            data = data[index[0]] if is_list and not has_layers else data
         return data.T, _ras_affine(reader)
     except RuntimeError as error:
         # The innermost cause comes last; the "Reason:" after it is an unrelated errno.

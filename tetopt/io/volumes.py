@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
+from tetopt.fields.field import Convention
 from tetopt.system.arrays import Floats, Shape
 from tetopt.system.budget import check_memory
 
@@ -95,6 +96,8 @@ class Reader(NamedTuple):
     has_spacing: bool = True
     reads_crop: bool = False
     reads_slice: bool = False
+    # all components (s_0, s_1, s_2, C), the affine, and what the file states of them
+    components: Callable[[Path], tuple[NDArray, Floats, Convention]] | None = None
 
 
 def volume_index(trailing: Sequence[int], volume: int | None, axes: str = "") -> Shape:
