@@ -11,6 +11,7 @@ import tetopt
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import (
     boundary_facets,
+    cell_euler,
     components,
     facets,
     folded_groups,
@@ -144,6 +145,16 @@ def test_components_are_those_of_the_twin(seed, n):
     largest = chosen[twin == np.bincount(twin).argmax()]
     assert_array_equal(largest_component(cells, is_chosen), largest)
     assert len(largest_component(cells, np.zeros(len(cells), dtype=bool))) == 0
+
+
+@given(seeds, dimensions)
+def test_the_euler_number_of_cells_is_that_of_the_twin(seed, n):
+    """Of the open solid: what is on the boundary does not connect cells."""
+    _, cells = random_mesh(seed, n)
+    cells = cells[np.random.default_rng(seed).random(len(cells)) < 0.6]
+    if len(cells):
+        inner = naive.faces_of(cells) - naive.faces_of(boundary_facets(cells))
+        assert cell_euler(cells) == 2 * (-1) ** n * naive.euler(inner)
 
 
 @pytest.mark.parametrize("n", [2, 3])

@@ -12,7 +12,7 @@ import tetopt
 from tetopt import E_D, Image, InputError, Sizes, check_mesh, mesh_image, quality
 from tetopt.contents.noise import noise_level
 from tetopt.start import octree
-from tetopt.start.clip import lost_fraction
+from tetopt.start.clip import hole_numbers, lost_fraction
 from tetopt.start.octree import octree_mesh
 from tetopt.system import budget
 
@@ -253,6 +253,21 @@ def test_one_octree_that_loses_more_by_chance_does_not_end_the_search():
     """Of this tube, the third octree loses more than the second, the fourth next to nothing."""
     content = tube(30.0, 1.5)
     assert kept_fraction(content, octree_mesh(content, 1500)) == pytest.approx(1.0, rel=0.02)
+
+
+def test_a_wall_with_holes_too_small_to_lose_volume_has_a_finer_octree(monkeypatch):
+    """Of a sphere's wall of 5 mm, on voxels of .7 x .7 x 2 mm."""
+    spacing, shape = np.array([0.7, 0.7, 2.0]), (36, 36, 13)
+    place = (np.indices(shape).T - 0.5 * np.array(shape) + 0.5) * spacing
+    inside = np.abs(np.linalg.norm(place, axis=-1).T - 9.0) < 2.5
+    mask = Image(1.0 * inside, np.diag([*spacing, 1.0]))
+    content = tetopt.content(mask, mask=mask)
+    whole = octree_mesh(content, 200)
+    assert hole_numbers(whole, mask, content.region) == (-1, -1)
+    monkeypatch.setattr(octree, "misfit_of_holes", lambda numbers: 0)
+    torn = octree_mesh(content, 200)
+    assert lost(content, torn) < octree.MOST_LOST
+    assert hole_numbers(torn, mask, content.region) == (1, -1)
 
 
 @pytest.mark.parametrize("sigma", [0.0, 3.0])

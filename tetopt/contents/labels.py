@@ -233,6 +233,25 @@ def voxel_components(
     return n_components, tuple(map(LostComponent, *columns))
 
 
+def voxel_euler(is_label: Bools) -> int:
+    """Euler number of the closed surface of voxels that are connected by faces: 2 (components -
+    holes + cavities).
+
+    It is twice the Euler number of the enclosed solid: voxels, minus pairs that share a face, plus
+    groups of four around an edge, minus groups of eight around a corner, for 6 neighbours inside
+    and 26 outside (Kong and Rosenfeld 1989). In 2-D: pixels, minus pairs, plus groups of four.
+    """
+    n, total = is_label.ndim, 0
+    for is_joined in itertools.product((False, True), repeat=n):
+        together = is_label
+        for axis in np.flatnonzero(is_joined):
+            first, second = [slice(None)] * n, [slice(None)] * n
+            first[axis], second[axis] = slice(None, -1), slice(1, None)
+            together = together[tuple(first)] & together[tuple(second)]
+        total += (-1) ** sum(is_joined) * int(np.count_nonzero(together))
+    return 2 * total
+
+
 def component_runs(inside: Bools, is_met: Bools, *, has_corners: bool = False) -> tuple[int, Ints]:
     """Number of components of voxels that faces connect, or corners, too, and the runs of those of
     which none is met.

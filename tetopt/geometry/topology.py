@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -254,6 +255,36 @@ def components(cells: NDArray[np.integer], shared: Facets | None = None) -> Ints
     rank = np.empty(len(first), dtype=np.int64)
     rank[np.argsort(first)] = np.arange(len(first))
     return rank[inverse]
+
+
+def euler_characteristic(surface_facets: Ints) -> int:
+    """Points minus edges plus triangles of a surface (T, 3); points minus segments of a curve
+    (T, 2).
+    """
+    if len(surface_facets) == 0:
+        return 0
+    nodes, total = np.sort(surface_facets, axis=1).T, 0
+    for size in range(1, len(nodes) + 1):
+        chosen = np.array(list(combinations(range(len(nodes)), size)))
+        is_new = lexicographic_order(
+            np.column_stack([nodes[column].ravel() for column in chosen.T])
+        )[1]
+        total += (-1) ** (size - 1) * int(np.count_nonzero(is_new))
+    return total
+
+
+def cell_euler(cells: NDArray[np.integer], shared: Facets | None = None) -> int:
+    """Euler number of the closed surface of cells that are connected by facets: 2 (components -
+    holes + cavities).
+
+    It is twice the Euler number of the enclosed solid: cells, minus facets between them, plus inner
+    edges, minus inner nodes. In 2-D: cells, minus segments between them, plus inner nodes. `shared`
+    are the cells' `facets`, if known.
+    """
+    shared = facets(cells) if shared is None else shared
+    outer = euler_characteristic(boundary_facets(cells, shared))
+    inner = euler_characteristic(shared.nodes) - outer
+    return 2 * (len(cells) + (-1) ** (cells.shape[1] - 1) * inner)
 
 
 def largest_component(cells: NDArray[np.integer], is_chosen: Bools) -> Ints:

@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import combinations
 from math import ceil
 from typing import Any, NamedTuple, TypeVar, cast
 
@@ -30,6 +29,7 @@ from tetopt.contents.labels import (
     LostComponent,
     check_labels,
     voxel_components,
+    voxel_euler,
 )
 from tetopt.energy.sampling import Overlap, cell_moments, cell_of_voxel, nearest_voxels, overlap_of
 from tetopt.errors import InputError
@@ -37,7 +37,7 @@ from tetopt.geometry.check import facets_on_box, outside_fraction
 from tetopt.geometry.manifold import OUTSIDE_LABEL
 from tetopt.geometry.nearest import triangle_distances
 from tetopt.geometry.simplex import centroids, volumes
-from tetopt.geometry.topology import Facets, components, facets, lexicographic_order
+from tetopt.geometry.topology import Facets, cell_euler, components, facets
 from tetopt.image import Image, check_image, transform_vectors
 from tetopt.mesh import Mesh
 from tetopt.system.arrays import Bools, Floats, Ints, plain_array
@@ -405,12 +405,9 @@ class MaskFidelity(NamedTuple):
         Connected components of the voxels, linked by faces.
     mesh_components : int
         Connected components of the cells, linked by facets.
-    euler : int
-        Euler characteristic of the mask's half level: 2 for each closed component, minus 2 for each
-        handle.
-    mesh_euler : int
-        Euler characteristic of the mesh's boundary. Both exclude the box's faces: a disc that ends
-        there has 1.
+    euler, mesh_euler : int
+        Euler numbers of the closed surfaces of these voxels and of the cells, faces of the box
+        included: 2 (components - holes + cavities).
     lost_components : tuple of LostComponent
         Components of these voxels, none of which lies in a cell, the largest first.
 
@@ -749,7 +746,7 @@ def mask_fidelity(
     Returns
     -------
     MaskFidelity
-        Volumes, Dice, distances both ways, connected components, Euler characteristics.
+        Volumes, Dice, distances both ways, connected components, Euler numbers.
 
     Raises
     ------
@@ -798,8 +795,8 @@ def mask_fidelity(
         *_mean_and_p95(back_mm),
         n_components,
         _n_components(mesh.cells, shared if pieces is mesh else None),
-        euler_characteristic(theirs.facets),
-        euler_characteristic(ours.facets),
+        voxel_euler(is_inside),
+        cell_euler(pieces.cells, shared),
         lost,
     )
 
@@ -889,22 +886,6 @@ def evenly_spread(surface: FacetSurface, count: int, areas: Floats | None = None
     place[is_beyond] = 1.0 - place[is_beyond]
     first = points[nodes[at, 0]]
     return first + ((points[nodes[at, 1:]] - first[:, None]) * place[..., None]).sum(axis=1)
-
-
-def euler_characteristic(surface_facets: Ints) -> int:
-    """Points minus edges plus triangles of a surface (T, 3); points minus segments of a curve
-    (T, 2).
-    """
-    if len(surface_facets) == 0:
-        return 0
-    nodes, total = np.sort(surface_facets, axis=1).T, 0
-    for size in range(1, len(nodes) + 1):
-        chosen = np.array(list(combinations(range(len(nodes)), size)))
-        is_new = lexicographic_order(
-            np.column_stack([nodes[column].ravel() for column in chosen.T])
-        )[1]
-        total += (-1) ** (size - 1) * int(np.count_nonzero(is_new))
-    return total
 
 
 @dataclass(frozen=True, eq=False)

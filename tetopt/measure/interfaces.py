@@ -14,13 +14,12 @@ closes only in an edge or a node has no hole.
 
 from __future__ import annotations
 
-from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tetopt.contents.labels import component_runs
+from tetopt.contents.labels import component_runs, voxel_euler
 from tetopt.geometry.manifold import (
     LabelSurfaces,
     Ridges,
@@ -252,24 +251,6 @@ def _node_sums(vectors: NDArray, nodes: NDArray, n_nodes: int) -> NDArray:
             for axis in range(3):
                 sums[nodes[t, k], axis] += vectors[t, axis]
     return sums
-
-
-def voxel_euler(is_label: Bools) -> int:
-    """Euler number of the closed surface of voxels that are connected by faces.
-
-    It is twice the Euler number of the enclosed solid: voxels, minus pairs that share a face, plus
-    groups of four around an edge, minus groups of eight around a corner, for 6 neighbours inside
-    and 26 outside (Kong and Rosenfeld 1989). In 2-D: pixels, minus pairs, plus groups of four.
-    """
-    n, total = is_label.ndim, 0
-    for is_joined in product((False, True), repeat=n):
-        together = is_label
-        for axis in np.flatnonzero(is_joined):
-            first, second = [slice(None)] * n, [slice(None)] * n
-            first[axis], second[axis] = slice(None, -1), slice(1, None)
-            together = together[tuple(first)] & together[tuple(second)]
-        total += (-1) ** sum(is_joined) * int(np.count_nonzero(together))
-    return 2 * total
 
 
 def voxel_cavities(is_label: Bools) -> int:

@@ -24,7 +24,6 @@ from tetopt.contents.labels import (
     BACKGROUND_LABEL,
     COMPONENT_VOXELS,
     LostComponent,
-    component_runs,
     voxel_components,
 )
 from tetopt.contents.memberships import supersampling
@@ -33,18 +32,17 @@ from tetopt.energy.sampling import cell_of_voxel
 from tetopt.errors import InputError, warn
 from tetopt.geometry.check import BOX_ROUNDING_VOXELS, beyond_box, manifold_problems
 from tetopt.geometry.manifold import OUTSIDE_LABEL
-from tetopt.geometry.simplex import dihedral_angles, edge_pairs, regular_edge, squared_edges
-from tetopt.geometry.topology import boundary_facets, components, facets
+from tetopt.geometry.simplex import dihedral_angles, edge_pairs, squared_edges
+from tetopt.geometry.topology import components
 from tetopt.image import Image, transform_vectors
 from tetopt.measure.fidelity import (
     LEAST_CELLS,
     LabelFidelity,
     OwnedVoxels,
-    euler_characteristic,
     label_extents,
 )
-from tetopt.measure.interfaces import voxel_euler
 from tetopt.mesh import Mesh
+from tetopt.start.clip import hole_numbers, misfit_of_holes
 from tetopt.system.arrays import Bools, Floats, Ints
 
 # least Dice of a mesh with its mask, below which cells are too large for the mask's detail
@@ -169,7 +167,7 @@ def measure(
             "overlap": lambda: n_voxels - int((straight() >= 0).sum()),
             "mask": lambda: _dice(owner() >= 0, inside),
             "components": lambda: _mask_components(content, inside, mesh, owner()),
-            "euler": lambda: _euler_numbers(content, inside, mesh, owner()),
+            "euler": lambda: hole_numbers(mesh, content.image, region),
         }
     elif is_filled or initial is not None:
         measures["cover"] = lambda: _cover(
@@ -204,8 +202,8 @@ def judge(rows: dict[str, Any], required: Requirements) -> dict[str, str]:
     image's box. `cover`: voxels or volume lost or gained. Within a mask, instead of the last,
     `overlap`: voxels that lie in two cells; `mask`: a Dice with the mask below 0.9; `components`:
     more connected components than the mask, or components of the mask, or parts far from any cell,
-    of 50 voxels or more without a cell; and `euler`: more or fewer holes or cavities than the mask
-    has with and without details smaller than cells. `manifold`: edges or nodes at which the
+    of 50 voxels or more without a cell; and `euler`: holes minus cavities other than those of the
+    mask with and without details smaller than cells. `manifold`: edges or nodes at which the
     boundary, within a mask or of the user's own mesh, or the interface of two labels is not a
     manifold. `labels`: labels of 200 voxels or more without a cell at one of them, or with
     0.6 to 1.5 times their volume exceeded, or components of 50 voxels or more without a cell; not
@@ -295,13 +293,13 @@ def _say_components(parts: MaskComponents, required: Requirements) -> str:
 
 def _say_euler(numbers: tuple[int, ...], required: Requirements) -> str:
     ours, *others = numbers
-    span = f"{min(others)} to {max(others)}, with and without details smaller than cells"
+    span = f"{min(others)} to {max(others)} with and without details smaller than cells"
     words = (
-        f"the mesh's surface has an Euler number of {ours}, that of the {required.region} is "
+        f"the mesh has {ours} holes minus cavities, the {required.region} "
         f"{span if len({*others}) > 1 else others[0]}: holes are torn or lost, or cavities; "
         f"{required.remedy}"
     )
-    return "" if min(others) <= ours <= max(others) else words
+    return words if misfit_of_holes(numbers) else ""
 
 
 def _say_manifold(problems: tuple[list[str], list[str], bool], required: Requirements) -> str:
@@ -460,41 +458,6 @@ def _mask_components(
     n_mask, lost = voxel_components(inside, is_met, affine)
     bare = _bare_parts(mesh, inside & ~is_met, affine)
     return MaskComponents(n_mask, tuple(n_cells.tolist()), lost, bare)
-
-
-def _euler_numbers(
-    content: Content, inside: Bools, mesh: Mesh, owner: NDArray[np.integer]
-) -> tuple[int, ...]:
-    """Euler numbers of the closed surfaces of a mesh, of the components of its mask that have a
-    cell and, if they differ, of these without details smaller than cells.
-
-    Cells that share no facet are apart, like voxels (`tetopt.measure.interfaces.voxel_euler`).
-    Each number is that of as many components as the mask has: closing may join two, and opening
-    part one.
-    """
-    planes, image = _own_voxels(content)[0], content.given
-    inside = inside[planes].copy()
-    rows = inside.reshape(-1, inside.shape[-1])
-    n_parts, lost = component_runs(inside, owner[planes] >= 0)
-    for _, row, begin, end in lost:
-        rows[row, begin:end] = False
-    n_parts -= len(np.unique(lost[:, 0]))
-    shared = facets(mesh.cells)
-    outer = boundary_facets(mesh.cells, shared)
-    inner = euler_characteristic(shared.nodes) - euler_characteristic(outer)
-    n_more = n_parts - 1 - int(components(mesh.cells).max())
-    ours = 2 * (len(mesh.cells) + (-1) ** mesh.ndim * inner + n_more)
-    if ours == (own := voxel_euler(inside)):
-        return ours, own
-    reach = 0.5 * regular_edge(mesh.cell_volumes.mean(), mesh.ndim) / image.spacing
-    size, voxels = 1 + 2 * np.rint(np.maximum(reach, 1.0)).astype(int), inside.view(np.uint8)
-    closed = scipy.ndimage.grey_closing(voxels, size)
-    opened = (scipy.ndimage.grey_opening(each, size) for each in (voxels, closed))
-
-    def euler(each: NDArray[np.uint8]) -> int:
-        return voxel_euler(each > 0) + 2 * (n_parts - int(scipy.ndimage.label(each)[1]))
-
-    return ours, own, *(euler(each) for each in (closed, *opened))
 
 
 def _bare_parts(mesh: Mesh, is_bare: Bools, affine: Floats) -> tuple[LostComponent, ...]:

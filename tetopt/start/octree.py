@@ -32,7 +32,8 @@ from tetopt.contents.smoothing import largest_around
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.start.clip import clip_cells, lost_fraction
+from tetopt.start.carve import carve_mesh, part_of
+from tetopt.start.clip import clip_cells, hole_numbers, lost_fraction, misfit_of_holes
 from tetopt.start.lattice import MAX_NODES, near_cubes
 from tetopt.start.leaves import leaf_cells, leaf_nodes
 from tetopt.start.sizes import (
@@ -324,15 +325,15 @@ def _octree_within(
 ) -> Mesh:
     """The octree within the limits with the nearest number of nodes, clipped at the mask's surface.
 
-    Where that would lose walls thinner than its cells, it has more nodes, if these keep them or
-    lose at most half as much; exchanges remove nodes.
+    Where that would lose walls thinner than its cells, or tear holes into them, it has more nodes,
+    if these keep them or lose, or tear, at most half as much; exchanges remove nodes.
     """
     if content.region is None:
         return _octree_of_box(content, nodes, limits)
     tried = _finer_octrees(content, nodes, limits, content.region, is_over)
     first = next(tried)
-    least = min(tried, key=lambda octree: octree.lost, default=first)
-    return (least if least.lost <= max(MOST_LOST, LESS_LOST * first.lost) else first).mesh
+    best = min(tried, key=lambda octree: octree.faults, default=first)
+    return (best if best.is_worth(first) else first).mesh
 
 
 class _Tried(NamedTuple):
@@ -340,6 +341,17 @@ class _Tried(NamedTuple):
 
     mesh: Mesh
     lost: float  # fraction of the mask's volume
+    n_torn: int  # `misfit_of_holes`
+
+    @property
+    def faults(self) -> tuple[float, int]:
+        """What a finer octree may have less of."""
+        return self.lost if self.lost > MOST_LOST else 0.0, self.n_torn
+
+    def is_worth(self, first: _Tried) -> bool:
+        """True if it has so much less of the faults of the first that it is worth its nodes."""
+        is_kept = self.lost <= max(MOST_LOST, LESS_LOST * first.lost)
+        return is_kept and (first.lost > MOST_LOST or self.n_torn <= LESS_LOST * first.n_torn)
 
 
 def _finer_octrees(
@@ -349,12 +361,12 @@ def _finer_octrees(
     region: Region,
     is_over: Callable[[], bool],
 ) -> Iterator[_Tried]:
-    """Octrees of ever more nodes, while they lose walls, but less than all before, until `is_over`
-    returns True.
+    """Octrees of ever more nodes, while they lose or tear walls, but less than all before, until
+    `is_over` returns True.
     """
     # The leaves that the region touches have about as many nodes, to a few per cent, as the clipped
     # mesh.
-    limits, least, n_stalled = _lighter(content, nodes, limits), np.inf, 0
+    limits, least, n_stalled = _lighter(content, nodes, limits), (np.inf, np.inf), 0
     for step in range(FINER_STEPS + 1):
         ratio = FINER_RATIO**step
         largest = max(limits.largest / ratio ** (1.0 / content.image.ndim), limits.smallest)
@@ -368,11 +380,17 @@ def _finer_octrees(
             if step == 0:
                 raise
             return
-        lost = lost_fraction(mesh, content.image, region)
-        yield _Tried(mesh, lost)
-        n_stalled = n_stalled + 1 if STALLED_FRACTION * least < lost < SMALL_LOSS else 0
-        least = min(least, lost)
-        if lost <= MOST_LOST or n_stalled == STALLED_STEPS or is_over():
+        kept = carve_mesh(
+            mesh, content.image, region, content.keeps_components, content.memberships
+        )
+        numbers = hole_numbers(part_of(mesh, kept.is_kept), content.image, region)
+        octree = _Tried(mesh, lost_fraction(mesh, content.image, region), misfit_of_holes(numbers))
+        yield octree
+        lost, n_torn = octree.faults
+        is_stalled = STALLED_FRACTION * least[0] <= lost < SMALL_LOSS and n_torn >= least[1]
+        n_stalled = n_stalled + 1 if is_stalled else 0
+        least = min(least[0], lost), min(least[1], n_torn)
+        if octree.faults == (0.0, 0) or n_stalled == STALLED_STEPS or is_over():
             return
 
 
