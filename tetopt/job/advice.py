@@ -429,7 +429,7 @@ def of_empty(
 
     `is_free` is True if the number of nodes can be chosen; `is_masked` if a mask determines the
     domain, so that the image may be of no importance, and fewer nodes are no remedy; `has_moduli`
-    if moduli come from the image.
+    if moduli come from the image's voxels.
     """
     n_cells = len(result.mesh.cells)
     if n_empty <= EMPTY_FRACTION * n_cells:
@@ -444,7 +444,9 @@ def of_empty(
         f"and take the nearest voxel's value{more}"
     )
     is_helped = is_free and not is_masked and not is_thick
-    yield Problem(words, "reduce `nodes`", wants="larger") if is_helped else Problem(words)
+    remedies = ["reduce `nodes`"] * is_helped
+    remedies += ["take the image linear between voxels (`average` linear)"] * has_moduli
+    yield Problem(words, " or ".join(remedies), wants="larger" if is_helped else None)
 
 
 def tell_label_sizes(sizes: SizesByLabel) -> None:

@@ -59,7 +59,8 @@ AVERAGE_OPTION = Option(
     "WORD",
     "Average of a cell's voxel moduli: mean (the paper's), geometric, harmonic, power:P, hill "
     "(between mean and harmonic); or gauss (one per Gauss point of quadratic cells), nodes "
-    f"(linear between nodes) (default {DEFAULT_AVERAGE}).",
+    "(linear between nodes), linear (mean of the image linear between voxels, for cells smaller "
+    f"than these) (default {DEFAULT_AVERAGE}).",
 )
 LabelNamesOption = Annotated[
     Path | None,

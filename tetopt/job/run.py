@@ -211,7 +211,7 @@ def _problems(result: Result, failed: dict[str, str]) -> list[Problem]:
     is_free = mode != "start" and (is_most or task.source.labels is None)
     is_free &= measured.get("nodes_of_sizes", 0) <= n_nodes
     mapping = None if job.young is None else parse_any_mapping(job.young)
-    has_moduli = callable(mapping) or isinstance(mapping, list)
+    has_moduli = (callable(mapping) or isinstance(mapping, list)) and job.average != "linear"
     is_masked = task.source.mask is not None
     empty = list(of_empty(outcome.result, is_free, n_empty, spacing, is_masked, has_moduli))
     problems = [*empty, *problems] if is_most else problems

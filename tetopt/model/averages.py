@@ -333,10 +333,9 @@ def _linear_means(image: Images, mesh: Mesh, mapped: Callable[[Floats | Named], 
             corners = mesh.points[mesh.cells[part]]
             points = np.einsum("qa,cad->cqd", places, corners).reshape(-1, mesh.ndim)
             values = {name: linear_values(each, points) for name, each in images.items()}
-            found = mapped(values[""] if isinstance(image, Image) else values)
-            found = found.reshape(len(part), len(places))
-            low, high = found.min(axis=1), found.max(axis=1)
-            means[part] = np.clip(found.mean(axis=1), low, high)
+            rows = mapped(values[""] if isinstance(image, Image) else values)
+            rows = rows.reshape(len(part), len(places))
+            means[part] = np.clip(rows.mean(axis=1), rows.min(axis=1), rows.max(axis=1))
     return means
 
 

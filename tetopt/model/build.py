@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tetopt.contents.align import resample_mask
+from tetopt.contents.align import is_in_mask
 from tetopt.contents.content import Content, continue_image
-from tetopt.contents.domain import INSIDE_FRACTION, mask_text
+from tetopt.contents.domain import mask_text
 from tetopt.energy.sampling import cell_of_voxel, mask_of_values
 from tetopt.engine.loop import MeshingResult
 from tetopt.errors import InputError, Note, prefix_errors, warn
@@ -471,7 +471,7 @@ def _whole_field(name: str, field: Image, mesh: Mesh, mask: Image | None) -> Ima
                 "(NaN) and take the nearest one's"
             )
     if mask is not None:
-        has_value &= resample_mask(mask, field, OWN_MASK).data >= INSIDE_FRACTION
+        has_value &= is_in_mask(mask, field, OWN_MASK)
     return field if has_value.all() else continue_image(field, Image(has_value, field.affine))
 
 
