@@ -224,7 +224,8 @@ def whole():
         ({"cover": Cover("its initial domain", -1, 1.0, 1.0, 3, 1e-6)}, {}, "domain: -1 voxels"),
         ({"cover": Cover("the image", 0, 1.0, 1.0, 3, 1e-9)}, {}, None),
         ({"overlap": 2}, {}, "2 voxels lie in two cells"),
-        ({"mask": 0.5}, {"region": "brain"}, "the brain overlap .* 0.500"),
+        ({"mask": 0.5}, {"region": "brain"}, "the brain overlap .* 0.500: cells .*more nodes$"),
+        ({"mask": 0.09}, {}, "0.090: the mesh is of another mask, .*; use the mask"),
         (
             {"components": MaskComponents(1, (9, 2), (), ())},
             {},
@@ -251,6 +252,12 @@ def test_words_on_a_violated_requirement(rows, required, words):
     else:
         assert list(found) == list(rows)
         assert re.search(words, *found.values())
+
+
+def test_of_another_mask_only_that_is_told():
+    rows = {"components": MaskComponents(1, (9, 2), (), ()), "euler": (9, 1)}
+    assert list(judge(rows | {"mask": 0.6}, Requirements())) == ["mask", *rows]
+    assert list(judge(rows | {"mask": 0.0}, Requirements())) == ["mask"]
 
 
 def test_the_box_and_the_cover(whole):

@@ -47,6 +47,8 @@ from tetopt.system.arrays import Bools, Floats, Ints
 
 # least Dice of a mesh with its mask, below which cells are too large for the mask's detail
 MASK_DICE = 0.9
+# below it, the mesh is of another mask: one that loses nearly all of a wall has .2 or more; chosen
+OTHER_DICE = 0.1
 # a label with as many voxels must have cells that contain some, of about their volume
 LABEL_VOXELS = 200
 LARGE_COMPONENTS = f"of {COMPONENT_VOXELS} voxels or more"
@@ -200,7 +202,8 @@ def judge(rows: dict[str, Any], required: Requirements) -> dict[str, str]:
 
     `min_dihedral`: tetrahedra with a smaller dihedral angle. `box`: nodes beyond the
     image's box. `cover`: voxels or volume lost or gained. Within a mask, instead of the last,
-    `overlap`: voxels that lie in two cells; `mask`: a Dice with the mask below 0.9; `components`:
+    `overlap`: voxels that lie in two cells; `mask`: a Dice with the mask below 0.9; below 0.1 the
+    mesh is of another mask, and the next two, and `labels`, are not judged; `components`:
     more connected components than the mask, or components of the mask, or parts far from any cell,
     of 50 voxels or more without a cell; and `euler`: holes minus cavities other than those of the
     mask with and without details smaller than cells. `manifold`: edges or nodes at which the
@@ -212,8 +215,10 @@ def judge(rows: dict[str, Any], required: Requirements) -> dict[str, str]:
     with the reason.
     """
     violated = {}
+    dice = rows.get("mask")
+    is_other = isinstance(dice, float) and dice < OTHER_DICE
     for name, say in SENTENCES.items():
-        if name not in rows:
+        if name not in rows or (is_other and name in OF_MASK):
             continue
         words = (
             f"{name} could not be checked: {type(rows[name]).__name__} {rows[name]}".rstrip()
@@ -265,11 +270,14 @@ def _say_overlap(twice: int, _: Requirements) -> str:
 
 
 def _say_mask(dice: float, required: Requirements) -> str:
-    words = (
-        f"the mesh and the {required.region} overlap with a Dice of only {dice:.3f}: cells are too "
-        f"large for the {required.region}'s detail; {required.remedy}"
-    )
-    return words if dice < MASK_DICE else ""
+    word, rest = required.region, f"; {required.remedy}"
+    words = f"the mesh and the {word} overlap with a Dice of only {dice:.3f}: "
+    if dice < OTHER_DICE:
+        rest = f", or of a part of it; use the {word} that it was built within"
+        words += f"the mesh is of another {word}"
+    else:
+        words += f"cells are too large for the {word}'s detail"
+    return words + rest if dice < MASK_DICE else ""
 
 
 def _say_components(parts: MaskComponents, required: Requirements) -> str:
@@ -416,6 +424,9 @@ SENTENCES: dict[str, Callable[[Any, Requirements], str]] = {
     "labels": _say_labels,
     "error": _say_error,
 }
+
+
+OF_MASK = {"components", "euler", "labels"}  # requirements that have no meaning in another mask
 
 
 def nodes_ratio(fraction: float, target_error: float, rate: float = ERROR_RATE) -> float:
