@@ -10,7 +10,7 @@ from shapes import distance
 
 from tetopt.contents import thickness as thickness_module
 from tetopt.contents.memberships import finer, memberships, supersampling
-from tetopt.contents.thickness import _cosine, _Labels, local_thickness, thickness_at
+from tetopt.contents.thickness import _chords, _cosine, _Labels, local_thickness, rows_within
 from tetopt.image import Image
 
 MOST = 12.0
@@ -18,7 +18,8 @@ MOST = 12.0
 
 def thickness_of(data, spacing=(1.0, 1.0, 1.0), inside=None):
     image = Image(data.astype(float), np.diag([*spacing[: data.ndim], 1.0]))
-    return local_thickness(memberships(image), image.spacing, MOST, inside)
+    members = memberships(image)
+    return local_thickness(rows_within(members.partition, inside), members, image.spacing, MOST)
 
 
 @pytest.mark.parametrize("size", [1.5, 2.0, 3.0, 5.0])
@@ -72,20 +73,18 @@ def test_a_way_that_leaves_the_grid_or_the_region_has_no_angle(step, expected):
 @pytest.mark.parametrize(
     ("shape", "spacing"), [((14, 12, 13), (1.0, 1.0, 1.0)), ((10, 9, 12), (1.0, 1.2, 2.0))]
 )
-def test_chords_at_the_sides_of_the_grid_are_the_shortest_that_end_inside(
-    shape, spacing, monkeypatch
-):
+def test_chords_at_the_sides_of_the_grid_are_the_shortest_that_end_inside(shape, spacing):
     """A way that leaves the grid ends no chord: with its bound in place of it, rounding once
     made it the shortest.
     """
     field = gaussian_filter(np.random.default_rng(1).normal(size=(3, *shape)), (0.0, 1.5, 1.5, 1.5))
     members = memberships(Image(field.argmax(axis=0).astype(float), np.diag([*spacing, 1.0])))
-    steps, ways, edges = thickness_module._rays(np.array(spacing))
-    lengths = ways[:, 1]
+    rays = thickness_module._rays(np.array(spacing), 8.0)
+    steps, lengths = rays[0], rays[1][:, 1]
     partition, nothing = members.partition.astype(np.int16), np.empty((0,) * 4, np.uint16)
     labels = _Labels(partition, members.levels, members.channel, nothing)
-    monkeypatch.setattr(thickness_module, "_spread_balls", lambda *_: None)
-    chords = local_thickness(members, np.array(spacing), 8.0)
+    chords, best, is_middle = _chords(labels, rays, 8.0, 0, (0, shape[0]))
+    assert 0 < is_middle.sum() < (best >= 0).sum() < best.size
     for place in np.ndindex(shape):
         ways = [
             sum(_walk(members, place, sign * step, length) for sign in (1, -1))
@@ -93,11 +92,7 @@ def test_chords_at_the_sides_of_the_grid_are_the_shortest_that_end_inside(
         ]
         d = int(np.argmin(ways))
         size = ways[d]
-        if size < 8.0:
-            size *= 0.5 * sum(
-                _cosine(labels, place, (number, tuple(way.tolist())), lengths[d], edges)
-                for number, way in ((d, steps[d]), (-1 - d, -steps[d]))
-            )
+        assert best[place] == (d if size < 8.0 else -1)
         assert chords[place] == pytest.approx(min(size, 8.0), abs=1e-5)
 
 
@@ -105,24 +100,35 @@ def test_chords_at_the_sides_of_the_grid_are_the_shortest_that_end_inside(
     ("shape", "spacing"),
     [((40, 31, 26), (1.0, 1.0, 1.0)), ((18, 19, 22), (1.0, 1.2, 1.9)), ((90, 41), (0.8, 1.1))],
 )
-def test_at_some_voxels_it_is_that_of_the_whole_grid(shape, spacing, monkeypatch):
-    """To the last bit, whichever they are, on any number of threads."""
+def test_it_is_the_same_in_slabs_and_in_a_wider_grid(shape, spacing, monkeypatch):
+    """To the last bit, on any number of threads; far from other labels it is the limit."""
     rng, n = np.random.default_rng(3), len(shape)
     field = gaussian_filter(rng.normal(size=(4, *shape)), (0.0, *[3.0] * n))
-    image, inside = Image(field.argmax(axis=0).astype(float)), rng.random(shape) < 0.999
-    members, spacing = memberships(image), np.array(spacing)
-    whole = local_thickness(members, spacing, 6.0, inside)
+    labels = np.pad(field[(slice(None), *[slice(3, -3)] * n)].argmax(axis=0), 3)
+    inside, spacing = rng.random(shape) < 0.999, np.array(spacing)
+    members = memberships(Image(labels.astype(float)))
+    rows = rows_within(members.partition, inside)
+    whole = local_thickness(rows, members, spacing, 6.0)
     assert len(np.unique(whole)) > 100
-    places = rng.permutation(whole.size)[: whole.size // 2]
-    rows = np.where(inside, members.partition, -1)
+    monkeypatch.setattr(thickness_module, "SLAB_PLANES", 2)
     for n_threads in (1, 3):
         monkeypatch.setattr(numba, "get_num_threads", lambda n_threads=n_threads: n_threads)
-        found = thickness_at(places, rows, members, spacing, 6.0)
-        np.testing.assert_array_equal(found, whole.ravel()[places])
+        np.testing.assert_array_equal(local_thickness(rows, members, spacing, 6.0), whole)
+    wider = members._replace(
+        levels=np.pad(members.levels, [(0, 0), *[(9, 9)] * n], mode="edge"),
+        partition=np.pad(members.partition, 9),
+    )
+    wide_rows = np.pad(rows, 9)
+    wide_rows[(0,) * n] = 1  # far away, so that no part of the grid is left out
+    around = local_thickness(wide_rows, wider, spacing, 6.0)
+    own = (slice(9, -9),) * n
+    np.testing.assert_array_equal(around[own][whole < 5.9], whole[whole < 5.9])
+    around[own] = 6.0
+    assert (around == 6.0).mean() > 0.95
 
 
 def _walk(members, place, step, length):
-    """The plain twin of `_way`: infinite if the grid ends."""
+    """Distance to the surface along steps: infinite if the grid ends."""
     here, way = np.array(place), 0.0
     while (here + step >= 0).all() and (here + step < members.partition.shape).all():
         own, other = members.partition[tuple(here)], members.partition[tuple(here + step)]
@@ -150,5 +156,6 @@ def test_divided_slices():
     thick_slices = Image(is_slab.astype(float), np.diag([1.0, 1.0, 5.0, 1.0]))
     factors = supersampling(thick_slices.spacing)
     fine = finer(thick_slices, factors)
-    thickness = local_thickness(memberships(thick_slices, factors), fine.spacing, MOST)
+    members = memberships(thick_slices, factors)
+    thickness = local_thickness(members.partition, members, fine.spacing, MOST)
     assert np.median(thickness[fine.data == 1.0]) == pytest.approx(6.0, abs=0.1)

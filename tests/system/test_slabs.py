@@ -46,7 +46,7 @@ def results(shape, factors):
         cell_of_voxel(image, mesh),
         moments.mean,
         *ranges,
-        local_thickness(what.memberships, labels.spacing, 9.0),
+        local_thickness(what.memberships.partition, what.memberships, labels.spacing, 9.0),
         result.mesh.points,
         result.labels,
     ]

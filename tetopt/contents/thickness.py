@@ -11,12 +11,12 @@ label's level becomes as small; between facets, it ends where it crosses one.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 from math import prod
 from typing import NamedTuple
 
 import numba
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from tetopt.contents.memberships import Memberships
@@ -28,19 +28,19 @@ from tetopt.system.slabs import over_slabs
 
 # percentiles over a label's voxels that describe its thickness
 THICKNESS_PERCENTILES = (5.0, 50.0, 95.0)
-THICKNESS_BYTES = 19.0  # per voxel: chords, thickness, the labels, and the labels within a region
-BOUND_BYTES = 8.0  # per voxel: limits of balls, and the labels
-STEP_BYTES, CROSSING_BYTES = 1.0, 2.0  # per direction, and voxel of the slabs in work
+THICKNESS_BYTES = 8.0  # per voxel: thickness, the labels, and the labels within a region
+# per voxel of the slabs in work: chords, their directions and middles; crossings, per direction
+SLAB_BYTES, CROSSING_BYTES = 10.0, 2.0
 BEYOND_REGION = -1  # stands for a label beyond the region
 NO_CROSSING = 2**16 - 1  # marks a step that no facet crosses
 COSINE_STEPS = 256  # steps of a cosine; a crossing is a multiple of as many steps
-# planes of a slab, at least: crossings and steps are counted in those around it, too
+# planes of a slab, at least: runs are followed, and crossings counted, in those around it, too
 SLAB_PLANES = 80
-MOST_STEPS = 255  # counted steps within a label
+GRADIENT_VOXELS = 2  # beyond a voxel of another label: a voxel next to it, and one next to that
+NO_RUN = -1  # a run that begins beyond the grid or the reach of chords
 # between the shortest chord and a normal; smaller at creases, which have no normal
 LEAST_COSINE = 0.75
 BESIDE_FRACTION = 1e-9  # of a triangle's size: places this little outside count as inside
-ABOVE_LIMIT = 1.0 + 1e-9  # times an upper limit of a chord: above it, however rounded
 # largest difference of the two ways along the shortest chord through a middle
 OFF_MIDDLE_STEPS = 1.01
 
@@ -58,72 +58,18 @@ class _Labels(NamedTuple):
 
 
 def local_thickness(
-    members: Memberships,
-    spacing: Floats,
-    most: float,
-    inside: Bools | None = None,
-) -> NDArray[np.float32]:
-    """The local thickness of each voxel's label.
-
-    Parameters
-    ----------
-    members : Memberships
-        Levels of K labels on a grid.
-    spacing : (n,) float64
-        Edges of its voxels, mm.
-    most : float
-        Upper limit of the thickness, mm; larger values are clipped.
-    inside : (*shape) bool, optional
-        The region of the labels; its surface ends them.
-
-    Returns
-    -------
-    (*shape) float32
-        mm; 0 beyond the region.
-
-    Raises
-    ------
-    InputError
-        Not enough memory for it.
-    """
-    _check_room(members.partition.shape, THICKNESS_BYTES, STEP_BYTES, spacing, 0.0)
-    partition = (
-        members.partition if inside is None else np.where(inside, members.partition, BEYOND_REGION)
-    )
-    labels, rays, whole = _labels_of(partition, members), _rays(spacing), _in_space(partition)
-    chord, is_middle = np.zeros(whole, dtype=np.float32), np.zeros(whole, dtype=np.bool_)
-    reach, n = int(most / rays[1][:, 1].min()) + 1, partition.ndim
-    n_slabs = max(whole[3 - n] // SLAB_PLANES, numba.get_num_threads())
-    _over_slabs(
-        lambda slab: _fill_chords(chord, is_middle, labels, rays, most, reach, slab),
-        whole,
-        n,
-        n_slabs,
-    )
-    thickness = chord.copy()
-    _over_slabs(
-        lambda slab: _spread_balls(thickness, chord, is_middle, labels.partition, rays[2], slab),
-        whole,
-        n,
-    )
-    return thickness.reshape(partition.shape)
-
-
-def thickness_at(
-    places: Ints,
     partition: NDArray[np.integer],
     surfaces: Memberships | Floats,
     spacing: Floats,
     most: float,
 ) -> NDArray[np.float32]:
-    """Local thickness of labels at some voxels, the same as that of all.
+    """The local thickness of each voxel's label.
 
     Parameters
     ----------
-    places : (K,) int
-        Indices of the voxels, flat.
     partition : (s_0, ..., s_{n-1}) array of int
-        Label of each voxel's centre, any whole number from 0; -1 beyond the region.
+        Label of each voxel's centre, any whole number from 0; -1 beyond the region, whose surface
+        ends labels.
     surfaces : Memberships or (F, n, n) float64
         Levels of the labels on this grid; or facets, such as those of a mesh: the nodes of each
         between two labels, mm from the centre of the first voxel, along the grid's axes.
@@ -134,7 +80,7 @@ def thickness_at(
 
     Returns
     -------
-    (K,) float32
+    (s_0, ..., s_{n-1}) float32
         mm; 0 beyond the region.
 
     Raises
@@ -142,49 +88,55 @@ def thickness_at(
     InputError
         Not enough memory.
     """
-    n, axis, rays, whole = partition.ndim, 3 - partition.ndim, _rays(spacing), _in_space(partition)
-    at = np.stack(np.unravel_index(places, whole), axis=1)
+    n, axis, rays = partition.ndim, 3 - partition.ndim, _rays(spacing, most)
     # a ball's centre is as far away as its radius, and its chords end as far away as its size
-    beyond = 1.5 * most
-    reach = int(beyond / float(min(spacing))) + 1
+    radius = int(0.5 * most / float(min(spacing))) + 1
+    reach = radius + rays[1].shape[1]
     levels, corners = (surfaces, None) if isinstance(surfaces, Memberships) else (None, surfaces)
-    of_step = CROSSING_BYTES if levels is None else 0.0
-    _check_room(partition.shape, BOUND_BYTES, of_step, spacing, beyond)
+    _check_room(partition.shape, reach, 0 if levels is not None else len(rays[0]))
     corners = _in_planes(corners) if corners is not None and n == 2 else corners
-    labels = _labels_of(partition, levels)
-    balls, sizes = _ball_offsets(rays[2], most, axis), np.zeros(len(at), dtype=np.float32)
+    rows = partition.reshape((1,) * axis + partition.shape)
+    thickness = np.full(rows.shape, 0.0 if rows.flat[0] < 0 else most, dtype=np.float32)
+    # No chord lies beyond the box of all labels but that in the corner; gradients look as far.
+    box = tuple(
+        slice(max(side.start - GRADIENT_VOXELS, 0), min(side.stop + GRADIENT_VOXELS, size))
+        for found in scipy.ndimage.find_objects((rows != rows.flat[0]).view(np.int8))
+        for side, size in zip(found, rows.shape, strict=True)
+    )
 
-    def fill(slab: tuple[tuple[int, int], ...]) -> None:
-        first, stop = slab[axis]
-        ends = max(first - reach, 0), min(stop + reach, whole[axis])
-        around = (slice(None),) * axis + (slice(*ends),)
-        near = labels._replace(partition=labels.partition[around])
-        if corners is None:
-            near = near._replace(levels=near.levels[:, *around])
-        else:  # 26 bytes a voxel
+    def fill(first: int, stop: int) -> None:
+        ends = max(first - reach, 0), min(stop + reach, n_planes)
+        begin = box[axis].start
+        around = (*box[:axis], slice(begin + ends[0], begin + ends[1]), *box[axis + 1 :])
+        near = _Labels(
+            np.ascontiguousarray(rows[around], dtype=np.int16),
+            np.zeros((1, 1, 1, 1), np.float32)
+            if levels is None
+            else np.ascontiguousarray(levels.levels.reshape(-1, *rows.shape)[:, *around]),
+            np.zeros(1, dtype=np.int64) if levels is None else levels.channel,
+            np.zeros((0, 1, 1, 1), np.uint16),
+        )
+        if corners is not None:  # 26 bytes a voxel
             crossing = np.full((len(rays[0]), *near.partition.shape), NO_CROSSING, np.uint16)
-            _fill_crossings(crossing, corners, rays[0] * rays[2], rays[2], ends, axis)
+            origin = np.array([side.start for side in around])
+            _fill_crossings(crossing, corners, rays[0] * rays[2], rays[2], origin)
             near = near._replace(crossing=crossing)
-        own = (first <= at[:, axis]) & (at[:, axis] < stop)
-        index = at[own]
-        index[:, axis] -= ends[0]
-        bound = np.full(near.partition.shape, np.inf, dtype=np.float32)
-        sizes[own] = _thickness_near(index, near, rays, balls, most, bound)
+        slab = first - ends[0], stop - ends[0]
+        wide = max(slab[0] - radius, 0), min(slab[1] + radius, ends[1] - ends[0])
+        found = _thickness(_chords(near, rays, most, axis, wide), near, rays, (axis, *slab))
+        own = (*box[:axis], slice(begin + first, begin + stop), *box[axis + 1 :])
+        thickness[own] = found[(slice(None),) * axis + (slice(*slab),)]
 
-    _over_slabs(fill, whole, n, max(whole[axis] // SLAB_PLANES, numba.get_num_threads()))
-    return sizes
+    if box:
+        n_planes = box[axis].stop - box[axis].start
+        n_slabs = max(n_planes // SLAB_PLANES, numba.get_num_threads())
+        over_slabs(fill, n_planes, thickness.size, n_slabs)
+    return thickness.reshape(partition.shape)
 
 
-def _ball_offsets(edges: Floats, most: float, axis: int) -> tuple[Ints, Floats]:
-    """Voxels (O, 3) in a ball of this size around one, in the plane if `axis` is 1, and the squares
-    of their distances.
-    """
-    most_steps = (0.5 * most / edges).astype(int)
-    most_steps[:axis] = 0
-    offsets = np.indices(tuple(2 * most_steps + 1)).reshape(3, -1).T - most_steps
-    squares = ((offsets * edges) ** 2).cumsum(axis=1)[:, 2]
-    is_near = squares <= 0.25 * most * most
-    return offsets[is_near], squares[is_near]
+def rows_within(partition: NDArray[np.integer], inside: Bools | None) -> NDArray[np.integer]:
+    """Rows of voxels' labels, `BEYOND_REGION` beyond a region."""
+    return partition if inside is None else np.where(inside, partition, BEYOND_REGION)
 
 
 def _in_planes(segments: Floats) -> Floats:
@@ -198,52 +150,17 @@ def _in_planes(segments: Floats) -> Floats:
     return np.concatenate([flat[:, :3], flat[:, 1:]])
 
 
-def _check_room(
-    shape: tuple[int, ...], of_voxel: float, of_step: float, spacing: Floats, beyond: float
-) -> None:
-    """Check the memory for a grid, in bytes by voxel, and by direction in the slabs in work and
-    `beyond` them, mm.
-    """
-    planes = 2.0 * beyond / float(min(spacing)) + SLAB_PLANES
-    fraction = min(numba.get_num_threads() * planes / shape[0], 1.0)
-    n_bytes = of_voxel + of_step * len(_rays(spacing)[0]) * fraction
-    check_memory(n_bytes * prod(shape), "thickness of labels", "crop the image")
+def _check_room(shape: tuple[int, ...], reach: int, n_crossings: int) -> None:
+    """Check the memory for a grid, and for the slabs in work with the planes around them."""
+    planes = numba.get_num_threads() * (SLAB_PLANES + 2.0 * reach)
+    of_slab = (SLAB_BYTES + n_crossings * CROSSING_BYTES) * min(planes / shape[0], 1.0)
+    n_bytes = (THICKNESS_BYTES + of_slab) * prod(shape)
+    check_memory(n_bytes, "thickness of labels", "crop the image")
 
 
-def _in_space(partition: NDArray) -> tuple[int, ...]:
-    return (1,) * (3 - partition.ndim) + partition.shape
-
-
-def _labels_of(partition: NDArray[np.integer], members: Memberships | None) -> _Labels:
-    whole = _in_space(partition)
-    return _Labels(
-        partition.reshape(whole).astype(np.int16, copy=False),
-        np.zeros((1, 1, 1, 1), np.float32)
-        if members is None
-        else members.levels.reshape(-1, *whole),
-        np.zeros(1, dtype=np.int64) if members is None else members.channel,
-        np.zeros((0, 1, 1, 1), np.uint16),
-    )
-
-
-def _over_slabs(
-    fill: Callable[[tuple[tuple[int, int], ...]], None],
-    whole: tuple[int, ...],
-    n: int,
-    most: int | None = None,
-) -> None:
-    """Call a function for each slab of a grid, on all threads; each call writes only to its
-    slab.
-    """
-    box = [(0, size) for size in whole]
-    over_slabs(
-        lambda *ends: fill((*box[: 3 - n], ends, *box[4 - n :])), whole[3 - n], prod(whole), most
-    )
-
-
-def _rays(spacing: Floats) -> tuple[Ints, Floats, Floats]:
-    """Steps (D, 3) along axes and diagonals, one of each opposite pair, the lengths of any number
-    of each, and a voxel's edges.
+def _rays(spacing: Floats, most: float) -> tuple[Ints, Floats, Floats]:
+    """Steps (D, 3) along axes and diagonals, one of each opposite pair and each after the last in
+    the order of voxels, the lengths of any number of each up to `most`, and a voxel's edges.
     """
     n = len(spacing)
     edges = np.concatenate([np.ones(3 - n), spacing])
@@ -254,159 +171,89 @@ def _rays(spacing: Floats) -> tuple[Ints, Floats, Floats]:
             if s > (0, 0, 0) and not any(s[: 3 - n])
         ]
     )
-    lengths = np.repeat(np.linalg.norm(steps * edges, axis=1)[:, None], MOST_STEPS, axis=1)
+    lengths, n_steps = np.linalg.norm(steps * edges, axis=1), int(most / min(spacing)) + 1
+    lengths = np.repeat(lengths[:, None], n_steps, axis=1)
     return steps, np.cumsum(np.pad(lengths, ((0, 0), (1, 0))), axis=1), edges
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fill_chords(
-    chord: NDArray,
-    is_middle: NDArray,
+def _chords(
     labels: _Labels,
     rays: tuple[NDArray, NDArray, NDArray],
     most: float,
-    reach: int,
-    slab: tuple[tuple[int, int], ...],
-) -> None:
-    """Fill in the shortest chord through each voxel of a slab, across its surfaces, and mark voxels
-    in its middle.
+    axis: int,
+    ends: tuple[int, int],
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Length of the shortest chord through each voxel of a slab across an axis, its direction, -1
+    for none below `most`, and True in its middle.
 
-    Ways begin after the steps that stay within the label, which are counted from voxel to voxel,
-    from as many planes (rows in 2-D) beyond the slab as chords reach: a tenth of the time of
-    walking from each voxel.
+    A chord passes through a run of voxels of one label. Each voxel knows how many of its run come
+    before it, and how far before the first one the surface is: those of the plane, the row and the
+    voxel before are known already. Where a run ends, its voxels get its chord.
     """
     (steps, ways, _), partition = rays, labels.partition
-    low, high = max(slab[1][0] - reach, 0), min(slab[1][1] + reach, partition.shape[1])
-    before, after = max(slab[0][0] - reach, 0), min(slab[0][1] + reach, partition.shape[0])
-    first, size, most_steps = (
-        slab[0][0],
-        (len(steps), high - low, partition.shape[2]),
-        min(reach, MOST_STEPS),
-    )
-    up, beyond = (
-        np.zeros((slab[0][1] - first, *size), dtype=np.uint8),
-        np.zeros((2, *size), dtype=np.uint8),
-    )
-    part = partition[:, low:high]
-    for i in range(after - 1, first - 1, -1):
-        here = up[i - first] if i < slab[0][1] else beyond[i % 2]
-        last = up[i + 1 - first] if i + 1 < slab[0][1] else beyond[(i + 1) % 2]
-        _fill_steps(here, last, part, i, steps, most_steps)
-    for i in range(before, slab[0][1]):
-        down = beyond[i % 2]
-        _fill_steps(down, beyond[(i + 1) % 2], part, i, -steps, most_steps)
-        for j in range(slab[1][0], slab[1][1] if i >= first else slab[1][0]):
-            for k in range(*slab[2]):
-                if partition[i, j, k] < 0:
-                    continue
-                least, off_middle, shortest = most, np.inf, -1
-                # a chord ends within a step of both voxels, if these are known
-                for d in range(len(steps)):
-                    n, m = up[i - first, d, j - low, k], down[d, j - low, k]
-                    if max(n, m) < most_steps:
-                        least = min(least, (ways[d, n + 1] + ways[d, m + 1]) * ABOVE_LIMIT)
-                for d in range(len(steps)):
-                    n, m = up[i - first, d, j - low, k], down[d, j - low, k]
-                    if ways[d, n] + ways[d, m] >= least:
-                        continue
-                    step = row(steps, d)
-                    forth = _way(labels, (i, j, k), (d, step), ways, n, least)
-                    if forth + ways[d, m] >= least:
-                        continue
-                    step = (-step[0], -step[1], -step[2])
-                    back = _way(labels, (i, j, k), (-1 - d, step), ways, m, least - forth)
-                    if forth + back < least:
-                        least, off_middle, shortest = (
-                            forth + back,
-                            abs(forth - back) / ways[d, 1],
-                            d,
-                        )
-                chord[i, j, k] = _across(labels, (i, j, k), rays, shortest, least)
-                is_middle[i, j, k] = off_middle <= OFF_MIDDLE_STEPS
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _fill_steps(
-    count: NDArray, last: NDArray, partition: NDArray, i: int, steps: NDArray, most: int
-) -> None:
-    """Count the steps (D, 3) from voxels of plane i that stay within their label, (D, s_1, s_2), up
-    to `most`.
-
-    It is `most`, too, where they leave the grid. `last` has the counts of the plane before, to
-    which steps across planes lead, all of them in the same sense.
-    """
-    _, n_rows, n_columns = partition.shape
+    n_planes, n_rows, n_columns = partition.shape
+    least, best = np.full(partition.shape, most), np.full(partition.shape, -1, dtype=np.int8)
+    is_middle = np.zeros(partition.shape, dtype=np.bool_)
+    # of the last two planes
+    before = np.empty((2, n_rows, n_columns), dtype=np.int16)
+    begin = np.empty((2, n_rows, n_columns))
     for d in range(len(steps)):
-        a, s, t = i + steps[d, 0], steps[d, 1], steps[d, 2]
-        is_in = 0 <= a < len(partition)
-        source, begin, size = count if a == i else last, max(-t, 0), n_columns - abs(t)
-        for number in range(n_rows):
-            j = n_rows - 1 - number if s > 0 or (s == 0 and t > 0) else number
-            b = j + s
-            if not (is_in and 0 <= b < n_rows):
-                count[d, j] = most
-                continue
-            count[d, j, 0] = count[d, j, n_columns - 1] = most
-            own, other = (
-                partition[i, j, begin : begin + size],
-                partition[a, b, begin + t : begin + t + size],
-            )
-            here, there = (
-                count[d, j, begin : begin + size],
-                source[d, b, begin + t : begin + t + size],
-            )
-            for m in range(size):
-                at = size - 1 - m if t > 0 and b == j else m
-                here[at] = min(there[at] + 1, most) if own[at] == other[at] else 0
+        (s, t, u), length = row(steps, d), ways[d, 1]
+        before[:] = NO_RUN
+        for i in range(n_planes):
+            a = i - s
+            for j in range(n_rows):
+                b, here, n_here = j - t, partition[i, j], before[i % 2, j]
+                n_here[:] = NO_RUN
+                if a < 0 or b < 0 or b >= n_rows:
+                    continue
+                there, n_there = partition[a, b], before[a % 2, b]
+                begin_here, begin_there = begin[i % 2, j], begin[a % 2, b]
+                for k in range(max(u, 0), n_columns + min(u, 0)):
+                    c = k - u
+                    n = n_there[c]
+                    if here[k] == there[c]:
+                        if n >= 0 and ways[d, n] < most:
+                            n_here[k], begin_here[k] = n + 1, begin_there[c]
+                        continue
+                    end, begin_here[k] = _surface_between(labels, (a, b, c), (i, j, k), d, length)
+                    if here[k] >= 0:
+                        n_here[k] = 0
+                    for m in range(n + 1 if n >= 0 and ways[d, n] < most else 0):
+                        p, q, r = a - m * s, b - m * t, c - m * u
+                        if not ends[0] <= (p if axis == 0 else q) < ends[1]:
+                            continue
+                        forth, back = ways[d, m] + end, ways[d, n - m] + begin_there[c]
+                        if forth + back < least[p, q, r]:
+                            least[p, q, r], best[p, q, r] = forth + back, d
+                            is_middle[p, q, r] = abs(forth - back) / length <= OFF_MIDDLE_STEPS
+    return least, best, is_middle
 
 
 @njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
-def _way(
+def _surface_between(
     labels: _Labels,
-    place: tuple[int, int, int],
-    direction: tuple[int, tuple[int, int, int]],
-    ways: NDArray,
-    n: int,
-    most: float,
-) -> float:
-    """Distance from a voxel's centre to its label's surface along steps, mm; infinite if the grid
-    ends, or at `most`.
-
-    `direction` is its number and its step; steps down have numbers -1 to -D. `ways` has the length
-    of any number of steps along each, of which the first `n` stay within the label. It is inlined:
-    a call would take twice as long as its body. Steps are tuples: views of arrays, which threads
-    count together, doubled the time of all chords.
+    here: tuple[int, int, int],
+    there: tuple[int, int, int],
+    d: int,
+    length: float,
+) -> tuple[float, float]:
+    """Distances from a voxel, and from the next one in direction d, of another label, to the
+    surface between them, mm.
     """
     partition, levels, channel, crossing = labels
-    (i, j, k), (d, step) = place, direction
-    along = d if d >= 0 else -1 - d
-    own, way, length = partition[i, j, k], ways[along, n], ways[along, 1]
-    i, j, k = i + n * step[0], j + n * step[1], k + n * step[2]
-    while way < most:
-        a, b, c = i + step[0], j + step[1], k + step[2]
-        is_in = (
-            0 <= a < partition.shape[0]
-            and 0 <= b < partition.shape[1]
-            and 0 <= c < partition.shape[2]
-        )
-        if not is_in:
-            return np.inf
-        if partition[a, b, c] < 0:
-            return way + 0.5 * length
-        other = partition[a, b, c]
-        if other != own and len(crossing) > 0:
-            part = crossing[along, i, j, k] if d >= 0 else crossing[along, a, b, c]
-            if part == NO_CROSSING:  # overlapping cells
-                return way + 0.5 * length
-            fraction = (part // COSINE_STEPS) / (COSINE_STEPS - 2.0)
-            return float(way + length * (fraction if d >= 0 else 1.0 - fraction))
-        if other != own:
-            here = levels[channel[other], i, j, k] - levels[channel[own], i, j, k]
-            there = levels[channel[own], a, b, c] - levels[channel[other], a, b, c]
-            # 1e-6 of a level, chosen: against division by 0
-            return float(way + length * here / max(here + there, 1e-6))
-        i, j, k, way = a, b, c, way + length
-    return np.inf
+    one, other = partition[here], partition[there]
+    part = crossing[d, here[0], here[1], here[2]] if len(crossing) > 0 else NO_CROSSING
+    if one < 0 or other < 0 or (len(crossing) > 0 and part == NO_CROSSING):  # cells overlap
+        return 0.5 * length, 0.5 * length
+    if len(crossing) > 0:
+        fraction = (part // COSINE_STEPS) / (COSINE_STEPS - 2.0)
+        return length * fraction, length * (1.0 - fraction)
+    own, next_one = levels[channel[one]], levels[channel[other]]
+    first, second = next_one[here] - own[here], own[there] - next_one[there]
+    total = max(first + second, 1e-6)  # of a level, chosen: against division by 0
+    return length * first / total, length * second / total
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -417,7 +264,7 @@ def _cosine(
     length: float,
     edges: NDArray,
 ) -> float:
-    """Cosine of the angle between a way to the label's surface (`_way`) and the normal there; 1 if
+    """Cosine of the angle between a way to the label's surface and the normal there; 1 if
     that is unknown.
 
     Between levels the normal is along the gradient of the other label's level.
@@ -464,9 +311,7 @@ def _across(
     d: int,
     chord: float,
 ) -> float:
-    """The length of a chord in direction d, -1 for none, across its label's surfaces."""
-    if d < 0:
-        return chord
+    """The length of a chord in direction d across its label's surfaces."""
     ways, edges, step = rays[1], rays[2], row(rays[0], d)
     forth = _cosine(labels, place, (d, step), ways[d, 1], edges)
     step = (-step[0], -step[1], -step[2])
@@ -475,107 +320,51 @@ def _across(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _chord_through(
-    labels: _Labels,
-    place: tuple[int, int, int],
-    rays: tuple[NDArray, NDArray, NDArray],
-    limits: tuple[float, float],
-    first: int,
-) -> tuple[float, bool, int]:
-    """The shortest chord through a voxel as in `_fill_chords`, whether the voxel is in its middle,
-    and its direction; or any chord shorter than the lower of the limits, which that in the `first`
-    direction mostly is.
-    """
-    (steps, ways, _), (low, least) = rays, limits
-    off_middle, shortest = np.inf, -1
-    for number in range(-1, len(steps)):
-        d = first if number < 0 else number
-        step = row(steps, d)
-        forth = _way(labels, place, (d, step), ways, 0, least)
-        if forth >= least:
-            continue
-        step = (-step[0], -step[1], -step[2])
-        back = _way(labels, place, (-1 - d, step), ways, 0, least - forth)
-        if np.float32(forth + back) < low:
-            return forth + back, True, d
-        if number >= 0 and forth + back < least:
-            least, off_middle, shortest = forth + back, abs(forth - back) / ways[d, 1], d
-    chord = _across(labels, place, rays, shortest, least)
-    return chord, off_middle <= OFF_MIDDLE_STEPS, max(shortest, 0)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _thickness_near(
-    places: NDArray,
+def _thickness(
+    chords: tuple[NDArray, NDArray, NDArray],
     labels: _Labels,
     rays: tuple[NDArray, NDArray, NDArray],
-    balls: tuple[NDArray, NDArray],
-    most: float,
-    bound: NDArray,
+    slab: tuple[int, int, int],
 ) -> NDArray:
-    """`local_thickness` at voxels (K, 3): the size of the largest ball around a middle nearby, at
-    `balls`' offsets (O, 3) with their squares, that covers each.
-
-    `bound` is an upper limit of the size of each voxel's ball, infinite at first: most voxels need
-    one direction of 13.
+    """Thickness at a slab's voxels, 0 elsewhere: the diameter of the largest ball around a middle
+    that covers them, or their own chord.
     """
-    (offsets, squares), shape = balls, labels.partition.shape
-    sizes, d = np.zeros(len(places), dtype=np.float32), 0
-    for p in range(len(places)):
-        i, j, k = row(places, p)
-        own = labels.partition[i, j, k]
-        if own < 0:
-            continue
-        size, _, d = _chord_through(labels, (i, j, k), rays, (0.0, most), d)
-        sizes[p] = size
-        for o in range(len(offsets)):
-            a, b, c = i + offsets[o, 0], j + offsets[o, 1], k + offsets[o, 2]
-            is_in = 0 <= a < shape[0] and 0 <= b < shape[1] and 0 <= c < shape[2]
-            if sizes[p] >= np.float32(most):
-                break
-            if not is_in or labels.partition[a, b, c] != own or bound[a, b, c] <= sizes[p]:
-                continue
-            if squares[o] > (0.5 * bound[a, b, c]) ** 2:
-                continue
-            low = max(float(sizes[p]), 2.0 * np.sqrt(squares[o]))
-            size, is_middle, d = _chord_through(labels, (a, b, c), rays, (low, most), d)
-            bound[a, b, c] = size if is_middle else 0.0
-            if bound[a, b, c] > sizes[p] and squares[o] <= (0.5 * bound[a, b, c]) ** 2:
-                sizes[p] = bound[a, b, c]
-    return sizes
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _spread_balls(
-    thickness: NDArray,
-    chord: NDArray,
-    is_middle: NDArray,
-    partition: NDArray,
-    edges: NDArray,
-    slab: tuple[tuple[int, int], ...],
-) -> None:
-    """Raise the thickness of a slab's voxels to the diameter of the largest ball around a middle
-    that covers them.
-    """
-    for i in range(partition.shape[0]):
-        for j in range(partition.shape[1]):
-            for k in range(partition.shape[2]):
+    (least, best, is_middle), partition, edges = chords, labels.partition, rays[2]
+    (axis, first, stop), shape = slab, partition.shape
+    thickness = np.zeros(shape, dtype=np.float32)
+    low, high = (first if axis == 0 else 0), (stop if axis == 0 else shape[0])
+    bottom, top = (first if axis == 1 else 0), (stop if axis == 1 else shape[1])
+    for i in range(shape[0]):
+        for j in range(shape[1]):
+            for k in range(shape[2]):
                 if not is_middle[i, j, k]:
                     continue
-                size, r = chord[i, j, k], 0.5 * chord[i, j, k]
+                place = (i, j, k)
+                size = np.float32(_across(labels, place, rays, best[place], least[place]))
+                r = 0.5 * size
                 r0, r1, r2 = int(r / edges[0]), int(r / edges[1]), int(r / edges[2])
-                for a in range(max(i - r0, slab[0][0]), min(i + r0 + 1, slab[0][1])):
+                for a in range(max(i - r0, low), min(i + r0 + 1, high)):
                     x = 0.0 if a == i else ((a - i) * edges[0]) ** 2
-                    for b in range(max(j - r1, slab[1][0]), min(j + r1 + 1, slab[1][1])):
+                    for b in range(max(j - r1, bottom), min(j + r1 + 1, top)):
                         y = x + ((b - j) * edges[1]) ** 2
                         if y > r * r:
                             continue
-                        for c in range(max(k - r2, slab[2][0]), min(k + r2 + 1, slab[2][1])):
+                        for c in range(max(k - r2, 0), min(k + r2 + 1, shape[2])):
                             is_in = (
                                 thickness[a, b, c] < size and y + ((c - k) * edges[2]) ** 2 <= r * r
                             )
                             if is_in and partition[a, b, c] == partition[i, j, k]:
                                 thickness[a, b, c] = size
+    for i in range(low, high):
+        for j in range(bottom, top):
+            for k in range(shape[2]):
+                chord = least[i, j, k]
+                if partition[i, j, k] < 0 or thickness[i, j, k] >= chord:
+                    continue
+                if best[i, j, k] >= 0:
+                    chord = _across(labels, (i, j, k), rays, best[i, j, k], chord)
+                thickness[i, j, k] = max(thickness[i, j, k], np.float32(chord))
+    return thickness
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -584,31 +373,26 @@ def _fill_crossings(
     corners: NDArray,
     ways: NDArray,
     edges: NDArray,
-    ends: tuple[int, int],
-    axis: int,
+    origin: NDArray,
 ) -> None:
-    """Find where triangles first cross the ways (D, 3), mm, up from voxel centres, in a slab across
-    an axis.
+    """Find where triangles first cross the ways (D, 3), mm, up from the voxels' centres, of which
+    the first is at `origin` (3,).
 
-    `crossing` has the planes of the slab alone.
-    The cosine of the angle between way and normal is stored, too (`_Labels`).
-
-    A triangle's height over a place is in lengths of its normal, which is not a unit vector.
+    The cosine of the angle between way and normal is stored, too (`_Labels`). A triangle's height
+    over a place is in lengths of its normal, which is not a unit vector.
     """
     first, last, rise = (
         np.zeros(3, dtype=np.int64),
         np.zeros(3, dtype=np.int64),
         np.zeros(len(ways)),
     )
-    lengths, origin = np.sqrt((ways * ways).sum(axis=1)), np.zeros(3, dtype=np.int64)
-    origin[axis] = ends[0]
+    lengths = np.sqrt((ways * ways).sum(axis=1))
     for facet in range(len(corners)):
         a, b, c = row(corners[facet], 0), row(corners[facet], 1), row(corners[facet], 2)
         for d in range(3):
             low, high = min(a[d], b[d], c[d]) / edges[d], max(a[d], b[d], c[d]) / edges[d]
-            first[d], last[d] = max(int(np.ceil(low)) - 1, 0), int(np.floor(high)) + 1
+            first[d], last[d] = max(int(np.ceil(low)) - 1, origin[d]), int(np.floor(high)) + 1
             last[d] = min(last[d], crossing.shape[1 + d] - 1 + origin[d])
-        first[axis], last[axis] = max(first[axis], ends[0]), min(last[axis], ends[1] - 1)
         u, v = minus(b, a), minus(c, a)
         normal = cross(u, v)
         for s in range(len(ways)):

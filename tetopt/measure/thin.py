@@ -8,10 +8,11 @@ surfaces and between the facets of the mesh: the median for shells is within 3 %
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from tetopt.contents.content import Content
@@ -19,7 +20,8 @@ from tetopt.contents.labels import LARGEST_LABEL
 from tetopt.contents.thickness import (
     BEYOND_REGION,
     THICKNESS_PERCENTILES,
-    thickness_at,
+    local_thickness,
+    rows_within,
 )
 from tetopt.errors import InputError
 from tetopt.geometry.manifold import OUTSIDE_LABEL
@@ -35,16 +37,12 @@ from tetopt.measure.fidelity import (
     painted_voxels,
     surface_areas,
     voxel_cells,
-    voxel_counts,
     voxels_of,
 )
 from tetopt.mesh import Mesh
 from tetopt.system.arrays import Floats, Ints
-from tetopt.system.kernel_cache import njit
 
 THICK_VOXELS = 10.0  # times a voxel's shortest edge, at which thickness is clipped
-THICKNESS_VOXELS = 5_000  # of a label at most, for its thickness
-GOLDEN_STEP = 0.6180339887498949  # of an even sequence from 0 to 1: (5^.5 - 1) / 2
 # mean ratio, over all directions, of a smooth surface to its voxels' faces
 STAIRS = {2: np.pi / 4.0, 3: 2.0 / 3.0}
 TOLERATED_CONTACT = 1.2  # times the voxels' contact: more in a mesh is excess
@@ -182,10 +180,6 @@ def _by_pair(one: NDArray, other: NDArray, weights: Floats | None = None) -> dic
 def label_thickness(what: Content, mesh: Mesh, of_cell: ArrayLike) -> dict[int, LabelThickness]:
     """Measure the thickness of each label, between smooth surfaces and in cells, and their edges.
 
-    Of a label of more than 5,000 voxels, as many are sampled, in which the thickness is exact. Of
-    the tissues of the MNI152 and 41 labels of a CT, the 5th percentile is off by 5 % or less, the
-    median by 3, and the 95th by 0.2.
-
     Parameters
     ----------
     what : Content
@@ -223,76 +217,41 @@ def label_thickness(what: Content, mesh: Mesh, of_cell: ArrayLike) -> dict[int, 
         raise InputError(
             "content: expected labels with smooth interfaces, got none; use content(image, labels)"
         )
-    inside = None if what.region is None else what.region.inside
     most = THICK_VOXELS * float(min(grid.spacing))
     spacing = np.asarray(grid.spacing, dtype=np.float64)
-    rows = (
-        members.partition if inside is None else np.where(inside, members.partition, BEYOND_REGION)
-    )
-    places = _sample_each(rows, len(members.labels))
-    thick, label = (
-        thickness_at(places, rows, members, spacing, most),
-        members.labels[rows.ravel()[places]],
-    )
-    of_voxels = _percentiles(thick, label, most)
+    rows = rows_within(members.partition, what.inside)
     owner, (pieces, n_pieces) = voxel_cells(grid, mesh), mesh.straight_pieces()
-    cell, edge = owner.ravel()[places], np.sqrt(squared_edges(mesh.points, mesh.cells)).mean(axis=1)
-    is_right = (cell >= 0) & (of_cell[cell] == label)
-    edges, across = edge[cell], thick / edge[cell]
+    edge = np.sqrt(squared_edges(mesh.points, mesh.cells)).mean(axis=1)
+    measured: dict[int, LabelThickness] = {}
+    thickness = local_thickness(rows, members, spacing, most)
+    for label, thick, cell in _of_each(rows, members.labels, thickness, owner):
+        is_right = (cell >= 0) & (of_cell[cell] == label)
+        edges = edge[cell[is_right]]
+        medians = (
+            float(np.median(x)) if len(x) else np.nan for x in (edges, thick[is_right] / edges)
+        )
+        measured[label] = LabelThickness(_percentiles(thick, most), None, *medians)
     values, row = np.unique(of_cell, return_inverse=True)
-    painted = painted_voxels(owner, row, BEYOND_REGION)
-    places = _sample_each(painted, len(values))
+    rows = painted_voxels(owner, row, BEYOND_REGION)
     shared = facets(pieces.cells)
     sides = np.repeat(of_cell, n_pieces)[shared.cells]
     is_between = (shared.n_cells == 2) & (sides[:, 0] != sides[:, 1])
     corners = (grid.to_index(pieces.points) * spacing)[shared.nodes[is_between]]
-    thick = thickness_at(places, painted, corners, spacing, most)
-    of_cells = _percentiles(thick, values[painted.ravel()[places]], most)
-    thickness = {}
-    for each in sorted(of_voxels | of_cells):
-        own = is_right & (label == each)
-        thickness[each] = LabelThickness(
-            of_voxels.get(each),
-            of_cells.get(each),
-            *(float(np.median(x[own])) if own.any() else np.nan for x in (edges, across)),
-        )
-    return thickness
+    thickness = local_thickness(rows, corners, spacing, most)
+    for label, thick in _of_each(rows, values, thickness):
+        of_voxels = measured.get(label, LabelThickness())
+        measured[label] = of_voxels._replace(of_cells=_percentiles(thick, most))
+    return measured
 
 
-def _sample_each(rows: NDArray[np.integer], n_rows: int) -> Ints:
-    """Flat indices of up to `THICKNESS_VOXELS` voxels of each row, ascending; -1 is no row."""
-    counts = voxel_counts(rows, n_rows)
-    limits = np.minimum(counts, THICKNESS_VOXELS)
-    return _fill_sample(np.empty(limits.sum(), dtype=np.int64), rows.ravel(), counts, limits)
+def _of_each(rows: NDArray[np.integer], labels: Ints, *fields: NDArray) -> Iterator[Any]:
+    """Yield each label that has voxels, by their rows, and the values of its voxels."""
+    for row, box in enumerate(scipy.ndimage.find_objects(rows + 1)):
+        if box is not None:
+            is_own = rows[box] == row
+            yield int(labels[row]), *(field[box][is_own] for field in fields)
 
 
-@njit(cache=True, nogil=True)
-def _fill_sample(places: NDArray, rows: NDArray, counts: NDArray, limits: NDArray) -> NDArray:
-    """Take one voxel, in order, of each of as many equal parts of each row's voxels: at a multiple
-    of the golden ratio in the part, as regular ones would miss layers.
-    """
-    number, part, n = np.zeros_like(counts), np.zeros_like(counts), 0
-    due = np.zeros_like(counts)
-    for v in range(len(rows)):
-        r = rows[v]
-        if r < 0:
-            continue
-        if number[r] >= due[r]:
-            places[n] = v
-            n += 1
-            part[r] += 1
-            size = counts[r] / limits[r]
-            due[r] = int((part[r] + part[r] * GOLDEN_STEP % 1.0) * size)
-        number[r] += 1
-    return places[:n]
-
-
-def _percentiles(thickness: NDArray[np.float32], labels: Ints, most: float) -> dict[int, Thickness]:
-    """Percentiles of the thickness at voxels of some labels, by label."""
-    percentiles = {}
-    for label in np.unique(labels).tolist():
-        low, middle, high = np.percentile(
-            thickness[labels == label], THICKNESS_PERCENTILES
-        ).tolist()
-        percentiles[label] = Thickness(low, middle, high, float(np.float32(most)))
-    return percentiles
+def _percentiles(thickness: NDArray[np.float32], most: float) -> Thickness:
+    low, middle, high = np.percentile(thickness, THICKNESS_PERCENTILES).tolist()
+    return Thickness(low, middle, high, float(np.float32(most)))

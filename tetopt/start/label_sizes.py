@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from tetopt.contents.content import Content, plain
 from tetopt.contents.labels import BACKGROUND_LABEL
-from tetopt.contents.thickness import THICKNESS_PERCENTILES, local_thickness
+from tetopt.contents.thickness import THICKNESS_PERCENTILES, local_thickness, rows_within
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.start.octree import nodes_of_sizes
@@ -340,7 +340,8 @@ def _thickness(
     slopes = [min(rule.most, largest) / rule.length for rule in rules.values() if rule.is_slope]
     most = max([largest * (sizes.cells_across or 0.0), *slopes, float(spacing.min())])
     longest_side = float(np.linalg.norm(spacing * content.image.shape))
-    return local_thickness(content.memberships, spacing, min(most, longest_side), content.inside)
+    rows = rows_within(content.memberships.partition, content.inside)
+    return local_thickness(rows, content.memberships, spacing, min(most, longest_side))
 
 
 def _targets(
