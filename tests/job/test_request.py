@@ -62,6 +62,7 @@ VALUES = {
     "density": "1000",
     "average": "hill",
     "bins": "5:log",
+    "fields": ["mu=/m.nii", "V1=/v.nii:direction@fsl"],
     "sets": ["A=below:1", "B=below:2"],
     "written_sets": "all",
     "loads": ["compress:5%", "hold:xmin"],

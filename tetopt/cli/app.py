@@ -54,9 +54,11 @@ ASIDE_PANEL = "To try, and to prepare"
 # The options that the help of a command with many shows; `--help-all` shows all.
 OF_RUNS = (
     "mask mask_label background labels merge label_names nodes target_error edge_size cells_across "
-    "order young nu loads max_seconds threads"
+    "order young nu fields loads max_seconds threads"
 )
-OF_MESHES = "image_path labels label_field label_names mesh_units young nu density sets loads order"
+OF_MESHES = (
+    "image_path labels label_field label_names mesh_units young nu density fields sets loads order"
+)
 SHOWN_OPTIONS = {
     "mesh": f"output json_path figures force dry_run {OF_RUNS}".split(),
     "cohort": f"output suffix participants mesh_format write_table dry_run retry_failed workers "

@@ -14,6 +14,7 @@ from tetopt.cli.console import print_table
 from tetopt.cli.options import FilesArgument, NumberOptions, mesh_and_image
 from tetopt.commands.simulation import PAPER_PERCENT, SolvedModel, solve_file
 from tetopt.io.vtk import VTK_SUFFIXES
+from tetopt.job.field_files import scalar_names
 from tetopt.job.options import LabelledPart, ModelOptions, Option
 from tetopt.model.mappings import ByLabel, parse_any_mapping
 from tetopt.report.tables import new_table, nodes_in_words, range_words
@@ -97,7 +98,7 @@ def _of_what(solved: SolvedModel) -> Iterator[tuple[str, str]]:
     elif model.gauss_young is not None:
         yield "modulus within a cell", "one per Gauss point"
     elif options.average is not None and not isinstance(
-        parse_any_mapping(str(options.young)), ByLabel
+        parse_any_mapping(str(options.young), fields=scalar_names(options.fields)), ByLabel
     ):
         yield "average over a cell", options.average
     yield "Poisson's ratio", range_words(nu)

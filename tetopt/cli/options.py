@@ -21,6 +21,7 @@ from tetopt.io.meshes import MESH_SUFFIXES
 from tetopt.job.job import of_option
 from tetopt.job.options import (
     IMAGE_FILES,
+    FieldsOption,
     ForceOption,
     JsonOption,
     LabelNamesOption,
@@ -79,6 +80,7 @@ class ShownOptions:
     html: Annotated[
         Path | None, Option("OUT.html", "Write the page to this file; open no browser.")
     ] = None
+    fields: FieldsOption = None
     show: Annotated[
         str | None,
         Option(

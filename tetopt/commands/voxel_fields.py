@@ -16,7 +16,7 @@ from tetopt.job.aligned import read_companion
 from tetopt.job.events import note, progress, warning
 from tetopt.job.mesh_file import check_overlap, read_mesh
 from tetopt.job.options import MaskPart, VoxelOptions
-from tetopt.model.fields import half_turned_fields
+from tetopt.model.fields import KINDS_TEXT, field_kinds, half_turned_fields
 from tetopt.model.file import MeshFile, words_of_other_box
 from tetopt.model.on_image import At, field_on_image, warped_image
 from tetopt.report.summary import versions
@@ -81,7 +81,8 @@ def write_on_image(
     check_overlap(mesh, loaded.mesh, image)
     numbers: Json = {"mesh": mesh.name, "output": output.name, "field": name, "at": at}
     if options.warp is None:
-        turned = half_turned_fields({name: values})[name]
+        kinds = field_kinds(loaded.text(KINDS_TEXT))
+        turned = half_turned_fields({name: values}, kinds)[name]
         has_axes = turned is not values  # of a vector or tensor in RAS+
         values = turned if space == "lps" else values
         outside = np.nan if options.outside is None else options.outside
@@ -189,7 +190,8 @@ def _field_of(
     is_bad = np.isinf if options.warp is None else lambda rows: ~np.isfinite(rows)
     if values.dtype.kind not in "biuf" or is_bad(values).any():  # NaN: no value there
         raise InputError(f"{mesh}: expected finite numbers in {name}")
-    is_unknown = half_turned_fields({name: values})[name] is values and values.ndim > 1
+    kinds = field_kinds(loaded.text(KINDS_TEXT))
+    is_unknown = half_turned_fields({name: values}, kinds)[name] is values and values.ndim > 1
     if is_unknown and "lps" in (space, loaded.space):
         what = "its file" if loaded.space == "lps" else "`space`"
         raise InputError(

@@ -127,8 +127,7 @@ def cell_field(field: Image | Field, mesh: Mesh, mask: Image | None = None) -> C
     if not is_known.any():
         where = "" if mask is None else " in the mask"
         raise InputError(
-            f"field: no voxel with data{where} lies in the mesh; do both use the same world "
-            "coordinates?"
+            f"no voxel with data{where} lies in the mesh; do both use the same world coordinates?"
         )
     filled = np.flatnonzero(~is_known)
     known = np.flatnonzero(is_known)
@@ -137,6 +136,16 @@ def cell_field(field: Image | Field, mesh: Mesh, mask: Image | None = None) -> C
         means[:, filled] = means[:, known[nearest]]
     values, coherence = _values(means, kind)
     return CellField(values, coherence, int(is_known[small].sum()), len(filled), n_repaired)
+
+
+def field_words(own: CellField) -> str:
+    """Return which cells and voxels have no data of their own, for a note; empty if all have."""
+    words = {
+        "cells without a voxel are interpolated": own.n_interpolated,
+        "cells without data take the nearest cell's": own.n_filled,
+        "tensors of voxels with an eigenvalue that is hardly positive are repaired": own.n_repaired,
+    }
+    return "; ".join(f"{count} {what}" for what, count in words.items() if count)
 
 
 def _features(rows: NDArray, kind: Kind, voxels: Ints) -> tuple[Floats, int]:

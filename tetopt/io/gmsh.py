@@ -57,6 +57,7 @@ from tetopt.io.tags import (
     without_labels,
 )
 from tetopt.io.text import comment_lines, names_apart, rows
+from tetopt.model.fields import KINDS_TEXT
 from tetopt.model.file import MASK_TEXT, MOVED, PLACE_TEXT
 from tetopt.model.model import Model, element_facets, elements
 from tetopt.model.sets import facet_triples
@@ -112,7 +113,9 @@ def own_comments(lines: list[str]) -> OwnComments | None:
         elif match := re.fullmatch(r"entity of (cells|facets) (\d+): (.*)", line):
             for name in match[3].split():
                 entities[match[1]].setdefault(name, []).append(int(match[2]))
-        elif match := re.fullmatch(rf"({'|'.join(TEXTS)}): (\{{.*\}}|\d+ nodes.*|{MOVED}.*)", line):
+        elif match := re.fullmatch(
+            rf"({'|'.join((*TEXTS, KINDS_TEXT))}): (\{{.*\}}|\d+ nodes.*|{MOVED}.*)", line
+        ):
             texts[match[1]] = match[2]
         elif match := re.fullmatch(LABEL_COMMENT.format(r"(\d+)"), line):
             zero = int(match[1])

@@ -34,7 +34,13 @@ from tetopt.io.text import plain
 from tetopt.io.units import LONGEST_BOX, SHORTEST_BOX
 from tetopt.io.vtk import box_in, sets_in
 from tetopt.mesh import Mesh
-from tetopt.model.fields import half_turned_fields, is_stress, scaled_fields
+from tetopt.model.fields import (
+    KINDS_TEXT,
+    field_kinds,
+    half_turned_fields,
+    is_stress,
+    scaled_fields,
+)
 from tetopt.model.file import (
     MASK_TEXT,
     MOVED,
@@ -239,7 +245,8 @@ def _numbers(
         words = f'unit is none of {", ".join(STRESS_UNITS)}: "{name}"'
         notes.append(f"dropped moduli and stresses, as their {words}")
     if raw.space == "lps" and ndim == 3:
-        fields = [half_turned_fields(each) for each in fields]
+        kinds = field_kinds(text_in(raw.field_data, KINDS_TEXT))
+        fields = [half_turned_fields(each, kinds) for each in fields]
     return fields, tuple(notes)
 
 

@@ -121,7 +121,7 @@ TOPOLOGY_TYPES = {
     (3, 2): '"Tetrahedron_10"',
 }
 GEOMETRY_TYPES = {2: "XY", 3: "XYZ"}
-VECTOR_SHAPES = ((3,),)  # of a row
+ROW_TYPES = {(): "Scalar", (3,): "Vector", (9,): "Tensor"}  # by a row's shape
 TREE_PATH = "/Xdmf/Domain/Grid/Information/Grid"
 TIME_ELEMENT = '<Time Value="0"/>\n'  # pyvista 0.49 requires it in XDMF, meshio 5.3.5 rejects it
 INFORMATION_TEXT = "&lt;main/&gt;"  # meshio parses an Information's text as XML
@@ -133,9 +133,9 @@ def xdmf(model: Model) -> bytes:
 
     A facet is listed once, oriented outwards from its cell in the first of its sets; if another set
     holds it from the other side, its tag is also in <Information Name="NAME turned"/>. dolfinx
-    itself does not orient facets. Cell data with 3 columns are written as vectors, with other
-    numbers of columns as separate fields NAME_0, NAME_1, ...; materials replace cell data with the
-    names material, young, nu and density.
+    itself does not orient facets. Cell data with 3 columns are written as vectors, with 9 as
+    tensors, with other numbers of columns as separate fields NAME_0, NAME_1, ...; materials replace
+    cell data with the names material, young, nu and density.
 
     Raises
     ------
@@ -170,9 +170,8 @@ def _mesh_grid(model: Model, others: str) -> str:
     if model.node_young is not None:
         young_nodes = node_field(model.node_young, model.mesh, model.order)
         at_nodes = {NODE_MODULI: young_nodes} | at_nodes
-    # scalars and vectors, no matrices: the forms that VTK recognises
-    columns = [(*item, "Cell") for item in as_columns(fields, VECTOR_SHAPES).items()]
-    columns += [(*item, "Node") for item in as_columns(at_nodes, VECTOR_SHAPES).items()]
+    columns = [(*item, "Cell") for item in as_columns(fields, tuple(ROW_TYPES)).items()]
+    columns += [(*item, "Node") for item in as_columns(at_nodes, tuple(ROW_TYPES)).items()]
     whole = _body(model, model.mesh.ndim, cells, _item(cells), _item(points))
     whole += "".join(
         _attribute(name, values, center, _item(values)) for name, values, center in columns
@@ -239,7 +238,7 @@ def _body(model: Model, dim: int, nodes: Ints, node_item: str, point_item: str) 
 def _attribute(name: str, values: NDArray, center: str, item: str) -> str:
     return (
         f'<Attribute Name="{xml_attribute(name)}" '
-        f'AttributeType="{"Scalar" if values.ndim == 1 else "Vector"}" '
+        f'AttributeType="{ROW_TYPES[values.shape[1:]]}" '
         f'Center="{center}" Dimensions="{_sizes(values)}">\n{item}</Attribute>\n'
     )
 

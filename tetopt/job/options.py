@@ -72,6 +72,17 @@ LabelNamesOption = Annotated[
         "in the file of labels).",
     ),
 ]
+FieldsOption = Annotated[
+    list[str] | None,
+    Option(
+        "NAME=FILE[:KIND[@FRAME]]",
+        "Add a field on a grid of its own to the cells: a scalar (default), whose name formulas "
+        "may use, vector, direction or tensor. FRAME is what components mean, if the file does "
+        "not state it: fsl, dipy, mrtrix, itk; or the axes voxel, fsl, ras, lps, of tensors with "
+        "-upper, -lower or -diagonal. May be repeated.",
+        "field",
+    ),
+]
 SpaceOption = Annotated[str, Option("ras|lps", "Coordinate convention of the file.")]
 
 
@@ -490,6 +501,7 @@ class ModelOptions:
             "Group cells into K materials: bins of equal width, equal count or log width.",
         ),
     ] = None
+    fields: FieldsOption = None
     sets: Annotated[
         list[str] | None,
         Option(

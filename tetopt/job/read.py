@@ -10,7 +10,8 @@ import numpy as np
 from tetopt.errors import InputError
 from tetopt.io.formats import format_of
 from tetopt.job.advice import tell_label_sizes
-from tetopt.job.events import note, start_stage
+from tetopt.job.events import note, start_stage, warnings_heard
+from tetopt.job.field_files import read_fields
 from tetopt.job.job import Job
 from tetopt.job.mesh_file import check_mesh_place, label_table, read_mesh, warn_of_other_image
 from tetopt.job.plan import (
@@ -70,6 +71,8 @@ def read_planned(plan: Plan) -> Task:
     start = regions = None
     if plan.job.start is not None:
         start = read_mesh(plan.job.start, plan.job)
+    with warnings_heard():
+        fields = read_fields(plan.job.fields)
     source = read_source(plan.job, plan.job.label_names, loaded=start)
     if start is not None:
         image = source.contrasts[0]
@@ -94,7 +97,8 @@ def read_planned(plan: Plan) -> Task:
     elif (needed := nodes_of_targets(plan, source.content, sizes)) is not None:
         note(f"sizes require about {needed} nodes")
     # With the files' current checksums.
-    return Task(plan, source, start, sizes, job_request(plan.bare), by_label, regions)
+    request = job_request(plan.bare)
+    return Task(plan, source, start, sizes, request, by_label, regions, fields)
 
 
 def set_threads(threads: int | None) -> None:

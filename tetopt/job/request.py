@@ -14,6 +14,7 @@ from typing import Any
 import tetopt
 from tetopt.io.images import sha256, status_checksum
 from tetopt.io.label_tables import is_preset_table
+from tetopt.job.field_files import parse_fields
 from tetopt.job.option_values import file_and_volume, tissue_files
 from tetopt.job.options import (
     JobOptions,
@@ -56,6 +57,8 @@ def job_request(job: JobOptions) -> Json:
         for name, value in options.items()
         if name not in files
     }
+    if "field" in files:  # what they are called, and what their components mean
+        stated["field"] = [f"{each.name}:{each.kind}" for each in parse_fields(options["field"])]
     whole: Json = {
         "options": {**stated, "format": job.output.suffix.lower()},
         "files": {
@@ -72,6 +75,8 @@ def _files(name: str, value: Any) -> list[Path]:
     """Return the files among an option's values."""
     if name.replace("-", "_") in FILES_IN_TEXTS:
         return [] if (file := named_file(value)) is None else [file]
+    if name == "field":
+        return [each.path for each in parse_fields(value)]
     if name == "tissues":
         return tissue_files(value)
     return [

@@ -24,6 +24,7 @@ from tetopt.job.advice import (
     unmet_requirements,
 )
 from tetopt.job.events import Listener, listen_with, start_stage
+from tetopt.job.field_files import scalar_names
 from tetopt.job.job import Job
 from tetopt.job.mesh_stage import mesh_task
 from tetopt.job.read import read
@@ -210,7 +211,8 @@ def _problems(result: Result, failed: dict[str, str]) -> list[Problem]:
     is_most = has_most_empty(outcome.result, n_empty)
     is_free = mode != "start" and (is_most or task.source.labels is None)
     is_free &= measured.get("nodes_of_sizes", 0) <= n_nodes
-    mapping = None if job.young is None else parse_any_mapping(job.young)
+    names = scalar_names(job.fields)
+    mapping = None if job.young is None else parse_any_mapping(job.young, fields=names)
     has_moduli = (callable(mapping) or isinstance(mapping, list)) and job.average != "linear"
     is_masked = task.source.mask is not None
     empty = list(of_empty(outcome.result, is_free, n_empty, spacing, is_masked, has_moduli))

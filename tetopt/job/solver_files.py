@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import cast, get_args
@@ -14,10 +14,12 @@ import numpy as np
 import tetopt
 from tetopt.engine.loop import MeshingResult
 from tetopt.errors import InputError, error_words
+from tetopt.fields.field import Field
 from tetopt.image import Image
 from tetopt.io.formats import FIELDS, FORMATS, file_bytes, format_of, save_mesh, save_model
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.events import note, warning, warnings_heard
+from tetopt.job.field_files import read_fields, scalar_names
 from tetopt.job.mesh_file import check_mesh_place, label_table
 from tetopt.job.options import ModelOptions, SolverOptions
 from tetopt.mesh import Mesh
@@ -112,12 +114,13 @@ def check_model_options(
     InputError
         An invalid mapping, average, number of bins or order; options that need moduli without any.
     """
+    scalars = scalar_names(options.fields)
     texts = ((name, getattr(options, name)) for name in MAPPED_OPTIONS)
     for name, text in texts:
         if text is None:
             continue
         if reads_files or named_file(text) is None:
-            _check_mapping(text, name)
+            _check_mapping(text, name, scalars)
         if options.young is None and not has_materials:
             raise InputError(f"`{name}`: needs `young`")
     parse_average(options.average or DEFAULT_AVERAGE)
@@ -127,10 +130,10 @@ def check_model_options(
         raise InputError(f"`order`: expected 1 or 2, got {options.order}")
 
 
-def _check_mapping(text: str, name: str) -> None:
+def _check_mapping(text: str, name: str, scalars: list[str]) -> None:
     """Raise InputError with the option's name for an invalid mapping."""
     try:
-        parse_any_mapping(text, name)
+        parse_any_mapping(text, name, fields=scalars)
     except InputError as error:
         raise InputError(f"`{name}`: {str(error).removeprefix('mapping: ')}") from error
 
@@ -184,10 +187,14 @@ def solver_model(
     options: ModelOptions,
     about: Json,
     box: Box | None,
+    fields: Mapping[str, Image | Field],
 ) -> Model:
-    """Build the model of a mesh, with its data, sets and texts, with the options."""
+    """Build the model of a mesh, with its data, sets and texts, with the options and their
+    `fields`, as read.
+    """
     about = {"tetopt": tetopt.__version__, **about}
-    model = model_of_file(loaded, image, choices_of(options), about, box)
+    choices = choices_of(options)._replace(fields=fields)
+    model = model_of_file(loaded, image, choices, about, box)
     return model._replace(is_nonlinear=isinstance(options, SolverOptions) and options.nonlinear)
 
 
@@ -260,7 +267,8 @@ def convert_model(
     table = label_table(options.label_names, loaded)
     about = about | ({TABLE_TEXT: table} if table.names or table.colours else {})
     with warnings_heard():
-        model = solver_model(loaded, image, options, about, box)
+        fields = read_fields(options.fields)
+        model = solver_model(loaded, image, options, about, box, fields)
     if has_units:
         warn_of_units(model)
     return model

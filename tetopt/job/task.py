@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from tetopt.engine.loop import MeshingResult
+from tetopt.fields.field import Field
+from tetopt.image import Image
 from tetopt.job.plan import Plan
 from tetopt.job.source import Source
 from tetopt.measure.quality import Quality
@@ -39,6 +42,8 @@ class Task(NamedTuple):
     regions : (M,) int64, optional
         Regions of the mesh to start from that the run keeps (`tetopt.model.sets.regions_of`):
         those of its labels and cell sets, unless the job has labels.
+    fields : dict of str to Image or Field, optional
+        The job's fields, as read.
 
     Examples
     --------
@@ -55,6 +60,7 @@ class Task(NamedTuple):
     request: dict[str, Any]
     by_label: SizesByLabel | None = None
     regions: Ints | None = None
+    fields: Mapping[str, Image | Field] = {}
 
     def labels_of(self, regions: Ints | None) -> Ints | None:
         """Return the labels of regions of the mesh to start from, (M,); None without labels.

@@ -68,7 +68,8 @@ def model_with(
         own = surviving_sets(started.mesh, started.sets, mesh, regions)
         _warn_of_losses(started, own, source.labels is not None)
     loaded = MeshFile(mesh, fields, {}, n_turned=0, sets=own)
-    return solver_model(loaded, source.image, solver, about, box_of(source.contrasts[0]))
+    box = box_of(source.contrasts[0])
+    return solver_model(loaded, source.image, solver, about, box, task.fields)
 
 
 def _warn_of_losses(started: MeshFile, own: Sets, has_labels: bool) -> None:

@@ -14,6 +14,8 @@ from tetopt.contents.domain import mask_text
 from tetopt.energy.sampling import cell_of_voxel, mask_of_values
 from tetopt.engine.loop import MeshingResult
 from tetopt.errors import InputError, Note, prefix_errors, warn
+from tetopt.fields.field import Field
+from tetopt.fields.onto_cells import cell_field, field_words
 from tetopt.geometry.check import check_place
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image, check_image
@@ -28,7 +30,7 @@ from tetopt.model.averages import (
     node_young,
     parse_average,
 )
-from tetopt.model.fields import cell_fields
+from tetopt.model.fields import KINDS_TEXT, cell_fields, check_field_name, field_kinds
 from tetopt.model.file import (
     MASK_TEXT,
     MATERIAL_FIELDS,
@@ -85,7 +87,7 @@ def build_model(
     nu: str | float | Floats | ModulusMapping | ByLabel = None,
     density: str | float | Floats | ModulusMapping | ByLabel = None,
     average: str = DEFAULT_AVERAGE,
-    fields: Mapping[str, Image] | None = None,
+    fields: Mapping[str, Image | Field] | None = None,
     sets: Iterable[str] = (),
     loads: Iterable[str] = (),
     bins: int | None = None,
@@ -124,8 +126,10 @@ def build_model(
         "mean" is Eq. (2). With "gauss" and quadratic cells, moduli vary within a cell in
         `tetopt.fem.solution.solve`, not in files. Ratios and densities are always averaged by the
         mean, with "linear" of images that are linear between voxel centres.
-    fields : dict of str to Image, optional
-        Further images, on any grids in the world, whose names mappings may use as they use h:
+    fields : dict of str to Image or Field, optional
+        Further images, and vectors, directions and tensors (`load_field`), on any grids in the
+        world; cells get their values as data of these names (`cell_field`), and directions
+        NAME_coherence. Mappings may use the names of images as they use h:
         ``young="3*mu"``. Such a mapping needs no `image` unless it names h. It is averaged over the
         voxels of the finest grid that it names (`tetopt.model.averages.cell_young`). A voxel of a
         field without a value (NaN), or outside the mesh's mask, has that of the nearest one.
@@ -243,7 +247,7 @@ class Choices(NamedTuple):
     spacing: Spacing = "equal"
     order: int = 1
     units: str = "kPa"  # of moduli and pressures in texts without a unit
-    fields: Mapping[str, Image] = {}  # that mappings may name
+    fields: Mapping[str, Image | Field] = {}  # whose images mappings may name
 
     @property
     def is_new(self) -> bool:
@@ -301,12 +305,13 @@ def _model(
         raise InputError(f"order: expected 1 or 2, got {order}")
     parse_average(choices.average)
     all_sets = with_requested(mesh, known_sets, choices.sets, cells.mean)
+    cell_data, about = _with_cell_fields(mesh, choices.fields, cell_data, about)
     table = None
     nodal = None
     at_gauss = None
     if choices.young is not None:
         laws = _laws(choices)
-        cells = _with_fields(cells, choices.fields, laws, about)
+        cells = _with_fields(cells, _images_of(choices), laws, about)
         nodal, at_gauss = _varying_moduli(cells, laws.young, choices)
         values = [
             None if law is None else _values(law, name, cells, choices.average)
@@ -426,10 +431,9 @@ def _laws(choices: Choices) -> _Laws:
         nu = young if isinstance(young, str) and has_column(young, "nu") else DEFAULT_NU
     if density is None and isinstance(young, str) and has_column(young, "density"):
         density = young
-    check_field_names(choices.fields)
     return _Laws(
         *(
-            parse_any_mapping(law, name, choices.units, choices.fields)
+            parse_any_mapping(law, name, choices.units, _images_of(choices))
             if isinstance(law, str)
             else law
             for name, law in (("young", young), ("nu", nu), ("density", density))
@@ -445,8 +449,7 @@ def _with_fields(
     A voxel without one, or outside the mask among the texts, has that of the nearest other.
     """
     named = [law.names for law in laws if isinstance(law, Formula)]
-    text = about.get(MASK_TEXT)
-    mask = None if text is None else mask_in(json.loads(text) if isinstance(text, str) else text)
+    mask = _mask_of(about)
     images = dict(cells.images)
     for name in sorted(fields.keys() & frozenset().union(*named)):
         with prefix_errors(f"field {name}"):
@@ -454,17 +457,46 @@ def _with_fields(
     return cells._replace(images=images)
 
 
-def _whole_field(name: str, field: Image, mesh: Mesh, mask: Image | None) -> Image:
-    """Return a field of which every voxel has a value; warn of voxels of the mesh that have none.
+def _images_of(choices: Choices) -> dict[str, Image]:
+    """Return the scalar fields."""
+    return {name: each for name, each in choices.fields.items() if not isinstance(each, Field)}
 
-    Raises InputError for a field that lies elsewhere than the mesh, or has no value in it.
+
+def _mask_of(about: Json) -> Image | None:
+    """Return the mask among a model's texts, if it has one."""
+    text = about.get(MASK_TEXT)
+    return None if text is None else mask_in(json.loads(text) if isinstance(text, str) else text)
+
+
+def _with_cell_fields(
+    mesh: Mesh, fields: Mapping[str, Image | Field], cell_data: Arrays, about: Json
+) -> tuple[Arrays, Json]:
+    """Return the data of cells with the values of fields, and the texts with their kinds; tell
+    cells and voxels without own data.
     """
-    check_place(mesh, check_image(f"field {name}", field), f"field {name}")
+    kinds = field_kinds(about.get(KINDS_TEXT))
+    check_field_names(fields)
+    for name, field in fields.items():
+        check_field_name(name)
+        is_field = isinstance(field, Field)
+        grid = field.grid if is_field else check_image(f"field {name}", field)
+        with prefix_errors(f"field {name}"):
+            check_place(mesh, grid, f"field {name}")
+            own = cell_field(field, mesh, _mask_of(about))
+        kinds[name] = field.kind if is_field else "scalar"
+        cell_data = {**cell_data, name: own.values}
+        if own.coherence is not None:
+            cell_data[f"{name}_coherence"] = own.coherence
+        if words := field_words(own):
+            warn(f"field {name}: {words}", Note)
+    return cell_data, about | ({KINDS_TEXT: kinds} if kinds else {})
+
+
+def _whole_field(name: str, field: Image, mesh: Mesh, mask: Image | None) -> Image:
+    """Return a field with a value in every voxel; warn of voxels of the mesh that have none."""
     has_value = ~np.isnan(field.data)
     if field.has_gaps:
         is_good = has_value[cell_of_voxel(field, mesh) >= 0]
-        if is_good.size and not is_good.any():
-            raise InputError("no voxel in the mesh has a value; do both use the same world?")
         if not is_good.all():
             warn(
                 f"field {name}: {1.0 - is_good.mean():.1%} of the voxels in the mesh have no value "

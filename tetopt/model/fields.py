@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +19,7 @@ from tetopt.image import Image
 from tetopt.measure.judge import warn_of_other_mask
 from tetopt.mesh import Mesh
 from tetopt.system.arrays import Arrays
+from tetopt.system.incoming import json_of
 
 # Fields that depend on the world's axes or on the unit of stress, by name; a suffix such as _step2
 # may follow.
@@ -34,6 +37,12 @@ STRESS_FIELDS = (
     "stress_nodes",
     "von_mises_nodes",
 )
+# cell data of tetopt's files beside those
+STANDARD_FIELDS = (
+    *("mean", "variance", "n_voxels", "min", "max", "volume", "rho", "min_dihedral"),
+    *("label", "material", "nu", "density", "facets", "cells"),
+)
+KINDS_TEXT = "field_kinds"  # text of a mesh's file: the kinds of fields from files, by name
 HALF_TURN = np.array([-1.0, -1.0, 1.0])  # about z, from RAS+ to LPS+ or back
 
 
@@ -121,19 +130,39 @@ def node_field(values: NDArray, mesh: Mesh, order: int) -> NDArray:
     return filled
 
 
-def half_turned_fields(fields: Arrays) -> Arrays:
-    """Transform 3-D vectors and tensors (row by row) among named fields from RAS+ to LPS+ or back.
+def half_turned_fields(fields: Arrays, kinds: Mapping[str, str] | None = None) -> Arrays:
+    """Transform 3-D vectors and tensors (row by row) among named fields from RAS+ to LPS+ or back:
+    those of a solver, and those of `kinds` (`field_kinds`).
 
     Fields with such a name but another shape come from other programs and are not changed.
     """
     turned = dict(fields)
     for name, values in fields.items():
-        kind = _base_name(name)
-        if kind in VECTOR_FIELDS and values.shape[1:] == (3,):
+        base = _base_name(name)
+        kind = (kinds or {}).get(name)
+        if (base in VECTOR_FIELDS or kind in ("vector", "direction")) and values.shape[1:] == (3,):
             turned[name] = values * HALF_TURN + 0.0  # + 0.0: no -0
-        elif kind in TENSOR_FIELDS and values.shape[1:] == (9,):
+        elif (base in TENSOR_FIELDS or kind == "tensor") and values.shape[1:] == (9,):
             turned[name] = values * np.outer(HALF_TURN, HALF_TURN).ravel() + 0.0
     return turned
+
+
+def field_kinds(text: Any) -> dict[str, str]:
+    """Return the kinds of fields by name, of the text `KINDS_TEXT` of a mesh's file or model; none
+    for another program's.
+    """
+    try:
+        table = json_of(text) if isinstance(text, str) else text
+    except ValueError:
+        return {}
+    return {str(name): str(kind) for name, kind in table.items()} if isinstance(table, dict) else {}
+
+
+def check_field_name(name: str) -> None:
+    """Raise InputError for the name of a field that cells have anyway, or results."""
+    own = (*STANDARD_FIELDS, *STRESS_FIELDS, *VECTOR_FIELDS, *TENSOR_FIELDS, "von_mises_nodes")
+    if _base_name(name) in own or re.fullmatch(r"(mean|variance)_\d+", name):
+        raise InputError(f'field: "{name}" is the name of other data of cells; choose another')
 
 
 def is_result(name: str) -> bool:

@@ -18,7 +18,7 @@ from tetopt.geometry.topology import compact
 from tetopt.image import Image
 from tetopt.interop import notebook
 from tetopt.mesh import Mesh
-from tetopt.model.fields import GAUSS_MODULI, NODE_MODULI, is_result
+from tetopt.model.fields import GAUSS_MODULI, KINDS_TEXT, NODE_MODULI, is_result
 from tetopt.model.label_names import TABLE_TEXT, LabelTable, labels_of, table_of_words
 from tetopt.model.loads import load_words, parse_load
 from tetopt.model.mappings import check_young
@@ -52,7 +52,7 @@ MOVE_ROUNDING = 1e-6  # of a coordinate, relative to the largest
 MOVED = "moved"
 MOVED_FROM_MASK = f"{MOVED} from the mask"
 # those that are kept in a new file
-TEXTS_KEPT = ("image", "image_sha256", "inputs", "options", "violated", MASK_TEXT)
+TEXTS_KEPT = ("image", "image_sha256", "inputs", "options", "violated", MASK_TEXT, KINDS_TEXT)
 REACTIONS_TEXT = r"reactions(_step\d+)?"  # texts of a solved mesh's file
 
 
@@ -224,7 +224,7 @@ def texts_of(loaded: MeshFile, *, is_other: bool = False) -> Json:
     """Return the texts of a mesh's file to keep in another file; with another image, only those
     on the mesh's mask and place.
     """
-    kept = (MASK_TEXT, PLACE_TEXT) if is_other else (*TEXTS_KEPT, PLACE_TEXT)
+    kept = (MASK_TEXT, PLACE_TEXT, KINDS_TEXT) if is_other else (*TEXTS_KEPT, PLACE_TEXT)
     return {name: text for name in kept if (text := loaded.text(name)) is not None}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -15,7 +16,9 @@ from tetopt.mesh import Mesh
 from tetopt.model.fields import (
     GAUSS_MODULI,
     HALF_TURN,
+    KINDS_TEXT,
     NODE_MODULI,
+    field_kinds,
     half_turned_fields,
     node_field,
     scaled_fields,
@@ -263,7 +266,8 @@ def in_space(model: Model, space: str) -> Model:
     middles = None if model.mesh.midpoints is None else half_turn(model.mesh.midpoints)
     mesh = Mesh(half_turn(model.mesh.points), model.mesh.cells, middles)
     cell_data, point_data = (
-        half_turned_fields(each) for each in (model.cell_data, model.point_data)
+        half_turned_fields(each, field_kinds(model.about.get(KINDS_TEXT)))
+        for each in (model.cell_data, model.point_data)
     )
     return model._replace(
         mesh=mesh, loads=loads, space=space, cell_data=cell_data, point_data=point_data
@@ -390,6 +394,9 @@ def header_lines(model: Model) -> list[str]:
     if (labels := model.labels) is not None:
         names = label_set_names(np.unique(labels).tolist(), model.label_names)
         lines += [f"label {label}: {name}" for label, name in names.items()]
+    kinds = field_kinds(model.about.get(KINDS_TEXT))
+    if kinds := {name: kind for name, kind in kinds.items() if name in model.cell_data}:
+        lines.append(f"{KINDS_TEXT}: {json.dumps(kinds)}")
     # A line break in a file's name would end the comment.
     return [" ".join(line.split()) for line in lines]
 
