@@ -386,11 +386,11 @@ def _finer_octrees(
         numbers = hole_numbers(part_of(mesh, kept.is_kept), content.image, region)
         octree = _Tried(mesh, lost_fraction(mesh, content.image, region), misfit_of_holes(numbers))
         yield octree
-        lost, n_torn = octree.faults
-        is_stalled = STALLED_FRACTION * least[0] <= lost < SMALL_LOSS and n_torn >= least[1]
-        n_stalled = n_stalled + 1 if is_stalled else 0
-        least = min(least[0], lost), min(least[1], n_torn)
-        if octree.faults == (0.0, 0) or n_stalled == STALLED_STEPS or is_over():
+        faults = octree.faults
+        is_larger = STALLED_FRACTION * least[0] < faults[0] < SMALL_LOSS
+        n_stalled = n_stalled + 1 if is_larger or least <= faults < (SMALL_LOSS,) else 0
+        least = min(least, faults)
+        if faults == (0.0, 0) or n_stalled == STALLED_STEPS or is_over():
             return
 
 
