@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import ceil
+from threading import Lock
 from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
@@ -364,6 +365,8 @@ class LabelFidelity(NamedTuple):
 
 
 Made = TypeVar("Made")
+CELLS = "cells of voxels"  # the name of `voxel_cells` among a mesh's attributes
+_OWNING = Lock()  # held by the thread that owns voxels, as others need the same
 RECORD = "voxels of labels"  # the name of a `VoxelRecord` among an image's attributes
 
 
@@ -484,7 +487,6 @@ def label_fidelity(
     mesh: Mesh,
     of_cell: ArrayLike | None = None,
     mask: Image | None = None,
-    owner: NDArray[np.integer] | None = None,
     extents: Sequence[LabelFidelity] = (),
 ) -> list[LabelFidelity]:
     """Measure how well cells represent each label of an image.
@@ -504,8 +506,6 @@ def label_fidelity(
         Label of each cell; `cell_labels` by default.
     mask : Image, optional
         Mask on the same voxels; only voxels of 1/2 or more count.
-    owner : (s_0, ..., s_{n-1}) array of int, optional
-        Cell of each voxel, -1 outside the mesh, if known.
     extents : sequence of LabelFidelity, optional
         Volumes, components and Dice, if known: the `MeshingResult.extents` of these labels and
         this mesh.
@@ -534,7 +534,7 @@ def label_fidelity(
     label 1: Dice 1.00, off by 0.5 mm
     """
     record = voxels_of(labels, mask)
-    owner = voxel_cells(labels, mesh) if owner is None else owner
+    owner = voxel_cells(labels, mesh)
     of_cell = cell_labels(labels, mesh) if of_cell is None else check_cell_labels(of_cell, mesh)
     values, true, of_cell = record.labels, record.rows, record.rows_of(of_cell)
     outside = BACKGROUND_LABEL if mask is None else OUTSIDE_LABEL
@@ -728,9 +728,7 @@ def _count_labels(
         none[cell] += rows[at] == 0
 
 
-def mask_fidelity(
-    mask: Image, mesh: Mesh, owner: NDArray[np.integer] | None = None
-) -> MaskFidelity:
+def mask_fidelity(mask: Image, mesh: Mesh) -> MaskFidelity:
     """Measure how well a mesh fills a mask and follows its boundary.
 
     Parameters
@@ -740,8 +738,6 @@ def mask_fidelity(
     mesh : Mesh
         Points in world coordinates, mm; curved cells as their `Mesh.straight_pieces`, their volumes
         exact.
-    owner : (s_0, ..., s_{n-1}) array of int, optional
-        Cell of each voxel, -1 outside the mesh, if known.
 
     Returns
     -------
@@ -770,7 +766,7 @@ def mask_fidelity(
             "it first"
         )
     pieces = mesh.straight_pieces()[0]
-    is_filled = (voxel_cells(mask, mesh) if owner is None else owner) >= 0
+    is_filled = voxel_cells(mask, mesh) >= 0
     is_inside = mask.data >= INSIDE_FRACTION
     n_components, lost = voxel_components(is_inside, is_filled, mask.affine)
     n_inside, n_filled = int(is_inside.sum()), int(is_filled.sum())
@@ -956,12 +952,18 @@ def voxels_of(labels: Image, mask: Image | None = None) -> VoxelRecord:
 
 
 def voxel_cells(image: Image, mesh: Mesh) -> NDArray[np.int32]:
-    """Number of the cell of each voxel, -1 outside the mesh; curved cells as their straight
-    pieces.
+    """Number of the cell of each voxel, -1 outside the mesh; curved cells as their straight pieces.
+
+    The last grid's are kept with the mesh, for all of its measures.
     """
-    pieces, n_pieces = mesh.straight_pieces()
-    owner = cell_of_voxel(image, pieces).astype(np.int32)
-    return owner if n_pieces == 1 else owner // np.int32(n_pieces)
+    with _OWNING:
+        grid = image.shape, image.affine.tobytes()
+        known: tuple[Any, NDArray[np.int32]] | None = vars(mesh).get(CELLS)
+        if known is None or known[0] != grid:
+            pieces, n_pieces = mesh.straight_pieces()
+            owner = cell_of_voxel(image, pieces).astype(np.int32) // np.int32(n_pieces)
+            vars(mesh)[CELLS] = known = grid, owner
+        return known[1]
 
 
 def _most_frequent(rows: NDArray[np.integer], owner: NDArray[np.integer], otherwise: Ints) -> Ints:

@@ -9,7 +9,7 @@ program, asks here.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import cache
+from functools import partial
 from math import prod
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -40,6 +40,7 @@ from tetopt.measure.fidelity import (
     LabelFidelity,
     OwnedVoxels,
     label_extents,
+    voxel_cells,
 )
 from tetopt.mesh import Mesh
 from tetopt.start.clip import hole_numbers, misfit_of_holes
@@ -152,9 +153,9 @@ def measure(
     """
     E_D, n_voxels = content_E_D(content, mesh) if counted is None else counted
     region, members = content.region, content.memberships
-    pieces, n_pieces = mesh.straight_pieces()
-    owner = cache(lambda: cell_of_voxel(content.image, pieces) // n_pieces)
-    straight = owner if n_pieces == 1 else lambda: cell_of_voxel(content.image, mesh)
+    owner = partial(voxel_cells, content.image, mesh)
+    is_straight = mesh.straight_pieces()[0] is mesh
+    straight = owner if is_straight else lambda: cell_of_voxel(content.image, mesh)
     measures: dict[str, Callable[[], Any]] = {}
     if mesh.ndim == 3:
         measures["min_dihedral"] = lambda: dihedral_angles(mesh.points, mesh.cells).min(axis=1)

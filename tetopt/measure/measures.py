@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
 from functools import cache, partial
 from threading import Lock
-from typing import Any, cast
+from typing import Any
 
 import numba
 import numpy as np
@@ -22,7 +22,6 @@ from tetopt.measure.fidelity import (
     cell_labels,
     label_fidelity,
     mask_fidelity,
-    voxel_cells,
     voxels_of,
 )
 from tetopt.measure.interfaces import label_interfaces
@@ -55,16 +54,15 @@ def fidelity(
     whole = partial(_with_levels, what, labels, mask)
     if mask is not None:
         labels, mask = _around(labels, mask, mesh)
-    owner = _once(lambda: voxel_cells(mask or cast(Image, labels), mesh))
     if mask is not None:
-        measures["mask"] = lambda: mask_fidelity(mask, mesh, owner())
+        measures["mask"] = lambda: mask_fidelity(mask, mesh)
     if labels is not None:
         own = (
             _once(lambda: cell_labels(continue_image(labels, mask), mesh))
             if of_cell is None
             else lambda: of_cell
         )
-        measures["labels"] = lambda: label_fidelity(labels, mesh, own(), mask, owner(), extents)
+        measures["labels"] = lambda: label_fidelity(labels, mesh, own(), mask, extents)
         # made before the threads that share it
         if sum(box is not None for box in voxels_of(labels, mask).boxes) > 1:
             measures["thickness"] = lambda: label_thickness(whole(), mesh, own())
