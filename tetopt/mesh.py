@@ -175,9 +175,9 @@ class Mesh:
         [[1.0, 1.0], [2.0, 1.0], [1.0, 2.0]]
         """
         move = transform if callable(transform) else _affine_map(transform, self.ndim)
-        midpoints = None if self.midpoints is None else _moved(move, self.midpoints)
+        midpoints = None if self.midpoints is None else _places_by(move, self.midpoints)
         with prefix_errors("Mesh.moved"):
-            return Mesh(_moved(move, self.points), self.cells, midpoints)
+            return Mesh(_places_by(move, self.points), self.cells, midpoints)
 
     def __repr__(self) -> str:
         kind = "tetrahedra" if self.ndim == 3 else "triangles"
@@ -477,7 +477,7 @@ def _affine_map(matrix: ArrayLike, n: int) -> Callable[[Floats], Floats]:
     return lambda points: (points[:, None, :] * A[:n, :n]).sum(axis=2) + A[:n, n]
 
 
-def _moved(move: Callable[[Floats], ArrayLike], points: Floats) -> Floats:
+def _places_by(move: Callable[[Floats], ArrayLike], points: Floats) -> Floats:
     places = np.asarray(move(points), dtype=np.float64)
     if places.shape != points.shape:
         raise InputError(

@@ -20,6 +20,7 @@ from tetopt.job.options import (
     LabelChoice,
     LabelledPart,
     MeshPart,
+    MoveOptions,
     Option,
     SolverOptions,
     VoxelOptions,
@@ -53,6 +54,7 @@ def convert_command(
     choice: LabelChoice,
     solver: SolverOptions,
     voxels: VoxelOptions,
+    move: MoveOptions,
     numbers: NumberOptions,
 ) -> int:
     """Write a mesh for a solver, in the format of OUT's suffix, or a field of it on the voxels
@@ -63,7 +65,7 @@ def convert_command(
     mesh_path, image_path = mesh_and_image(paths[:-1], image_path)
     output = paths[-1]
     is_image = is_image_name(paths[-1])
-    _check_options(output, voxels if not is_image else None, part, choice, solver)
+    _check_options(output, voxels if not is_image else None, part, choice, solver, move)
     if output.exists() and not numbers.force and output.suffix.lower() in MESH_SUFFIXES:
         raise InputError(
             f"{output}: exists, and is the file to write: MESH comes first (are {mesh_path} and "
@@ -94,6 +96,7 @@ def convert_command(
             choice=choice,
             image=image_path,
             results=results_path,
+            move=move,
         )
     numbers.save(converted.numbers)
     print_model(output, converted.model, converted.options)
@@ -106,6 +109,7 @@ def _check_options(
     part: LabelledPart,
     choice: LabelChoice,
     solver: SolverOptions,
+    move: MoveOptions,
 ) -> None:
     """Raise InputError for an option of images with a mesh's file, which has `voxels`, or the
     other way round.
@@ -119,7 +123,7 @@ def _check_options(
         what = "a mesh's file; name an image, such as field.nii.gz"
     else:
         own = replace(part, registered=False, **vars(MeshPart()))
-        wrong = given_options(own) | given_options(choice)
+        wrong = given_options(own) | given_options(choice) | given_options(move)
         wrong |= given_options(replace(solver, space="ras", written_fields=None))
         what = "an image, on all voxels of `like`"
     if wrong:

@@ -24,7 +24,15 @@ from tetopt.io.text import count_text, list_names
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.events import note, progress, warning, warnings_heard
 from tetopt.job.mesh_file import read_mesh
-from tetopt.job.options import ALL_LABELS, LabelChoice, LabelledPart, SolverOptions
+from tetopt.job.moved import move_file, tell_fit
+from tetopt.job.options import (
+    ALL_LABELS,
+    UNMOVED,
+    LabelChoice,
+    LabelledPart,
+    MoveOptions,
+    SolverOptions,
+)
 from tetopt.job.solver_files import (
     check_solver_options,
     choices_of,
@@ -76,6 +84,7 @@ def convert_file(
     choice: LabelChoice = ALL_LABELS,
     image: Path | None = None,
     results: Path | None = None,
+    move: MoveOptions = UNMOVED,
 ) -> Converted:
     """Write a mesh's file for a solver: materials, named sets, loads, in the format of the output's
     suffix.
@@ -92,6 +101,8 @@ def convert_file(
         The source of means and mappings, instead of the mesh's file.
     results : Path, optional
         CalculiX's results for this mesh, to be added to it.
+    move : MoveOptions
+        Transforms that move the mesh to the image.
 
     Raises
     ------
@@ -102,9 +113,13 @@ def convert_file(
         raise InputError(
             f"`results`: expected an output file {' or '.join(VTK_SUFFIXES)}, got {output}"
         )
+    if move.transforms and (results is not None or part.labels is not None):
+        name = "labels" if results is None else "results"
+        raise InputError(f"`transforms` and `{name}`: convert first with one, then with the other")
     check_part(image, part, part.labels)
-    loaded = read_mesh(mesh, part)
-    check_unfolded(loaded.mesh, source=str(mesh))
+    before = read_mesh(mesh, part)
+    check_unfolded(before.mesh, source=str(mesh))
+    loaded = move_file(before, move, image)
     if results is None:
         with warnings_heard():
             is_stale = choices_of(solver).is_new
@@ -121,6 +136,8 @@ def convert_file(
     if not solver.loads:
         solver = replace(solver, loads=_loads_of_file(loaded, choice))
     loaded, what, is_other = voxels_of(loaded, mesh, image, part, part.labels)
+    if move.transforms and what is not None:
+        tell_fit(before, loaded.mesh, what, image)
     loaded = _of_labels(loaded, choice)
     about = _texts_of(loaded, solver, has_new_results=results is not None)
     box = loaded.box
@@ -138,6 +155,7 @@ def convert_file(
     files = {"mesh": mesh.name, "output": output.name, "units": solver.units, "space": solver.space}
     files |= {} if results is None else {"results": results.name}
     files |= stated_files(part)
+    files |= {"transforms": [each.name for each in move.transforms]} if move.transforms else {}
     return Converted(model, solver, files | {"versions": versions()} | model_summary(model))
 
 

@@ -10,7 +10,9 @@ from tetopt.system.arrays import Bools, Floats, Ints
 
 UNTANGLE_ROUNDS = 200  # at most: each spreads a fold by one more layer of cells
 MOST_INVERTED = 0.2  # of the cells: more belong to no registration of one subject to another
-LEAST_VOLUME = 0.05  # of a cell's volume before, next to an inverted cell: less counts as inverted
+LEAST_FRACTION = (
+    0.05  # of a cell's volume before, next to an inverted cell: less counts as inverted
+)
 
 
 def untangle(points: Floats, moved: Floats, cells: Ints) -> tuple[Floats, int]:
@@ -44,7 +46,7 @@ def untangle(points: Floats, moved: Floats, cells: Ints) -> tuple[Floats, int]:
     shift, places, ends = moved - points, moved, cells.ravel()
     n_around = np.bincount(ends, minlength=len(points))[:, None]
     is_loose: Bools = np.zeros(len(points), dtype=bool)
-    least = np.where(is_inverted, LEAST_VOLUME * before, 0.0)
+    least = np.where(is_inverted, LEAST_FRACTION * before, 0.0)
     for _ in range(UNTANGLE_ROUNDS):
         is_bad = volumes(places, cells) <= least
         if not is_bad.any():

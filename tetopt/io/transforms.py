@@ -32,7 +32,7 @@ LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 MATLAB_SUFFIX, HDF5_SUFFIXES, NIFTI_SUFFIXES = ".mat", (".h5", ".hdf5"), (".nii", ".nii.gz")
 TEXT_HEAD = "#Insight Transform File"
 VECTOR_INTENTS = {1007: "lps", 1006: "ras"}  # of ITK's files: vectors, displacements
-EDGE_VOXELS = 0.5 + 1e-6  # beyond the outer voxel centres, to the field's end
+REACH_VOXELS = 0.5 + 1e-6  # beyond the outer voxel centres, to the field's end
 LEAST_DETERMINANT = 1e-9  # of a linear transform, over the product of its columns' lengths
 INVERSE_MM = 1e-9  # of a coordinate: an inverse is exact to this
 INVERSE_STEPS = 60  # at most, by Newton's method
@@ -64,9 +64,9 @@ class Dense(NamedTuple):
     def __call__(self, points: Floats) -> Floats:
         """Map points (K, 3), mm; InputError for points that the field does not cover."""
         index = Linear(np.linalg.inv(self.affine))(points)
-        most = np.array(self.shifts.shape[:3]) - 1.0 + EDGE_VOXELS
+        most = np.array(self.shifts.shape[:3]) - 1.0 + REACH_VOXELS
         moved = points + self._shifts_at(index)
-        is_out = ((index < -EDGE_VOXELS) | (index > most)).any(axis=1)
+        is_out = ((index < -REACH_VOXELS) | (index > most)).any(axis=1)
         is_out |= ~np.isfinite(moved).all(axis=1)
         if is_out.any():
             raise InputError(

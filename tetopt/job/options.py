@@ -394,6 +394,32 @@ class StartOptions(MeshPart):
 
 
 @dataclass(frozen=True, kw_only=True)
+class MoveOptions:
+    """The transform of a registration that moves a mesh from the fixed to the moving image."""
+
+    panel: ClassVar[str] = "Registration"
+    transforms: Annotated[
+        list[Path] | None,
+        Option(
+            "FILE",
+            "Move the mesh by the map that resamples images from the moving to the fixed image, "
+            "whose mesh it is (ITK, ANTs, FSL, AFNI, SPM); repeated in the order of "
+            "antsApplyTransforms: nodes pass the first file first.",
+            "transform",
+        ),
+    ] = None
+    inverse: Annotated[
+        bool, Option(None, "Move by the inverse: the mesh is of the registration's moving image.")
+    ] = False
+    fixed: Annotated[
+        Path | None, Option("IMAGE", "The registration's fixed image, for FSL's matrix.")
+    ] = None
+
+
+UNMOVED = MoveOptions()
+
+
+@dataclass(frozen=True, kw_only=True)
 class EngineOptions:
     """Settings of the optimisation."""
 
@@ -584,7 +610,9 @@ class OutputOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunOptions(SolverOptions, EngineOptions, StartOptions, SizeOptions, ContentOptions):
+class RunOptions(
+    SolverOptions, EngineOptions, MoveOptions, StartOptions, SizeOptions, ContentOptions
+):
     """Options of the runs of many subjects: all except images, outputs and workers."""
 
 
@@ -593,6 +621,7 @@ class JobOptions(
     OutputOptions,
     SolverOptions,
     EngineOptions,
+    MoveOptions,
     StartOptions,
     SizeOptions,
     SourceOptions,
