@@ -114,9 +114,7 @@ def method_figure() -> Figure:
     """
     image = tetopt.load_phantom("fig2_2d").image()
     lattice = tetopt.lattice_mesh(image, nodes=113)
-    moved = {
-        n: tetopt.optimize(image, lattice, k_D=0.5, iterations=n, tolerance=0.0) for n in (1, 20)
-    }
+    moved = {n: tetopt.optimize(image, lattice, k_D=0.5, iterations=n) for n in (1, 20)}
     graded = tetopt.mesh_image(image, nodes=113)
     figure = Figure(figsize=(9.4, 5.9), layout="constrained")
     panels = figure.subplots(2, 3)

@@ -8,6 +8,7 @@ import pytest
 import SimpleITK as sitk
 from commands import assert_done, in_copy_of, numbers_in, refusals, run_command
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.ndimage import binary_dilation
 
 import tetopt
 from tetopt import Image, load_image, load_mesh, save_image, save_mesh
@@ -130,11 +131,12 @@ def test_the_inverse_and_several_files_undo_each_other():
 
 
 def test_inverted_cells_are_counted_and_untangled():
-    """A field with a fold of 20 mm at the voxel of the node that is nearest to the middle."""
+    """A field with a fold of 20 mm along each axis around the node nearest to the middle."""
     image, points = load_image("image.nii.gz"), load_mesh("bare.vtu").mesh.points
     node = np.argmin(((points - points.mean(axis=0)) ** 2).sum(axis=1))
     shifts = np.zeros((*image.shape, 1, 3), dtype=np.float32)
-    shifts[tuple(np.rint(image.to_index(points[node])).astype(int))] = 20.0
+    low = np.floor(image.to_index(points[node])).astype(int)
+    shifts[tuple(slice(at, at + 2) for at in low)] = 20.0
     field = nibabel.Nifti1Image(shifts, image.affine)
     field.header.set_intent("vector")
     nibabel.save(field, "fold.nii.gz")
@@ -166,6 +168,29 @@ def test_fsl_matrices_move_from_the_fixed_to_the_moving_image():
     assert_allclose(load_mesh("moved.vtu").mesh.points, expected, atol=1e-3)
 
 
+def test_a_mesh_starts_from_a_moved_one_and_keeps_its_cells_labels_and_sets():
+    """In one command; the subject's mask is a little larger than the moved ball."""
+    image, mask = load_image("image_s.nii.gz"), load_image("mask_s.nii.gz")
+    more = binary_dilation(mask.data > 0)
+    save_image("larger.nii.gz", Image(1.0 * more, mask.affine))
+    places = image.to_world(np.moveaxis(np.indices(image.shape), 0, -1).reshape(-1, 3))
+    is_one = ((places - A[:3, 3]) @ A[:3, 0] > 0).reshape(image.shape)
+    save_image("labels.nii.gz", Image(1.0 * is_one, mask.affine))
+    words = "--start labelled.vtu --transform affine.mat --keep-connectivity --mask larger.nii.gz"
+    words += " --labels labels.nii.gz -o s.vtu --json s.json"
+    said = run_command(f"mesh image_s.nii.gz {words}", code=None)
+    before, after = load_mesh("labelled.vtu"), load_mesh("s.vtu")
+    assert "its cells, labels and sets stay, and nodes move" in said.err
+    assert_array_equal(after.mesh.cells, before.mesh.cells)
+    assert_array_equal(after.labels, before.labels)
+    numbers = numbers_in("s.json")
+    assert numbers["request"]["options"]["keep-connectivity"] is True
+    assert [name for name, _ in numbers["request"]["files"]["transform"]] == ["affine.mat"]
+    assert numbers["mask"]["dice"] > 0.9
+    for name, rows in before.sets.facets.items():
+        assert_array_equal(after.sets.facets[name], rows)
+
+
 test_what_cannot_be_moved_is_refused = refusals("""
 convert bare.vtu o.vtu --inverse
     --inverse: needs --transform
@@ -177,6 +202,12 @@ convert bare.vtu o.vtu --transform mask.nii.gz
     mask.nii.gz: expected a dense field
 convert bare.vtu o.vtu --transform affine.mat --labels mask.nii.gz
     --transform and --labels: convert first with one
+mesh image.nii.gz -o o.vtu --keep-connectivity
+    --keep-connectivity: needs --start
+mesh image.nii.gz -o o.vtu --transform affine.mat
+    --transform: needs --start
+mesh image.nii.gz -o o.vtu --start bare.vtu --keep-connectivity --nodes 300
+    --start and --nodes: bare.vtu already has nodes
 convert bare.vtu o.nii.gz --transform affine.mat --like image.nii.gz --fields mean
     --transform: has no effect on o.nii.gz, an image
 """)

@@ -24,7 +24,8 @@ TABLE_SUFFIXES = (".tsv", ".csv")
 SUBJECT_COLUMNS = ("subject", "participant_id")  # the second is from BIDS
 SESSION_COLUMNS = ("session", "session_id")
 # of `tetopt mesh`, with files
-FILE_OPTIONS = ("mask", "labels", "tissues", "sizing", "start", "label_names")
+FILE_OPTIONS = ("mask", "labels", "tissues", "sizing", "start", "transform", "fixed", "label_names")
+SEPARATORS = {"tissues": ",", "transform": ";"}  # of several files of an option
 # of participants in BIDS and other tables; some resemble options, as site does set
 NOTE_COLUMNS = ("age", "sex", "handedness", "group", "site", "weight", "height", "strain")
 LEAST_RESEMBLANCE = 0.75  # of difflib's ratio: a column like an option is one with a slip
@@ -200,8 +201,9 @@ def with_files(options: dict[str, str], function: Callable[[str], Path | str]) -
     changed = {}
     for name, text in options.items():
         if name in FILE_OPTIONS:
-            files = text.split(",") if name == "tissues" else [text]
-            changed[name] = ",".join(
+            separator = SEPARATORS.get(name, "\0")
+            files = text.split(separator)
+            changed[name] = separator.join(
                 file if is_preset_table(Path(file)) else str(function(file.strip()))
                 for file in files
             )

@@ -32,7 +32,7 @@ from tetopt.engine.complex import (
 )
 from tetopt.engine.density import Limits, compact_state, exchange
 from tetopt.engine.flips import _evaluate_cells, _evaluate_triangles, flip
-from tetopt.engine.label_state import meet_everywhere, mend_pinches, with_labels
+from tetopt.engine.label_state import follow_labels, meet_everywhere, mend_pinches, with_labels
 from tetopt.engine.labelling import LabelVoxels, label_voxels
 from tetopt.engine.loop import (
     MIN_DIHEDRAL,
@@ -85,6 +85,7 @@ ATTRACTED_MIN_DIHEDRAL = 4.0
 # Most cells on a mask's boundary that may be removed if nothing lifts them: a fraction of all
 # cells, or this number.
 FLAT_CELLS_FRACTION, FLAT_CELLS = 0.005, 10
+CONVERGED_FALL = 5e-4  # of E in an iteration: a run ends if E falls by less
 MEND_ROUNDS = 3  # of lifting and removing cells, at the end
 FAR_TICKS = -(1 << 40)  # a place far from any other
 
@@ -101,12 +102,12 @@ def optimize(
     boundary: Boundary = "slide",
     nodes: int | None = None,
     sizes: Sizes | None = None,
-    tolerance: float = 5e-4,
     max_seconds: float | None = None,
     callback: Callable[[IterationRecord], None] | None = None,
     stop: Callable[[], bool] | None = None,
     keep: Callable[[Mesh, Ints | None], None] | None = None,
     cell_labels: Ints | None = None,
+    keep_connectivity: bool = False,
 ) -> MeshingResult:
     """Move and reconnect the nodes of a mesh to lower E.
 
@@ -145,9 +146,6 @@ def optimize(
         shape energy is that of Eq. (1).
     sizes : Sizes, optional
         Targets and limits for the edges that exchanges make, with `nodes`.
-    tolerance : float
-        The run ends if E falls by less, relatively, in an iteration; it has converged if E does not
-        rise by more.
     max_seconds : float, optional
         Stop at the next colour of nodes after this time; the mesh is valid. Lifting cells above the
         minimum dihedral angle may take another tenth of the run's time, or half a second; the
@@ -163,6 +161,10 @@ def optimize(
     cell_labels : (M,) int, optional
         Label of each cell of `mesh`, for a content without labels. The cells of the result have
         labels, too; nodes and facets between two labels stay unchanged to the last bit.
+    keep_connectivity : bool
+        Only move nodes: nodes and cells keep their numbers, cells their `cell_labels`, whose
+        interfaces follow those of the content's labels, if it has any. Its number of cells below
+        `min_dihedral` may stay above 0.
 
     Returns
     -------
@@ -203,7 +205,10 @@ def optimize(
     content = plain(image)
     outside_fraction(mesh, content.given)
     sizes = (Sizes() if sizes is None else sizes).prepared(content.image.ndim)
-    run = Run(content, mesh, k_D, shape_power, boundary, nodes is not None, cell_labels)
+    if keep_connectivity and nodes is not None:
+        raise InputError("keep_connectivity: the nodes are those of the mesh; leave out nodes")
+    is_graded = nodes is not None or keep_connectivity
+    run = Run(content, mesh, k_D, shape_power, boundary, is_graded, cell_labels, keep_connectivity)
     min_dihedral = min_dihedral if run.n == 3 else 0.0
     # Iterations that may exchange nodes: shape alone does not determine where to add nodes.
     n_early = int(EXCHANGING_FRACTION * iterations) if k_D > 0.0 or sizes.has_target else 0
@@ -211,7 +216,6 @@ def optimize(
         iterations,
         n_early,
         min_dihedral,
-        tolerance,
         nodes,
         sizes,
         carves=boundary != "fixed",
@@ -239,7 +243,6 @@ class Course(NamedTuple):
     iterations: int
     n_early: int  # the first ones, which exchange nodes
     min_dihedral: float  # degrees
-    tolerance: float  # as of `optimize`
     nodes: int | None  # as of `optimize`
     sizes: Sizes
     carves: bool  # True if the last iteration removes cells at pinches of a mask's boundary
@@ -271,6 +274,7 @@ def follow_course(
         run.keep_min_dihedral(min_dihedral)
     is_late = grace(begin, is_over)
     has_labels = run.content.memberships is not None and run.state.objective.image > 0.0
+    has_labels = has_labels and not run.keeps_cells
     for iteration in range(1, course.iterations + 1):
         before = run.state.complex.ticks.copy()
         # not of a run that ends here, whose mesh is first kept
@@ -284,7 +288,8 @@ def follow_course(
         # 2. Exchange cells: if nodes are exchanged next, only at first, as cells around them change
         # anyway.
         does_exchange = is_early and is_finished and iteration % 2 == 1
-        n_changes = run.flip() if is_finished and (iteration == 1 or not does_exchange) else 0
+        flips = is_finished and (iteration == 1 or not does_exchange) and not run.keeps_cells
+        n_changes = run.flip() if flips else 0
         movement = run.movement(before)
         # E is defined differently: nothing has settled yet
         is_new = is_labelled or (has_labels and not run.has_labels)
@@ -299,7 +304,7 @@ def follow_course(
         is_last = (
             iteration == course.iterations
             or not is_finished
-            or (fall < course.tolerance and not is_early)
+            or (fall < CONVERGED_FALL and not is_early)
         )
         n_lifted, n_gone = run.mend(course.carves, min_dihedral, is_late) if is_last else (0, 0)
         n_changes, fall = n_changes + n_lifted + n_gone, np.inf if n_lifted > 0 else fall
@@ -307,8 +312,8 @@ def follow_course(
         record(iteration, movement, n_changes > 0)
         if not is_finished:
             return history, "over"
-        if is_last and fall < course.tolerance:  # interfaces that follow their surfaces may raise E
-            return history, "converged" if abs(fall) < course.tolerance else "risen"
+        if is_last and fall < CONVERGED_FALL:  # interfaces that follow their surfaces may raise E
+            return history, "converged" if abs(fall) < CONVERGED_FALL else "risen"
     return history, "iterations"
 
 
@@ -395,30 +400,43 @@ class Run:
         boundary: Boundary = "slide",
         is_graded: bool = False,
         cell_labels: Ints | None = None,
+        keeps_cells: bool = False,
     ) -> None:
         """Take the arguments of `tetopt.engine.state.state_of`, and labels of cells to keep.
 
-        With these, cells of different labels have nodes of their own, which stay where they are.
+        With these, cells of different labels have nodes of their own, which stay where they are;
+        if the run `keeps_cells`, they share nodes, which follow the content's labels if there are
+        any.
         """
         self.content, self.image, self.n = content, content.image, content.image.ndim
+        self.keeps_cells = keeps_cells
         self.kept_labels: Ints | None = None
-        if cell_labels is not None:
+        follows = keeps_cells and content.memberships is not None
+        if follows:
+            row_of_cell = check_followed(cell_labels, content, mesh)
+        elif cell_labels is not None:
             check_cell_labels(cell_labels, content, mesh, boundary)
             self.kept_labels, part = np.unique(cell_labels, return_inverse=True)
             before, cells, is_shared = split_nodes(mesh.cells, part)
-            mesh = Mesh(mesh.points[before], cells)
+            if keeps_cells:
+                is_shared = np.isin(np.arange(len(mesh.points)), before[is_shared])
+            else:
+                mesh = Mesh(mesh.points[before], cells)
         self.grid = channel_grid(content, mesh.points)
         self.state: State = state_of(content, mesh, self.grid, k_D, power, boundary, is_graded)
-        if cell_labels is not None:
+        if self.kept_labels is not None:
             self.state.complex.labels[: len(part)] = part
             self.state.complex.is_frozen[is_shared, :3] = True
-        ticks, is_exact = self.state.complex.ticks, boundary == "fixed" or cell_labels is not None
+        is_exact = boundary == "fixed" or self.kept_labels is not None
+        ticks = self.state.complex.ticks
         is_kept = self.is_still if is_exact else np.zeros(len(ticks), dtype=bool)
         self.kept = dict(
             zip(map(tuple, ticks[is_kept].tolist()), mesh.points[is_kept], strict=True)
         )
         self.groups, self.edge = blocks(ticks), _edges(mesh.points, mesh.cells)
-        self.has_labels = False
+        self.has_labels = follows
+        if content.smooth is not None and follows:
+            self.state = follow_labels(self.state, content, content.smooth, row_of_cell)
         self.label_voxels: LabelVoxels | None = None  # computed when needed
         # Variance of the noise, estimated when first needed.
         self.image_noise: float | None = None
@@ -598,11 +616,11 @@ class Run:
         Returns the numbers of moves and of removed cells.
         """
         n_lifted = n_gone = 0
-        for _ in range(MEND_ROUNDS):
+        for _ in range(1 if self.keeps_cells else MEND_ROUNDS):
             n_lifted += (
                 self.lift(min_dihedral, carves, is_late) if self.n_below(min_dihedral) > 0 else 0
             )
-            n_new = self.mend_surfaces(carves, min_dihedral)
+            n_new = 0 if self.keeps_cells else self.mend_surfaces(carves, min_dihedral)
             n_gone += n_new
             if n_new == 0 or self.n_below(min_dihedral) == 0 or is_late():
                 break
@@ -619,7 +637,7 @@ class Run:
         minimum dihedral angle.
         """
         before = self.state if self.content.region is None else copy_state(self.state)
-        made = repair(self.state, degrees, is_late)
+        made = repair(self.state, degrees, is_late, reconnects=not self.keeps_cells)
         if self.content.region is not None:
             n_over = int(self._overlapping(made.state).sum())
             if n_over > (self.most_gone if carves else 0):
@@ -739,7 +757,7 @@ class Run:
     def mesh(self) -> Mesh:
         """The current mesh; nodes of several labels at one place are one node."""
         points, cells = self.points(), self.cells
-        if self.kept_labels is not None:
+        if self.kept_labels is not None and not self.keeps_cells:
             _, first, number = np.unique(
                 self.state.complex.ticks, axis=0, return_index=True, return_inverse=True
             )
@@ -754,6 +772,26 @@ def _edges(points: Floats, cells: Ints) -> Floats:
     total = np.bincount(around, np.repeat(volumes(points, cells), n + 1), len(points))
     mean = total / np.maximum(np.bincount(around, minlength=len(points)), 1)
     return regular_edge(mean, n)
+
+
+def check_followed(cell_labels: Ints | None, content: Content, mesh: Mesh) -> Ints:
+    """Return the row of each cell's label among the content's labels, (M,), which it keeps.
+
+    Raises InputError for cells without a label, or with one that the content lacks.
+    """
+    assert content.memberships is not None
+    known = content.memberships.labels
+    if np.shape(cell_labels) != (len(mesh.cells),):
+        raise InputError(
+            "keep_connectivity: the image has labels, and the cells have none to keep; leave out "
+            "`labels`, or give the mesh labels (`tetopt convert`)"
+        )
+    if len(lost := np.setdiff1d(cell_labels, known)):
+        raise InputError(
+            f"keep_connectivity: cells have the labels {lost[:5].tolist()}, which the image's "
+            f"labels lack: {known[:20].tolist()}"
+        )
+    return np.searchsorted(known, cell_labels)
 
 
 def check_cell_labels(cell_labels: Ints, content: Content, mesh: Mesh, boundary: str) -> None:

@@ -46,13 +46,21 @@ def with_labels(
 
     `voxels` is the information on the labels' voxels (`label_voxels`).
     """
-    members, own_channel, own_value, keeps_volumes = smooth
-    n_cells, image = len(mesh.cells), content.image
-    across = state.complex.across[:n_cells]
-    contents = cell_contents(image, members, mesh, voxels)
-    state.complex.labels[:n_cells] = label_cells(
-        mesh.points, mesh.cells, across, contents, voxels.components, keeps_volumes
+    across = state.complex.across[: len(mesh.cells)]
+    contents = cell_contents(content.image, smooth.memberships, mesh, voxels)
+    rows = label_cells(
+        mesh.points, mesh.cells, across, contents, voxels.components, smooth.keeps_volumes
     )
+    return follow_labels(state, content, smooth, rows)
+
+
+def follow_labels(state: State, content: Content, smooth: SmoothLabels, rows: Ints) -> State:
+    """The state with labels for cells, (M,) rows of the content's labels, whose interfaces follow
+    the voxels', and an objective that penalises other labels' voxels.
+    """
+    members, own_channel, own_value, _ = smooth
+    image = content.image
+    state.complex.labels[: len(rows)] = rows
     objective = state.objective._replace(
         n_means=int(content.n_contrasts),
         own_column=np.where(own_channel == 0, 1, 2 + own_channel),

@@ -93,6 +93,17 @@ MODE_DEFAULTS: dict[Mode, ModeDefaults] = {
     "paper": ModeDefaults(UNIFORM_K_D, UNIFORM_ITERATIONS),
     "start": ModeDefaults(START_K_D, UNIFORM_ITERATIONS, "fixed"),
 }
+
+
+def default_options(mode: Mode, keeps_cells: bool, has_region: bool) -> ModeDefaults:
+    """Return a mode's defaults; with fixed connectivity those of a graded mesh's last iterations,
+    whose boundary follows a mask.
+    """
+    if keeps_cells:
+        return ModeDefaults(GRADED_K_D, UNIFORM_ITERATIONS, "slide" if has_region else "fixed")
+    return MODE_DEFAULTS[mode]
+
+
 MODE_ARGUMENTS: dict[Mode, tuple[str, ...]] = {  # arguments that determine the initial mesh
     "graded": ("nodes", "target_error", "nodes_max", "sizes"),
     "uniform": ("nodes", "spacing", "kind"),
@@ -162,7 +173,8 @@ def mesh_image(
         `optimize_paper`, for a single image without labels or mask. "start", the default if `start`
         is given: `optimize` on that mesh.
     start : Mesh
-        The mesh to improve. Its boundary stays unchanged, unless `boundary="slide"`.
+        The mesh to improve. Its boundary stays unchanged, unless `boundary="slide"`; with
+        `keep_connectivity`, which only moves nodes, it follows a mask.
     spacing : float
         Instead of `nodes`, for a lattice: edge length of a block, mm.
     kind : str
@@ -257,7 +269,10 @@ def search_mesh(
     content = plain(image)
     mode = aim.mode or ("graded" if aim.start is None else "start")
     _check_names(options, optimize_paper if mode == "paper" else optimize)
-    aim, options = _complete_aim(content, aim._replace(mode=mode)), _with_defaults(mode, options)
+    aim = _complete_aim(content, aim._replace(mode=mode))
+    keeps_cells = bool(options.get("keep_connectivity"))
+    defaults = default_options(mode, keeps_cells, content.region is not None)
+    options = _with_defaults(defaults._asdict(), options)
     content = content._replace(is_flat=content.is_flat and aim.order == 1)
     runs, starts, best = list[SearchRun](), list[NDArray](), list[MeshingResult]()
     is_over = deadline(begin, options.get("max_seconds"), options.get("stop"))
@@ -437,11 +452,8 @@ def check_memory_of(content: Content, nodes: int) -> None:
     )
 
 
-def _with_defaults(mode: Mode, options: dict[str, Any]) -> dict[str, Any]:
-    """The options of an optimisation; the defaults of the mode for those that are None or
-    missing.
-    """
-    defaults = MODE_DEFAULTS[mode]._asdict()
+def _with_defaults(defaults: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
+    """The options of an optimisation; the defaults for those that are None or missing."""
     return defaults | {
         name: each for name, each in options.items() if each is not None or name not in defaults
     }

@@ -80,13 +80,16 @@ def _fill_cosines(cosines: Floats1, state: State) -> None:
 
 
 def repair(
-    state: State, min_dihedral: float, is_over: Callable[[], bool] = lambda: False
+    state: State,
+    min_dihedral: float,
+    is_over: Callable[[], bool] = lambda: False,
+    reconnects: bool = True,
 ) -> Repaired:
     """Lift every cell's smallest dihedral angle to `min_dihedral`, degrees, as far as moves can.
 
     Each round treats the cells below, the worst first: by flips, then by displacements of their
     nodes and, if neither helps, by inserting or removing nodes. Rounds end when no cell remains,
-    nothing changes, or `is_over` returns True.
+    nothing changes, or `is_over` returns True. Unless it `reconnects`, nodes are displaced only.
     """
     target = -np.cos(np.radians(min_dihedral))
     source, n_moves = np.arange(len(state.complex.ticks)), 0
@@ -99,15 +102,16 @@ def repair(
         if len(state.complex.cells) - state.complex.n_cells[0] < 4 * len(bad) + 64:
             state = grow_state(state)
         before = state.complex.cells[: state.complex.n_cells[0]].copy()
-        n_made = _reconnect(
-            state, bad, target, cavity(len(state.complex.cells), state.complex.fluxes.shape[2])
-        )
+        n_made = 0
+        if reconnects:
+            work = cavity(len(state.complex.cells), state.complex.fluxes.shape[2])
+            n_made = _reconnect(state, bad, target, work)
         _free_changed(is_stuck, before, state.complex.cells[: state.complex.n_cells[0]])
         bad = _worst_first(state, target)
         if len(bad):
             n_made += _displace_until(state, bad, target, is_over, is_stuck)
         bad = _worst_first(state, target)
-        if n_made == 0 and len(bad):
+        if n_made == 0 and len(bad) and reconnects:
             mended = mend(state, bad, target)
             state, n_made = mended.state, mended.n_split + mended.n_collapsed
             source = np.where(mended.source >= 0, source[mended.source], -1)

@@ -28,11 +28,11 @@ from tetopt.system.arrays import Floats
 from tetopt.system.extras import install_hint
 from tetopt.system.incoming import regular_file
 
-LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
+LPS_AXES = np.diag([-1.0, -1.0, 1.0, 1.0])  # from RAS+, or back
 MATLAB_SUFFIX, HDF5_SUFFIXES, NIFTI_SUFFIXES = ".mat", (".h5", ".hdf5"), (".nii", ".nii.gz")
 TEXT_HEAD = "#Insight Transform File"
 VECTOR_INTENTS = {1007: "lps", 1006: "ras"}  # of ITK's files: vectors, displacements
-REACH_VOXELS = 0.5 + 1e-6  # beyond the outer voxel centres, to the field's end
+FIELD_EDGE_VOXELS = 0.5 + 1e-6  # beyond the outer voxel centres, to the field's end
 LEAST_DETERMINANT = 1e-9  # of a linear transform, over the product of its columns' lengths
 INVERSE_MM = 1e-9  # of a coordinate: an inverse is exact to this
 INVERSE_STEPS = 60  # at most, by Newton's method
@@ -64,9 +64,9 @@ class Dense(NamedTuple):
     def __call__(self, points: Floats) -> Floats:
         """Map points (K, 3), mm; InputError for points that the field does not cover."""
         index = Linear(np.linalg.inv(self.affine))(points)
-        most = np.array(self.shifts.shape[:3]) - 1.0 + REACH_VOXELS
+        most = np.array(self.shifts.shape[:3]) - 1.0 + FIELD_EDGE_VOXELS
         moved = points + self._shifts_at(index)
-        is_out = ((index < -REACH_VOXELS) | (index > most)).any(axis=1)
+        is_out = ((index < -FIELD_EDGE_VOXELS) | (index > most)).any(axis=1)
         is_out |= ~np.isfinite(moved).all(axis=1)
         if is_out.any():
             raise InputError(
@@ -258,7 +258,7 @@ def _itk_step(kind: str, values: NDArray, fixed: NDArray) -> Linear | Dense:
         affine[:3, :3] = fixed[9:18].reshape(3, 3) * fixed[6:9]
         affine[:3, 3] = origin
         shifts = values.reshape(*shape[::-1], 3).transpose(2, 1, 0, 3)
-        return Dense(shifts * np.diag(LPS)[:3], LPS @ affine)
+        return Dense(shifts * np.diag(LPS_AXES)[:3], LPS_AXES @ affine)
     if name in ("AffineTransform", "MatrixOffsetTransformBase"):
         turn, shift = values[:9].reshape(3, 3), values[9:12]
     elif name == "Euler3DTransform":
@@ -280,13 +280,15 @@ def _itk_step(kind: str, values: NDArray, fixed: NDArray) -> Linear | Dense:
     matrix = np.eye(4)
     matrix[:3, :3] = turn
     matrix[:3, 3] = shift + fixed[:3] - transform_vectors(fixed[:3], turn)
-    return _check_linear(LPS @ matrix @ LPS)
+    return _check_linear(LPS_AXES @ matrix @ LPS_AXES)
 
 
 def _matrix_of(numbers: NDArray, fixed: Image | None, moving: Image | None) -> Floats:
     """Return AFNI's 12 numbers or FSL's 16 as a matrix from the fixed to the moving image."""
     if len(numbers) == 12:
-        return np.asarray(LPS @ np.vstack([numbers.reshape(3, 4), [0.0, 0.0, 0.0, 1.0]]) @ LPS)
+        return np.asarray(
+            LPS_AXES @ np.vstack([numbers.reshape(3, 4), [0.0, 0.0, 0.0, 1.0]]) @ LPS_AXES
+        )
     if len(numbers) != 16:
         raise InputError(
             f"expected a transform of ITK, ANTs, FSL (16 numbers), AFNI (12) or SPM, got "
@@ -339,7 +341,9 @@ def _dense_of(path: Path) -> Dense:
             f"its vectors' axes are not stated: expected the intent 1007 of ITK's fields, or SPM's "
             f"y_*.nii, got intent {intent}"
         )
-    return Dense(values * np.diag(LPS)[:3] if VECTOR_INTENTS[intent] == "lps" else values, affine)
+    return Dense(
+        values * np.diag(LPS_AXES)[:3] if VECTOR_INTENTS[intent] == "lps" else values, affine
+    )
 
 
 def _read_nifti(path: str) -> tuple[NDArray, NDArray, int, bool]:

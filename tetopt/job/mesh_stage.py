@@ -73,7 +73,8 @@ def mesh_task(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
     job = task.plan.job
     content = task.source.content
     options = task.plan.engine_options
-    options |= {} if task.regions is None else {"cell_labels": task.regions}
+    kept = task.kept_labels if job.keep_connectivity else task.regions
+    options |= {} if kept is None else {"cell_labels": kept}
     ends = None if job.max_seconds is None else begin + job.max_seconds
     left = None if ends is None else ends - time.perf_counter()
     options |= {"max_seconds": left, "stop": stop}

@@ -33,7 +33,7 @@ from tetopt.model.file import (
 from tetopt.system.arrays import Arrays, Floats
 
 IMAGE_FIELD = r"(mean|variance)(_\d+)?|n_voxels|min|max"  # of cells, by the old image
-WORSE = 1e-3  # of Dice or correlation: a loss above rounding
+WORSE_FALL = 1e-3  # of Dice or correlation: a loss above rounding
 
 
 def move_file(loaded: MeshFile, move: MoveOptions, image: Path | None) -> MeshFile:
@@ -129,7 +129,7 @@ def tell_fit(before: MeshFile, mesh: Mesh, content: Content, name: object) -> No
     what = "correlation of the cells' means" if content.own_mask is None else "Dice of the mask"
     old, new = (_fit(each, mean, content) for each in (before.mesh, mesh))
     words = f"{name}: {what} {old:.3f} before the move, {new:.3f} after it"
-    if new < old - WORSE:
+    if new < old - WORSE_FALL:
         warning(
             f"{words}: worse. Nodes of the fixed image's mesh move by the map that resamples "
             "images from the moving to the fixed one; for the other way, pass `inverse`, or leave "

@@ -391,6 +391,14 @@ class StartOptions(MeshPart):
         Path | None,
         Option("MESH", "Improve this mesh and keep its boundary, instead of building a new one."),
     ] = None
+    keep_connectivity: Annotated[
+        bool,
+        Option(
+            None,
+            "With `start`: only move its nodes; cells keep their labels, and boundary and "
+            "interfaces follow `mask` and `labels`.",
+        ),
+    ] = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -429,7 +437,8 @@ class EngineOptions:
         Option(
             "K",
             "Weight of the image: 0 shape only; 0.9 image first "
-            f"(default {GRADED_K_D:g}; `uniform` {UNIFORM_K_D:g}; `start` {START_K_D:g}).",
+            f"(default {GRADED_K_D:g}; `uniform` {UNIFORM_K_D:g}; `start` {START_K_D:g} without "
+            "`keep_connectivity`).",
         ),
     ] = None
     iterations: Annotated[

@@ -14,9 +14,9 @@ from tetopt.engine.aim import Mode, nodes_per_corner
 from tetopt.engine.fast import check_options
 from tetopt.engine.loop import DEFAULT_NODES, MIN_DIHEDRAL, SHAPE_POWER, TARGET_NODES_MAX
 from tetopt.engine.meshing import (
-    MODE_DEFAULTS,
     check_target_error,
     default_nodes,
+    default_options,
     sizes_of_order,
     with_label_sizes,
 )
@@ -27,7 +27,7 @@ from tetopt.io.images import check_bounds, file_shape, parse_crop, parse_slice, 
 from tetopt.io.label_tables import NO_TABLE, LabelTable
 from tetopt.job.aligned import read_companion
 from tetopt.job.option_values import balance_of, label_sizes_of, number_of
-from tetopt.job.options import JobOptions, MeshPart, Method
+from tetopt.job.options import JobOptions, MeshPart, Method, MoveOptions
 from tetopt.job.solver_files import check_solver_options
 from tetopt.model.mappings import named_file
 from tetopt.model.tissues import groups_of
@@ -118,7 +118,8 @@ class Plan(NamedTuple):
         options = {"k_D": job.k_D, "iterations": job.iterations, "boundary": job.boundary}
         if self.mode == "paper":
             return options | {"n_t": job.n_t, "retessellate": job.retessellate}
-        return options | {"shape_power": job.shape_power, "min_dihedral": job.min_dihedral}
+        options |= {"shape_power": job.shape_power, "min_dihedral": job.min_dihedral}
+        return options | ({"keep_connectivity": True} if job.keep_connectivity else {})
 
 
 def kind_of(plan: Plan, ndim: int) -> str:
@@ -303,6 +304,7 @@ def _mode(job: JobOptions) -> Mode:
             )
     if job.start is not None:
         regions = ("lattice", "mask", "background", "keep_labels", "drop_labels")
+        regions = regions[:1] if job.keep_connectivity else regions
         others = [*counts, *(name for name in regions if getattr(job, name) is not None)]
         if others := [*others, *["uniform"] * job.uniform]:
             raise InputError(
@@ -314,7 +316,8 @@ def _mode(job: JobOptions) -> Mode:
                 "`start`: only with `method` fast, which preserves a non-convex boundary"
             )
         return "start"
-    if stated := [name for name in vars(MeshPart()) if getattr(job, name) is not None]:
+    of_start = vars(MeshPart()) | vars(MoveOptions()) | {"keep_connectivity": False}
+    if stated := [name for name, none in of_start.items() if getattr(job, name) != none]:
         raise InputError(f"`{stated[0]}`: needs `start`")
     if is_paper:
         return "paper"
@@ -324,7 +327,7 @@ def _mode(job: JobOptions) -> Mode:
 
 def _complete_options(job: JobOptions, mode: Mode) -> JobOptions:
     """Return the engine's options with the mode's defaults; raise InputError for invalid ones."""
-    default = MODE_DEFAULTS[mode]
+    default = default_options(mode, job.keep_connectivity, has_region(job))
     k_D = default.k_D if job.k_D is None else job.k_D
     iterations = default.iterations if job.iterations is None else job.iterations
     if not 0.0 <= k_D < 1.0:

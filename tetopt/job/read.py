@@ -14,6 +14,7 @@ from tetopt.job.events import note, start_stage, warnings_heard
 from tetopt.job.field_files import read_fields
 from tetopt.job.job import Job
 from tetopt.job.mesh_file import check_mesh_place, label_table, read_mesh, warn_of_other_image
+from tetopt.job.moved import move_file, tell_fit
 from tetopt.job.plan import (
     Plan,
     changed_options,
@@ -70,7 +71,8 @@ def read_planned(plan: Plan) -> Task:
     """Read the files of a plan, and fill in the defaults that depend on them."""
     start = regions = None
     if plan.job.start is not None:
-        start = read_mesh(plan.job.start, plan.job)
+        unmoved = read_mesh(plan.job.start, plan.job)
+        start = move_file(unmoved, plan.job, plan.job.images[0])
     with warnings_heard():
         fields = read_fields(plan.job.fields)
     source = read_source(plan.job, plan.job.label_names, loaded=start)
@@ -78,18 +80,22 @@ def read_planned(plan: Plan) -> Task:
         image = source.contrasts[0]
         path = Path(str(plan.job.start))
         check_mesh_place(path, start.mesh, image)
+        if plan.job.transforms:
+            tell_fit(unmoved, start.mesh, source.content, path)
         warn_of_other_image(start, path, source.paths[0], image, is_registered=None)
         if plan.job.order is None and start.order == 2 and format_of(plan.job.output).has_quadratic:
             plan = plan._replace(job=changed_options(plan.job, order=2))
         if not source.table.names and (source.labels is not None or start.labels is not None):
             source = source.with_table(label_table(None, start))
-        if source.labels is None:
+        if plan.job.keep_connectivity:
+            note(f"{path}: its cells, labels and sets stay, and nodes move")
+        elif source.labels is None:
             regions = regions_of(start.labels, start.sets, len(start.mesh.cells))
         if regions is not None:
             n_regions = len(np.unique(regions))
             fixed = f"; nodes between these {n_regions} regions are fixed" * (n_regions > 1)
             note(f"{path}: its labels and cell sets stay{fixed}")
-        elif start.labels is not None:
+        elif start.labels is not None and not plan.job.keep_connectivity:
             note(f"{path}: its labels are dropped for those of the image")
     plan, sizes, by_label = with_numbers(plan, source.content, source.table)
     if by_label is not None:

@@ -62,6 +62,11 @@ class Task(NamedTuple):
     regions: Ints | None = None
     fields: Mapping[str, Image | Field] = {}
 
+    @property
+    def kept_labels(self) -> Ints | None:
+        """Labels of the cells of the mesh to start from, (M,), if there are any."""
+        return None if self.started is None else self.started.labels
+
     def labels_of(self, regions: Ints | None) -> Ints | None:
         """Return the labels of regions of the mesh to start from, (M,); None without labels.
 
@@ -80,7 +85,7 @@ class Task(NamedTuple):
         >>> task.labels_of(np.array([0, 5]))  # doctest: +SKIP
         array([1, 2])
         """
-        of_start = None if self.started is None else self.started.labels
+        of_start = self.kept_labels
         return None if regions is None or of_start is None else of_start[regions]
 
     @property

@@ -65,7 +65,9 @@ def model_with(
         fields = source.fields(mesh, task.labels_of(regions))
     own = Sets({}, {})
     if started is not None:
-        own = surviving_sets(started.mesh, started.sets, mesh, regions)
+        own = started.sets
+        if not task.plan.job.keep_connectivity:
+            own = surviving_sets(started.mesh, own, mesh, regions)
         _warn_of_losses(started, own, source.labels is not None)
     loaded = MeshFile(mesh, fields, {}, n_turned=0, sets=own)
     box = box_of(source.contrasts[0])
