@@ -100,8 +100,8 @@ def local_thickness(
     # No chord lies beyond the box of all labels but that in the corner; gradients look as far.
     box = tuple(
         slice(max(side.start - GRADIENT_VOXELS, 0), min(side.stop + GRADIENT_VOXELS, size))
-        for found in scipy.ndimage.find_objects((rows != rows.flat[0]).view(np.int8))
-        for side, size in zip(found, rows.shape, strict=True)
+        for extent in scipy.ndimage.find_objects((rows != rows.flat[0]).view(np.int8))
+        for side, size in zip(extent, rows.shape, strict=True)
     )
 
     def fill(first: int, stop: int) -> None:
@@ -123,9 +123,9 @@ def local_thickness(
             near = near._replace(crossing=crossing)
         slab = first - ends[0], stop - ends[0]
         wide = max(slab[0] - radius, 0), min(slab[1] + radius, ends[1] - ends[0])
-        found = _thickness(_chords(near, rays, most, axis, wide), near, rays, (axis, *slab))
+        thick = _thickness(_chords(near, rays, most, axis, wide), near, rays, (axis, *slab))
         own = (*box[:axis], slice(begin + first, begin + stop), *box[axis + 1 :])
-        thickness[own] = found[(slice(None),) * axis + (slice(*slab),)]
+        thickness[own] = thick[(slice(None),) * axis + (slice(*slab),)]
 
     if box:
         n_planes = box[axis].stop - box[axis].start
