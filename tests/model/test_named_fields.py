@@ -1,6 +1,7 @@
 """Fields in mappings: images on grids of their own, by name; ranges; images linear in between."""
 
 import json
+import warnings
 
 import numpy as np
 import pytest
@@ -346,3 +347,15 @@ def test_onto_cells_and_back():
     ]
     errors = [np.nanstd(tetopt.field_on_image(MESH, way, field) - field.data) for way in ways]
     assert errors[0] < 0.95 * min(errors[1:])
+
+
+def test_a_grid_coarser_than_cells_is_told():
+    """By the finest grid that the formula names, unless it is linear."""
+    coarse = {"mu": oblique(slope, (5, 5, 5), (9.0, 9.0, 9.0))}
+    with pytest.warns(UserWarning, match=r"\d\d% of the cells .* of field mu .*`average` linear"):
+        build_model(MESH, young="mu", fields=coarse)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*voxel centre")
+        build_model(MESH, young="mu", fields=coarse, average="linear")
+        fine = oblique(slope, (60, 60, 60), (0.7, 0.7, 0.7))
+        build_model(MESH, young="mu*s", fields=coarse | {"s": fine})

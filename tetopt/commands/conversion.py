@@ -129,9 +129,10 @@ def convert_file(
     solver = replace(solver, order=_order_of(loaded, solver, output))
     loaded = _with_straight_edges(loaded) if solver.order == 1 else loaded
     check_solver_options(output, solver, has_materials="young" in loaded.cell_data)
-    if image is None and solver.average is not None:
+    if image is None and solver.average is not None and not solver.fields:
         raise InputError(
-            f"`average`: {solver.average} averages over voxels and needs an image; pass `image`"
+            f"`average`: {solver.average} averages over voxels and needs an image; pass `image` or "
+            "`fields`"
         )
     if not solver.loads:
         solver = replace(solver, loads=_loads_of_file(loaded, choice))
@@ -141,16 +142,14 @@ def convert_file(
     loaded = _of_labels(loaded, choice)
     about = _texts_of(loaded, solver, has_new_results=results is not None)
     box = loaded.box
-    voxels = None
     if image is not None and what is not None:
         about = texts_of(loaded, is_other=True) if is_other else about
         about |= {"image": image.name, "image_sha256": sha256(image)}
-        voxels = what.image
         box = box_of(what.given) if box is None else box
     if box is not None:
         about["box"] = box_text(box)
 
-    model = with_chosen_sets(convert_model(loaded, voxels, solver, about, box), output, solver)
+    model = with_chosen_sets(convert_model(loaded, what, solver, about, box), output, solver)
     save_for_solver(output, model, solver)
     files = {"mesh": mesh.name, "output": output.name, "units": solver.units, "space": solver.space}
     files |= {} if results is None else {"results": results.name}

@@ -117,8 +117,8 @@ def _check_options(
             "`compress` and `loads`: combine them as `loads` compress:5% `loads` pressure:left:1.5"
         )
     check_part(image, part, part.labels)
-    if image is None and model.average is not None:
-        raise InputError("`average`: averages over an image's voxels; pass `image`")
+    if image is None and model.average is not None and not model.fields:
+        raise InputError("`average`: averages over an image's voxels; pass `image` or `fields`")
     check_model_options(model, has_materials=True)
 
 
@@ -166,17 +166,15 @@ def _model(
     about = texts_of(loaded, is_other=is_other)
     box = loaded.box
     whole = None
-    voxels = None
     if what is not None:
         whole = what.given
-        voxels = what.image
         if of_box:
             _check_box(whole, loaded)
         box = box_of(whole)
     about |= {} if box is None else {"box": box_text(box)}
     model = _fill_options(model, loaded, whole, compress)
     return convert_model(
-        loaded, voxels, model, about, box, has_units=model.young != INTENSITY_MAPPING
+        loaded, what, model, about, box, has_units=model.young != INTENSITY_MAPPING
     )
 
 

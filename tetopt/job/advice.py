@@ -31,6 +31,7 @@ from tetopt.measure.judge import (
     is_pocket,
     is_shown,
 )
+from tetopt.model.averages import EMPTY_FRACTION
 from tetopt.model.label_names import count_of_labels, label_words
 from tetopt.start.label_sizes import SizesByLabel
 from tetopt.start.octree import is_for_walls
@@ -56,7 +57,6 @@ LACKING_ACROSS = 0.1  # fraction of the requested cells across a label
 FAR_VOXELS = 1.5  # between the surfaces of mesh and mask, 95th percentile
 MISSED_NODES = 0.01  # fraction of the requested number of nodes
 ENERGY_RISE = 1e-3  # of E above its least value, of E_D above its first, relative
-EMPTY_FRACTION = 0.02  # of the cells
 EDGE_MISS = 1e-3  # of the longest or shortest edge beyond its limit, relative
 LONG_FRACTION = 0.1  # of the edges, far over their targets
 

@@ -12,6 +12,7 @@ from typing import cast, get_args
 import numpy as np
 
 import tetopt
+from tetopt.contents.content import Content
 from tetopt.engine.loop import MeshingResult
 from tetopt.errors import InputError, error_words
 from tetopt.fields.field import Field
@@ -188,12 +189,13 @@ def solver_model(
     about: Json,
     box: Box | None,
     fields: Mapping[str, Image | Field],
+    mask: Image | None = None,
 ) -> Model:
     """Build the model of a mesh, with its data, sets and texts, with the options and their
-    `fields`, as read.
+    `fields`, as read, within the mask unless the texts have one.
     """
     about = {"tetopt": tetopt.__version__, **about}
-    choices = choices_of(options)._replace(fields=fields)
+    choices = choices_of(options)._replace(fields=fields, mask=mask)
     model = model_of_file(loaded, image, choices, about, box)
     return model._replace(is_nonlinear=isinstance(options, SolverOptions) and options.nonlinear)
 
@@ -251,7 +253,7 @@ def with_chosen_sets(model: Model, output: Path, options: ModelOptions) -> Model
 
 def convert_model(
     loaded: MeshFile,
-    image: Image | None,
+    what: Content | None,
     options: ModelOptions,
     about: Json,
     box: Box | None,
@@ -260,6 +262,8 @@ def convert_model(
     """Build the model of a mesh's file, keeping the file's own data, with the options; warn of
     implausible units.
     """
+    image = None if what is None else what.image
+    mask = None if what is None or not options.fields else what.own_mask
     if image is not None:
         check_mesh_place("mesh and image", loaded.mesh, image)
         fields = loaded.cell_data | cell_fields(loaded.mesh, image)
@@ -268,7 +272,7 @@ def convert_model(
     about = about | ({TABLE_TEXT: table} if table.names or table.colours else {})
     with warnings_heard():
         fields = read_fields(options.fields)
-        model = solver_model(loaded, image, options, about, box, fields)
+        model = solver_model(loaded, image, options, about, box, fields, mask)
     if has_units:
         warn_of_units(model)
     return model

@@ -43,6 +43,7 @@ VOXELS_PER_CHUNK = 2**20  # whose positions in their cells are computed at once,
 # along an edge of a cell, for the average "linear": of cells 4 voxels wide or wider, whose values
 # have 2,048 places in a tetrahedron
 MOST_PARTS = 8
+EMPTY_FRACTION = 0.02  # of the cells: a note on more without a voxel
 
 Images = Image | Mapping[str, Image]  # the image, or those that a formula names, without gaps
 
@@ -263,6 +264,11 @@ def gauss_young(node_young: Floats, mesh: Mesh, order: int) -> Floats:
     return np.clip(np.einsum("qa,ca->cq", places, corners), low, high)
 
 
+def finest_of(images: Mapping[str, Image]) -> str:
+    """Return the name of the image of the least volume of a voxel, the first of equal ones."""
+    return min(sorted(images), key=lambda name: images[name].voxel_volume)
+
+
 class _Seen(NamedTuple):
     """What mappings are applied to, on the voxels of one grid."""
 
@@ -281,7 +287,7 @@ def _see_voxels(image: Images, mesh: Mesh) -> _Seen:
     if isinstance(image, Image):
         grid = image = without_gaps(image, mesh)
     else:
-        grid = min(sorted(image.items()), key=lambda named: named[1].voxel_volume)[1]
+        grid = image[finest_of(image)]
     owner = cell_of_voxel(grid, mesh).ravel()
     is_seen = owner >= 0
     if not is_seen.all():

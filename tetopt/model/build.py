@@ -23,10 +23,12 @@ from tetopt.measure.judge import warn_of_other_mask
 from tetopt.mesh import Mesh
 from tetopt.model.averages import (
     DEFAULT_AVERAGE,
+    EMPTY_FRACTION,
     Images,
     cell_values,
     cell_young,
     element_young,
+    finest_of,
     node_young,
     parse_average,
 )
@@ -248,6 +250,7 @@ class Choices(NamedTuple):
     order: int = 1
     units: str = "kPa"  # of moduli and pressures in texts without a unit
     fields: Mapping[str, Image | Field] = {}  # whose images mappings may name
+    mask: Image | None = None  # of the fields' voxels, if the mesh's file has none
 
     @property
     def is_new(self) -> bool:
@@ -305,13 +308,14 @@ def _model(
         raise InputError(f"order: expected 1 or 2, got {order}")
     parse_average(choices.average)
     all_sets = with_requested(mesh, known_sets, choices.sets, cells.mean)
-    cell_data, about = _with_cell_fields(mesh, choices.fields, cell_data, about)
+    mask = choices.mask if about.get(MASK_TEXT) is None else _mask_of(about)
+    cell_data, about = _with_cell_fields(mesh, choices.fields, mask, cell_data, about)
     table = None
     nodal = None
     at_gauss = None
     if choices.young is not None:
         laws = _laws(choices)
-        cells = _with_fields(cells, _images_of(choices), laws, about)
+        cells = _with_fields(cells, _images_of(choices), laws, mask)
         nodal, at_gauss = _varying_moduli(cells, laws.young, choices)
         values = [
             None if law is None else _values(law, name, cells, choices.average)
@@ -442,14 +446,13 @@ def _laws(choices: Choices) -> _Laws:
 
 
 def _with_fields(
-    cells: _ModelCells, fields: Mapping[str, Image], laws: _Laws, about: Json
+    cells: _ModelCells, fields: Mapping[str, Image], laws: _Laws, mask: Image | None
 ) -> _ModelCells:
     """Return the cells with the fields that laws name, each with a value in every voxel.
 
-    A voxel without one, or outside the mask among the texts, has that of the nearest other.
+    A voxel without one, or outside the mask, has that of the nearest other.
     """
     named = [law.names for law in laws if isinstance(law, Formula)]
-    mask = _mask_of(about)
     images = dict(cells.images)
     for name in sorted(fields.keys() & frozenset().union(*named)):
         with prefix_errors(f"field {name}"):
@@ -463,13 +466,17 @@ def _images_of(choices: Choices) -> dict[str, Image]:
 
 
 def _mask_of(about: Json) -> Image | None:
-    """Return the mask among a model's texts, if it has one."""
-    text = about.get(MASK_TEXT)
-    return None if text is None else mask_in(json.loads(text) if isinstance(text, str) else text)
+    """Return the mask among a model's texts, if it is one of ours."""
+    text = about[MASK_TEXT]
+    return mask_in(json.loads(text) if isinstance(text, str) else text)
 
 
 def _with_cell_fields(
-    mesh: Mesh, fields: Mapping[str, Image | Field], cell_data: Arrays, about: Json
+    mesh: Mesh,
+    fields: Mapping[str, Image | Field],
+    mask: Image | None,
+    cell_data: Arrays,
+    about: Json,
 ) -> tuple[Arrays, Json]:
     """Return the data of cells with the values of fields, and the texts with their kinds; tell
     cells and voxels without own data.
@@ -482,7 +489,7 @@ def _with_cell_fields(
         grid = field.grid if is_field else check_image(f"field {name}", field)
         with prefix_errors(f"field {name}"):
             check_place(mesh, grid, f"field {name}")
-            own = cell_field(field, mesh, _mask_of(about))
+            own = cell_field(field, mesh, mask)
         kinds[name] = field.kind if is_field else "scalar"
         cell_data = {**cell_data, name: own.values}
         if own.coherence is not None:
@@ -493,7 +500,10 @@ def _with_cell_fields(
 
 
 def _whole_field(name: str, field: Image, mesh: Mesh, mask: Image | None) -> Image:
-    """Return a field with a value in every voxel; warn of voxels of the mesh that have none."""
+    """Return a field of which every voxel has a value; warn of voxels of the mesh that have none.
+
+    Raises InputError for a field without a value in the mesh.
+    """
     has_value = ~np.isnan(field.data)
     if field.has_gaps:
         is_good = has_value[cell_of_voxel(field, mesh) >= 0]
@@ -581,6 +591,8 @@ def _values(mapping: Any, name: str, cells: _ModelCells, average: str) -> Floats
     if images is not None:  # map each voxel, then average, as in Eq. (2)
         _warn_of_range(mapping, name, cells, images, is_linear=is_linear)
         if name == "young":
+            if isinstance(images, Mapping) and not is_linear:
+                _warn_of_empty_cells(cells.mesh, images)
             return cell_young(images, cells.mesh, mapping, average)
         return cell_values(images, cells.mesh, mapping, is_linear=is_linear)
     if cells.mean is None:
@@ -595,6 +607,19 @@ def _values(mapping: Any, name: str, cells: _ModelCells, average: str) -> Floats
     return (
         young_from(mapping, cells.mean) if name == "young" else mapped_values(mapping, cells.mean)
     )
+
+
+def _warn_of_empty_cells(mesh: Mesh, images: Mapping[str, Image]) -> None:
+    """Warn if many cells contain no voxel of the grid on which a formula is averaged."""
+    name = finest_of(images)
+    owner = np.unique(cell_of_voxel(images[name], mesh))
+    empty = 1.0 - int((owner >= 0).sum()) / len(mesh.cells)
+    if empty > EMPTY_FRACTION:
+        what = "the image" if name == INTENSITY else f"field {name}"
+        warn(
+            f"{empty:.0%} of the cells contain no voxel centre of {what} and take the nearest "
+            "voxel's modulus; take it linear between voxels (`average` linear)"
+        )
 
 
 def _warn_of_range(
