@@ -27,7 +27,9 @@ NOISE = 0.1  # of the stiffness
 def stiffness_map(image, seed=0):
     """The map, kPa, with and without noise, as images around the middle of `image`."""
     turn = scipy.spatial.transform.Rotation.from_euler("xyz", [20, -15, 35], degrees=True)
-    shape = tuple(int(1.6 * n * s / d) for n, s, d in zip(image.shape, image.spacing, SPACING))
+    shape = tuple(
+        int(1.6 * n * s / d) for n, s, d in zip(image.shape, image.spacing, SPACING, strict=True)
+    )
     affine = np.eye(4)
     affine[:3, :3] = turn.as_matrix() * SPACING
     middle = image.to_world((np.array(image.shape) - 1) / 2)

@@ -11,6 +11,8 @@ from commands import assert_done, refusals, run_command
 from numpy.testing import assert_allclose, assert_array_equal
 
 import tetopt
+from tetopt.model.averages import cell_young
+from tetopt.start.carve import part_of
 
 pytestmark = [pytest.mark.full, pytest.mark.usefixtures("here")]
 FIELDS = "--field V=v.nii.gz:direction@fsl --field D=d.nii.gz:tensor@ras-lower --field mu=m.nii.gz"
@@ -119,8 +121,49 @@ def test_outside_the_mask_of_the_mesh_there_is_no_data():
     assert (inside.values != tetopt.cell_field(field, loaded.mesh).values).any()
 
 
+def test_elastography_from_a_map():
+    """From image and map to a solution, in several steps or one, with moduli of the map alone."""
+    law = "--field mu=m.nii.gz --young '3*mu for mu < 2.9' --nu 0.45 --average linear"
+    said = run_command(f"mesh i.nii.gz -o e.vtu --nodes 80 --iterations 0 {law} --load compress:5%")
+    assert re.search(r"young: [\d.]+ % of the mesh's volume is outside of the range", said.err)
+    mu = tetopt.load_image("m.nii.gz")
+    loaded = tetopt.load_mesh("e.vtu")
+    young = cell_young(mu, loaded.mesh, lambda h: 3.0 * h, "linear")
+    assert_allclose(loaded.cell_data["young"], young, rtol=1e-9)
+    assert_done("fem e.vtu -o one.vtu --order 2")
+    assert_done("convert e.vtu f.vtu --young 1")
+    assert_done(f"fem f.vtu -o two.vtu --order 2 --load compress:5% {law}")
+    one, two = (tetopt.load_mesh(f"{each}.vtu").point_data for each in ("one", "two"))
+    assert_allclose(one["displacement"], two["displacement"], atol=1e-9)
+    assert 0.05 < np.abs(one["displacement"][:, :2]).max() < 3.0
+
+
+@pytest.mark.parametrize("mask", ["", "--image i.nii.gz --mask mask.nii.gz"])
+def test_a_map_that_is_0_outside_the_mask(mask):
+    """For another program's mesh the mask is given; the map's zeros would count in its cells."""
+    image = tetopt.load_image("i.nii.gz")
+    ball = tetopt.Image(image.data > 50.0, image.affine)
+    tetopt.save_image("mask.nii.gz", ball)
+    tetopt.save_image("map.nii.gz", tetopt.Image(5.0 * ball.data, image.affine))
+    whole = tetopt.load_mesh("a.vtu").mesh
+    centres = whole.points[whole.cells].mean(axis=1)
+    tetopt.save_mesh("ball.vtu", part_of(whole, (centres**2).sum(axis=1) < 20.0**2))
+    words = "convert ball.vtu b.vtu --field mu=map.nii.gz --young max(3*mu,1) --average mean"
+    assert_done(f"{words} {mask}")
+    young = tetopt.load_mesh("b.vtu").cell_data["young"]
+    assert (young == 15.0).all() == bool(mask)
+
+
 test_refused = refusals(
     """
+convert a.vtu b.vtu --field V=v.nii.gz:direction@fsl --field mu=m.nii.gz --young 2*V
+    --young: formula: expected numbers, h, mu, .* cannot use "V"
+convert a.vtu b.vtu --young 3*mu
+    --young: formula: .* cannot use "mu"; write h for the intensity, or give --field mu=FILE
+convert a.vtu b.vtu --young 3*h --average linear
+    --average: linear averages over voxels and needs an image; pass --image or --field
+convert a.vtu b.vtu --field mu=m.nii.gz --young "3*mu for 7"
+    --young: formula: expected a range, such as 0.1 < h <= 1.8
 convert a.vtu b.vtu --field V=v.nii.gz:direction
     v.nii.gz: the axes of its components are not stated; give them, as direction@FRAME: @fsl
 convert a.vtu b.vtu --field V=v.nii.gz:tensor@fsl
