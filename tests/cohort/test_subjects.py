@@ -14,6 +14,8 @@ from tetopt.cohort.subjects import (
     write_table,
 )
 from tetopt.errors import InputError
+from tetopt.job.options import RunOptions
+from tetopt.job.texts import with_options
 
 
 def table(path, *lines):
@@ -39,6 +41,21 @@ def test_a_table_says_what_is_meshed(tmp_path):
     second = Subject("02", "", (Path("/c.nii"),), options, f"{path}, line 3")
     assert read_table(path) == [first, second]
     assert [key(first), key(second)] == ["sub-01_ses-a", "sub-02"]
+
+
+def test_transforms_are_relative_to_the_table_and_come_back(tmp_path):
+    files = "warp.nii.gz;../affine.mat"
+    path = table(
+        tmp_path / "s.tsv", "subject\timage\tstart\ttransform", f"1\ta.nii\tt.vtu\t{files}"
+    )
+    (row,) = read_table(path)
+    places = [str(tmp_path / "warp.nii.gz"), str(tmp_path.parent / "affine.mat")]
+    assert row.options == {"start": str(tmp_path / "t.vtu"), "transform": ";".join(places)}
+    options = with_options(RunOptions(), row.options)
+    assert [str(each) for each in options.transforms] == places
+    write_table(tmp_path / "again.tsv", [row])
+    (again,) = read_table(tmp_path / "again.tsv")
+    assert again.options == row.options
 
 
 def test_files_of_mappings_are_relative_to_the_table(tmp_path):
