@@ -52,7 +52,7 @@ def test_transforms_are_relative_to_the_table_and_come_back(tmp_path):
     places = [str(tmp_path / "warp.nii.gz"), str(tmp_path.parent / "affine.mat")]
     assert row.options == {"start": str(tmp_path / "t.vtu"), "transform": ";".join(places)}
     options = with_options(RunOptions(), row.options)
-    assert [str(each) for each in options.transforms] == places
+    assert [str(each) for each in options.transform] == places
     write_table(tmp_path / "again.tsv", [row])
     (again,) = read_table(tmp_path / "again.tsv")
     assert again.options == row.options

@@ -63,7 +63,7 @@ SHOWN_OPTIONS = {
     "mesh": f"output json_path figures force dry_run {OF_RUNS}".split(),
     "cohort": f"output suffix participants mesh_format write_table dry_run retry_failed workers "
     f"scheduler {OF_RUNS}".split(),
-    "convert": "results_path transforms inverse units space written_fields like warp json_path "
+    "convert": "results_path transform inverse units space written_fields like warp json_path "
     f"force {OF_MESHES}".split(),
     "fem": f"compress output mask json_path force {OF_MESHES}".split(),
 }

@@ -15,6 +15,7 @@ from tetopt.cohort.options import CohortOptions
 from tetopt.cohort.subject_states import SubjectState, state_of
 from tetopt.cohort.subjects import (
     FILE_OPTIONS,
+    SEPARATORS,
     Problems,
     Subject,
     key,
@@ -46,11 +47,7 @@ class PlannedSubject(NamedTuple):
 
     def row(self) -> Subject:
         """Return the subject with the files that patterns match."""
-        files = {
-            name: str(path)
-            for name in FILE_OPTIONS
-            if (path := getattr(self.plan.bare, name)) is not None
-        }
+        files = _file_texts(self.plan.bare)
         return self.subject._replace(options=self.subject.options | files)
 
     def words(self) -> tuple[str, ...]:
@@ -138,10 +135,7 @@ def _lines(problems: Iterable[tuple[str, str]]) -> Iterator[str]:
 
 def _plan_subject(subject: Subject, options: RunOptions, output: Path) -> Plan:
     """Plan a subject with its files and options; raise InputError for invalid options."""
-    patterns = {
-        name: str(path) for name in FILE_OPTIONS if (path := getattr(options, name)) is not None
-    }
-    texts = with_files(patterns, partial(matching, subject=subject)) | subject.options
+    texts = with_files(_file_texts(options), partial(matching, subject=subject)) | subject.options
     if "threads" in subject.options:
         raise InputError(
             "threads: all subjects use the same number, set by `threads`; remove the column"
@@ -151,6 +145,16 @@ def _plan_subject(subject: Subject, options: RunOptions, output: Path) -> Plan:
     return plan_job(job, reads_files=True)
 
 
+def _file_texts(options: RunOptions | JobOptions) -> dict[str, str]:
+    """Return the files among a run's options, as the cells of a table."""
+    values = {name: getattr(options, name) for name in FILE_OPTIONS}
+    return {
+        name: SEPARATORS[name].join(map(str, value)) if isinstance(value, list) else str(value)
+        for name, value in values.items()
+        if value is not None
+    }
+
+
 def _missing(job: JobOptions) -> Iterator[str]:
     """Yield the problems of a subject's files: missing, broken links, or empty."""
     named = [("image", path) for path in job.images]
@@ -158,10 +162,11 @@ def _missing(job: JobOptions) -> Iterator[str]:
         name: path
         for name in FILE_OPTIONS
         if (path := getattr(job, name)) is not None
-        and name != "tissues"
+        and name not in SEPARATORS
         and not is_preset_table(path)
     }
     named += [*whole.items(), *(("tissues", path) for path in tissue_files(job.tissues))]
+    named += [("transform", path) for path in job.transform or []]
     for number, (name, path) in enumerate(named):
         file = path if number == 0 else file_and_volume(path)[0]  # --volume applies to the first
         try:

@@ -113,9 +113,9 @@ def convert_file(
         raise InputError(
             f"`results`: expected an output file {' or '.join(VTK_SUFFIXES)}, got {output}"
         )
-    if move.transforms and (results is not None or part.labels is not None):
+    if move.transform and (results is not None or part.labels is not None):
         name = "labels" if results is None else "results"
-        raise InputError(f"`transforms` and `{name}`: convert first with one, then with the other")
+        raise InputError(f"`transform` and `{name}`: convert first with one, then with the other")
     check_part(image, part, part.labels)
     before = read_mesh(mesh, part)
     check_unfolded(before.mesh, source=str(mesh))
@@ -137,7 +137,7 @@ def convert_file(
     if not solver.loads:
         solver = replace(solver, loads=_loads_of_file(loaded, choice))
     loaded, what, is_other = voxels_of(loaded, mesh, image, part, part.labels)
-    if move.transforms and what is not None:
+    if move.transform and what is not None:
         tell_fit(before, loaded.mesh, what, image)
     loaded = _of_labels(loaded, choice)
     about = _texts_of(loaded, solver, has_new_results=results is not None)
@@ -154,7 +154,7 @@ def convert_file(
     files = {"mesh": mesh.name, "output": output.name, "units": solver.units, "space": solver.space}
     files |= {} if results is None else {"results": results.name}
     files |= stated_files(part)
-    files |= {"transforms": [each.name for each in move.transforms]} if move.transforms else {}
+    files |= {"transforms": [each.name for each in move.transform]} if move.transform else {}
     return Converted(model, solver, files | {"versions": versions()} | model_summary(model))
 
 

@@ -53,23 +53,23 @@ def move_file(loaded: MeshFile, move: MoveOptions, image: Path | None) -> MeshFi
     Raises
     ------
     InputError
-        As for `load_transform` and `untangle`; an option without `transforms`; a 2-D mesh.
+        As for `load_transform` and `untangle`; an option without `transform`; a 2-D mesh.
     """
-    if not move.transforms:
+    if not move.transform:
         for name in ("inverse", "fixed"):
             if getattr(move, name) not in (None, False):
-                raise InputError(f"`{name}`: needs `transforms`")
+                raise InputError(f"`{name}`: needs `transform`")
         return loaded
     mesh = loaded.mesh
     if mesh.ndim != 3:
-        raise InputError("`transforms`: expected a mesh of tetrahedra, got triangles")
+        raise InputError("`transform`: expected a mesh of tetrahedra, got triangles")
     has_both = move.fixed is not None and image is not None
     ends = (move.fixed, image) if has_both else ()
     images = (read_image(path, WHOLE_BOX) for path in ends if path is not None)
     fixed, moving = images if has_both else (None, None)
-    transform = load_transform(*move.transforms, inverse=move.inverse, fixed=fixed, moving=moving)
+    transform = load_transform(*move.transform, inverse=move.inverse, fixed=fixed, moving=moving)
     there = transform(mesh.points)
-    with prefix_errors(list_names([str(path) for path in move.transforms])):
+    with prefix_errors(list_names([str(path) for path in move.transform])):
         points, n_inverted = untangle(mesh.points, there, mesh.cells)
     moved = Mesh(points, mesh.cells, _moved_midpoints(mesh, transform, points, there))
     way = np.linalg.norm(points - mesh.points, axis=1)

@@ -406,14 +406,13 @@ class MoveOptions:
     """The transform of a registration that moves a mesh from the fixed to the moving image."""
 
     panel: ClassVar[str] = "Registration"
-    transforms: Annotated[
+    transform: Annotated[
         list[Path] | None,
         Option(
             "FILE",
             "Move the mesh by the map that resamples images from the moving to the fixed image, "
             "whose mesh it is (ITK, ANTs, FSL, AFNI, SPM); repeated in the order of "
             "antsApplyTransforms: nodes pass the first file first.",
-            "transform",
         ),
     ] = None
     inverse: Annotated[

@@ -80,7 +80,7 @@ def read_planned(plan: Plan) -> Task:
         image = source.contrasts[0]
         path = Path(str(plan.job.start))
         check_mesh_place(path, start.mesh, image)
-        if plan.job.transforms:
+        if plan.job.transform:
             tell_fit(unmoved, start.mesh, source.content, path)
         warn_of_other_image(start, path, source.paths[0], image, is_registered=None)
         if plan.job.order is None and start.order == 2 and format_of(plan.job.output).has_quadratic:
