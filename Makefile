@@ -91,11 +91,11 @@ test-hostile: $(VENV)/.test
 	PYTHONPATH=scripts PYTHONUTF8=1 NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python -m fuzz --inputs 10000 --workers 2
 	$(TESTED) -q -s --no-header tests/hostile/test_faults.py tests/hostile/test_kills.py
 
-# CalculiX and dolfinx from Debian, MFEM, gmsh (run beside the tests, never imported by tetopt) and pyfebio from PyPI.
+# CalculiX and dolfinx from Debian, MFEM and gmsh (run beside the tests, never imported by tetopt) from PyPI.
 test-solvers: $(VENV)/.test
 	@command -v apt-get >/dev/null || { echo "needs Debian's apt-get; install CalculiX (ccx) and dolfinx, then run: $(BIN)/python -m pytest tests/solvers"; exit 2; }
 	dpkg -s $(SOLVERS) >/dev/null 2>&1 || { apt-get update -qq && apt-get install -y -qq --no-install-recommends $(SOLVERS); }
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check mfem gmsh pyfebio
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check mfem gmsh
 	$(TESTED) tests/solvers tests/model tests/io/test_abaqus.py tests/io/test_febio.py tests/io/test_gmsh.py \
 	  tests/io/test_medit.py tests/io/test_mfem.py tests/io/test_vtk.py tests/io/test_xdmf.py tests/io/test_writers.py
 

@@ -4,6 +4,7 @@ labels, an oblique box.
 
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from meshes import with_bent_edges
@@ -13,12 +14,12 @@ from shapes import grid
 
 import tetopt
 from tetopt.fem.elasticity import lame_constants, stiffness, strains
-from tetopt.geometry.quadratic import cell_edges, quadratic
+from tetopt.geometry.quadratic import cell_edges, of_order, quadratic
 from tetopt.geometry.simplex import volumes
 from tetopt.io.formats import file_bytes
 from tetopt.model.label_names import TABLE_TEXT, LabelTable, table_words
-from tetopt.model.loads import parse_loads
-from tetopt.model.materials import bin_moduli, materials
+from tetopt.model.loads import Load, facet_forces, parse_loads
+from tetopt.model.materials import Along, bin_moduli, materials
 from tetopt.model.model import Model, in_space, in_units
 from tetopt.model.sets import (
     Sets,
@@ -137,6 +138,85 @@ def all_nodes(values, mesh):
         for node, (a, b) in zip(cell[mesh.ndim + 1 :], cell_edges(mesh.ndim), strict=True):
             filled[node] = 0.5 * (values[cell[a]] + values[cell[b]])
     return filled
+
+
+@cache
+def fibre_model(bins=None):
+    """The sample model with a direction in each cell but a few, and moduli of two labels along
+    them; shear and a pull.
+    """
+    model, rng = sample_model(bins=bins), np.random.default_rng(5)
+    mesh, labels = model.mesh, model.labels
+    fibre = rng.normal(size=(len(mesh.cells), 3))
+    fibre[::50] = np.nan
+    stiff, shear = np.where(labels == 1, 9.0, 7.0), np.where(labels == 1, 2.5, 1.5)
+    along = Along(stiff, shear, fibre)
+    table = materials(np.where(labels == 1, 3.0, 2.0), 0.4, len(mesh.cells), 1000.0, along)
+    if bins is not None:
+        table = bin_moduli(table, volumes(mesh.points, mesh.cells), bins)
+    loads = parse_loads(["hold:superior", "traction:inferior:0.02,0.05,0.04"], mesh, model.sets)
+    return model._replace(materials=table, loads=loads)
+
+
+def fibre_compliance(fibre, young, nu, young_along, shear_along):
+    """The compliance (3, 3, 3, 3) of fibres along a vector, from engineering constants in their
+    axes; of one of 0, with isotropic constants, in the world's.
+    """
+    E, G = (young_along, young, young), young / (2.0 * (1.0 + nu))
+    S = np.zeros((3, 3, 3, 3))
+    for i in range(3):
+        S[i, i, i, i] = 1.0 / E[i]
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        ratio = -nu / (young_along if i == 0 else young)
+        S[i, i, j, j] = S[j, j, i, i] = ratio
+        for a, b in ((i, j), (j, i)):
+            S[a, b, a, b] = S[a, b, b, a] = 0.25 / (shear_along if i == 0 else G)
+    first = fibre / np.linalg.norm(fibre) if np.any(fibre) else np.eye(3)[0]
+    axes = np.vstack([first, np.linalg.svd(first[None])[2][1:]])
+    return np.einsum("ia,jb,kc,ld,ijkl->abcd", axes, axes, axes, axes, S)
+
+
+class PulledCube(NamedTuple):
+    """A cube of one material with fibres under a uniform stress, held so that it only strains."""
+
+    model: Model  # without loads
+    is_held: np.ndarray  # (N, 3)
+    forces: np.ndarray  # (N, 3) mN
+    u: np.ndarray  # (N, 3) mm, in closed form
+    stress: np.ndarray  # (3, 3) kPa
+
+
+def pulled_cube(order, fibre=(0.6, -0.3, 0.74)):
+    """A corner rests, and one along x and one along y only move away from it and in their plane."""
+    side, constants = 20.0, (3.0, 0.4, 9.0, 2.5)
+    affine = np.diag([side, side, side, 1.0])
+    affine[:3, 3] = 0.5 * side
+    image = tetopt.Image(np.zeros((1, 1, 1)), affine)
+    mesh = tetopt.lattice_mesh(image, blocks=(3, 3, 3))
+    sets = standard_sets(mesh, box_of(image))
+    n_cells = len(mesh.cells)
+    along = Along(*constants[2:], np.tile(fibre, (n_cells, 1)))
+    table = materials(*constants[:2], n_cells, along=along)
+    model = Model(mesh, {}, sets, table, order=order)
+    stress = np.array([[0.10, 0.02, -0.03], [0.02, -0.05, 0.04], [-0.03, 0.04, 0.20]])
+    points = of_order(mesh.points, mesh.cells, order)[0]
+    forces = np.zeros_like(points)
+    for name, axis, sign in SIDES:
+        load = Load("traction", name, sign * stress[axis])
+        nodes, of_face = facet_forces(mesh, sets, load, order)
+        forces[nodes] += of_face
+    strain = np.einsum("ijkl,kl->ij", fibre_compliance(np.array(fibre), *constants), stress)
+    slope = np.triu(2.0 * strain, 1) + np.diag(np.diag(strain))
+    is_held = np.zeros(points.shape, dtype=bool)
+    for corner, dofs in (((0, 0, 0), 3), ((side, 0, 0), 2), ((0, side, 0), 1)):
+        is_held[np.flatnonzero(np.isclose(points, corner).all(axis=1)), 3 - dofs :] = True
+    return PulledCube(model, is_held, forces, points @ slope.T, stress)
+
+
+SIDES = (
+    *(("left", 0, -1.0), ("right", 0, 1.0), ("posterior", 1, -1.0), ("anterior", 1, 1.0)),
+    *(("inferior", 2, -1.0), ("superior", 2, 1.0)),
+)
 
 
 def young_of(model):

@@ -17,8 +17,9 @@ import pyvista
 import tetopt
 from tetopt.model.loads import facet_forces, spring_constants
 
-# %% openCARP reads a mesh from two text files: the nodes, in micrometres, and the cells with a
-# region each, here their label. Each is a format of its own. Not yet verified in openCARP.
+# %% openCARP reads a mesh from three text files: the nodes, in micrometres, the cells with a
+# region each, here their label, and a direction of fibres in each cell, 0 0 0 where there is none.
+# Each is a format of its own. Not yet verified in openCARP.
 
 
 def pts(model):
@@ -33,19 +34,32 @@ def elem(model):
     return "\n".join([str(len(rows)), *(f"Tt {' '.join(map(str, row))}" for row in rows), ""])
 
 
+def lon(model):
+    """The file of fibres."""
+    rows = (" ".join(map(repr, row)) for row in model.cell_data["fibre"].tolist())
+    return "\n".join(["1", *rows, ""])
+
+
+tetopt.register_format(".lon", lon, "openCARP fibres")
 tetopt.register_format(".pts", pts, "openCARP nodes")
 tetopt.register_format(".elem", elem, "openCARP cells")
 phantom = tetopt.load_phantom("sphere")
 image, labels = phantom.image(voxel_mm=4), phantom.label_image(voxel_mm=4)
 result = tetopt.mesh_image(image, 300, labels=labels, iterations=3)
+x, y, _ = result.mesh.points[result.mesh.cells].mean(axis=1).T  # fibres run around the z axis
+around = np.stack([-y, x, 0.0 * x], axis=1) * (result.labels == 1)[:, None]
+around /= np.maximum(np.linalg.norm(around, axis=1, keepdims=True), 1e-9)
 with tempfile.TemporaryDirectory() as folder:
-    for suffix in (".pts", ".elem"):
-        tetopt.save_mesh(Path(folder) / f"heart{suffix}", result.mesh, {"label": result.labels})
+    for suffix in (".pts", ".elem", ".lon"):
+        data = {"label": result.labels, "fibre": around}
+        tetopt.save_mesh(Path(folder) / f"heart{suffix}", result.mesh, data)
+    fibre = np.loadtxt(Path(folder) / "heart.lon", skiprows=1)
     points = np.loadtxt(Path(folder) / "heart.pts", skiprows=1) / 1000.0
     cells = np.loadtxt(Path(folder) / "heart.elem", skiprows=1, usecols=range(1, 6), dtype=int)
 counts = np.bincount(cells[:, 4])
 extent_mm = np.ptp(points, axis=0).round(1)
 print(f"openCARP: {len(points)} nodes over {extent_mm} mm, {counts.tolist()} cells by region")
+print(f"openCARP: {int(fibre.any(axis=1).sum())} cells with fibres")
 
 # %%
 # SOFA takes a scene of objects.

@@ -7,15 +7,16 @@ No FEBio is at hand to run them.
 import xml.etree.ElementTree as ET
 
 import numpy as np
+import pyfebio
 import pytest
-from models import LOAD_CASES, displaced, loaded_model, sample_model, young_of
+from models import LOAD_CASES, displaced, fibre_model, loaded_model, sample_model, young_of
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusal
 
 from tetopt.fem.solution import solve
 from tetopt.geometry.simplex import volumes
 from tetopt.io.febio import MOST_MATERIAL_PARTS, febio
-from tetopt.model.materials import materials
+from tetopt.model.materials import Along, along_of, materials
 from tetopt.model.model import elements, header_lines, in_space, in_units
 
 
@@ -80,13 +81,15 @@ class Feb:
             element.get("name"): listed(element) - 1 for element in mesh.findall("ElementSet")
         }
         self.data = {}
-        for entry in self.root.findall("MeshData/ElementData"):
+        for entry in self.root.findall("MeshData/ElementData[@name]"):
             lid, values = rows_of(entry, "elem", "lid")
             of_cell = self.data.setdefault(entry.get("name"), np.full(len(self.cells), np.inf))
             of_cell[self.parts[entry.get("elem_set")][lid - 1] - 1] = values[:, 0]
 
     def moduli(self, tag):
-        """A parameter of every cell, from its material or through the map that it names."""
+        """A parameter of every cell, from its material or through the map that it names; NaN if
+        its material has none.
+        """
         material_of = {m.get("name"): m for m in self.root.find("Material")}
         result = np.full(len(self.cells), np.nan)
         for domain in self.root.find("MeshDomains"):
@@ -94,6 +97,8 @@ class Feb:
                 material_of[domain.get("mat")].find(tag),
                 self.parts[domain.get("name")],
             )
+            if parameter is None:
+                continue
             result[ids - 1] = (
                 self.data[parameter.text][ids - 1]
                 if parameter.get("type") == "map"
@@ -150,7 +155,6 @@ def test_sections_are_those_of_pyfebio():
     pyfebio knows neither <units> nor names of conditions, which FEBio Studio writes, and reads no 0
     or 1 back: what has them is compared with what it writes.
     """
-    pyfebio = pytest.importorskip("pyfebio")
     for kind in KINDS:
         model = sample(kind)
         root = ET.fromstring(febio(model))
@@ -310,7 +314,6 @@ def test_several_steps_are_several_files():
 
 def test_loads_are_those_of_pyfebio():
     """Every tag and type of the loads is known to the spec as pyfebio models it."""
-    pyfebio = pytest.importorskip("pyfebio")
     root = ET.fromstring(febio(loaded_model("all")))
     known = ET.fromstring(pyfebio.loads.PressureLoad(surface="left").to_xml())
     pressures = [load for load in root.find("Loads") if load.get("type") == "pressure"]
@@ -335,3 +338,93 @@ def test_loads_are_those_of_pyfebio():
         )
         > 3
     )
+
+
+# Fibres
+
+
+def with_fibres(kind):
+    """Directions in cells of few materials, some isotropic; or in those of as many materials."""
+    model = fibre_model()
+    if kind == "parts":
+        return model
+    n_cells = len(model.mesh.cells)
+    along = Along(9.0, 2.5, model.materials.along.fibre)
+    young = 1.0 + np.arange(n_cells)[::-1] / n_cells
+    return model._replace(materials=materials(young, 0.4, n_cells, along=along))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_fibres_are_axes_of_elements(kind):
+    """By the rules of FEBio's reader and of its "orthotropic elastic": axes from a and d, by the
+    place of an element in its part; cells without a direction are isotropic.
+    """
+    model = with_fibres(kind)
+    feb, table = Feb(febio(model)), model.materials
+    along = along_of(table)
+    young, nu = young_of(model), table.nu[table.of_cell]
+    is_along = along.fibre.any(axis=1)
+    axes = np.zeros_like(along.fibre)
+    for entry in feb.root.findall("MeshData/ElementData[@type='mat_axis']"):
+        assert {child.tag for elem in entry for child in elem} == {"a", "d"}
+        lid = np.array([int(elem.get("lid")) for elem in entry])
+        a, d = (np.array([numbers(elem.find(tag)) for elem in entry]) for tag in "ad")
+        assert (np.linalg.norm(np.cross(a, d), axis=1) > 0.5).all()
+        axes[feb.parts[entry.get("elem_set")][lid - 1] - 1] = a
+    assert_array_equal(axes[is_along], along.fibre[is_along])
+    expected = {
+        **{"E1": along.young_along, "E2": young, "E3": young, "v12": nu, "v23": nu},
+        **{"v31": nu * young / along.young_along, "G12": along.shear_along},
+        **{"G23": young / (2.0 + 2.0 * nu), "G31": along.shear_along},
+    }
+    for tag, values in expected.items():
+        assert_allclose(feb.moduli(tag)[is_along], values[is_along], rtol=1e-14)
+    tags = ("E", "v") if kind == "parts" else ("E2", "v12")
+    for tag, values in zip(tags, (young, nu), strict=True):
+        assert_array_equal(feb.moduli(tag)[~is_along], values[~is_along])
+    if kind == "maps":
+        assert_allclose(feb.moduli("E1")[~is_along], young[~is_along])
+        assert_allclose(feb.moduli("G12")[~is_along], (young / (2.0 + 2.0 * nu))[~is_along])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_fibres_are_those_of_pyfebio(kind):
+    """Materials and maps as pyfebio reads them, and the axes of each part's first cell.
+
+    pyfebio has no element data of axes; those of a material have the same form.
+    """
+    model = with_fibres(kind)._replace(loads=())
+    root = ET.fromstring(febio(model))
+    root.find("Module").remove(root.find("Module/units"))
+    data = root.find("MeshData")
+    of_axes = data.findall("ElementData[@type='mat_axis']")
+    for entry in of_axes:
+        data.remove(entry)
+        name = root.find(f"MeshDomains/SolidDomain[@name='{entry.get('elem_set')}']").get("mat")
+        material = root.find(f"Material/material[@name='{name}']")
+        ET.SubElement(material, "mat_axis", type="vector").extend(entry[0])
+    read = pyfebio.model.Model.from_xml(ET.tostring(root))
+    table = model.materials
+    is_fibres = [np.any(table.along.fibre[table.of_cell == k]) for k in range(len(table.young))]
+    kinds = {False: "neo-Hookean", True: "orthotropic elastic"}
+    all_materials = read.material_.all_materials
+    axes = [each.mat_axis for each in all_materials if each.type == "orthotropic elastic"]
+    expected = [tuple(child.text for child in entry[0]) for entry in of_axes]
+    assert [(each.a, each.d) for each in axes] == expected
+    assert expected
+    if kind == "maps":
+        (each,) = all_materials
+        assert (each.E1.type, each.E2.type, each.v12.text) == ("map", "map", 0.4)
+        by_name = {entry.name: entry for entry in read.meshdata_.element_data}
+        values = [float(elem.text) for elem in by_name[each.E2.text].all_elements]
+        assert_array_equal(values, young_of(model))
+        return
+    assert [each.type for each in all_materials] == [kinds[bool(each)] for each in is_fibres]
+    for k, each in enumerate(all_materials):
+        young = each.E if each.type == "neo-Hookean" else each.E2
+        assert young.text == table.young[k]
+        if each.type != "neo-Hookean":
+            assert (each.E1.text, each.G12.text) == (
+                table.along.young_along[k],
+                table.along.shear_along[k],
+            )

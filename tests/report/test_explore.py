@@ -41,6 +41,23 @@ def cell_data(mesh):
     }
 
 
+def test_directions_are_colours(mesh):
+    """Red, green and blue are x, y and z, whatever the sign and length; cells without one have no
+    value.
+    """
+    vectors = np.tile([0.0, 3.0, -4.0], (len(mesh.cells), 1))
+    vectors[::2] *= -0.5
+    vectors[1] = [2.0, 0.0, 0.0]
+    vectors[4] = np.nan
+    (field,) = exhibit(mesh, {"v1": vectors}).fields[-1:]
+    colours = dict(field.categories)
+    assert field.name == "v1"
+    assert np.isnan(field.values[4])
+    assert colours[int(field.values[1])] == "#ff0000"
+    assert {colours[int(each)] for each in np.delete(field.values, [1, 4])} == {"#0099cc"}
+    assert sorted(field.names.values()) == ["0.00 -0.60 0.80", "1.00 0.00 0.00"]
+
+
 def packed(*shown, **more):
     """The data block of the page of what `exhibit` makes of these."""
     page = explorer_html(exhibit(*shown, **more))

@@ -250,6 +250,32 @@ def test_slice_figure_holds_each_mesh_under_its_title(n):
         assert means.get_clim() == over.images[0].get_clim()
 
 
+@pytest.mark.parametrize("signs", [(1, 1, 1), (-1, 1, 1), (1, -1, -1)])
+@pytest.mark.parametrize("worlds", [(0, 1, 2), (2, 0, 1)])
+def test_directions_are_lines_across_cells(worlds, signs):
+    """Through the middle of a section, towards where the section of a moved mesh lies."""
+    image = oriented_image(worlds, signs)
+    mesh = lattice(image)
+    vectors = np.tile([0.6, -0.48, 0.64], (len(mesh.cells), 1))
+    vectors[:3] = np.nan
+    figure = figures.slice_figure(image, [("one", mesh)], fibre=2.0 * vectors)
+    lines = collections_in(figure.axes[1], LineCollection)
+    segments = np.array(lines[-1].get_segments())
+    view = SliceView(image, None, None)
+    polygons, cells = view.section(mesh)
+    assert_allclose(segments.mean(axis=1), polygons.mean(axis=1), atol=1e-9)
+    places = np.array([[0.0, 0.0, 0.0], [0.6, -0.48, 0.64]])
+    way = np.diff(view._flat(image.to_index(places)), axis=0)
+    half = np.diff(segments, axis=1)[:, 0]
+    lengths = np.linalg.norm(half, axis=1)
+    assert (lengths[cells < 3] == 0.0).all()
+    is_drawn = lengths > 1e-6  # and no section of a mere edge
+    assert is_drawn.sum() > 0.5 * (cells >= 3).sum()
+    ways = half[is_drawn] / lengths[is_drawn, None]
+    assert_allclose(ways, np.tile(way / np.linalg.norm(way), (is_drawn.sum(), 1)))
+    assert_allclose(lines[-1].get_colors()[is_drawn][:, :3], [[0.6, 0.48, 0.64]] * is_drawn.sum())
+
+
 def test_letters_stand_on_their_sides():
     image = oriented_image((2, 0, 1), (-1, 1, -1))
     over, flat = slice_figure(image, [("", lattice(image))]).axes

@@ -8,7 +8,15 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from models import LOAD_CASES, cell_energies, loaded_model, sample_model, young_of
+from models import (
+    LOAD_CASES,
+    cell_energies,
+    fibre_model,
+    loaded_model,
+    pulled_cube,
+    sample_model,
+    young_of,
+)
 from numpy.testing import assert_allclose, assert_array_equal
 
 import tetopt
@@ -252,6 +260,30 @@ def test_a_model_that_only_holds_rests(tmp_path):
     printed = answer(abaqus(loaded_model(["hold:superior"])), tmp_path)
     assert energy(printed) == 0.0
     assert not printed.u.any()
+
+
+# Fibres
+
+
+def test_a_cube_of_turned_fibres_has_the_strain_of_the_closed_form(order, tmp_path):
+    cube = pulled_cube(order)
+    held = [f"{node + 1}, {dof + 1}\n" for node, dof in np.argwhere(cube.is_held)]
+    pulls = [f"{i + 1}, {j + 1}, {cube.forces[i, j]:.13g}\n" for i, j in np.argwhere(cube.forces)]
+    step = ["*STEP\n*STATIC\n*BOUNDARY\n", *held, "*CLOAD\n", *pulls]
+    every = f"*NSET, NSET=every, GENERATE\n1, {len(cube.u)}\n"
+    requests = "*NODE FILE\nU\n*NODE PRINT, NSET=every\nU\n*END STEP\n"
+    raw = abaqus(cube.model) + "".join([every, *step, requests]).encode()
+    printed = answer(raw, tmp_path).tables["displacements", "every"][:, 1:]
+    assert_printed(printed, cube.u, 1e-6)
+
+
+@pytest.mark.parametrize("bins", [None, 8])
+def test_fibres_of_each_cell_are_those_of_fem(bins, order, tmp_path):
+    """Beside cells without a direction; and by groups of directions."""
+    model = fibre_model(bins)._replace(order=order)
+    printed, own = answer(abaqus(model), tmp_path), solve(model)
+    assert_allclose(energy(printed), own.strain_energy, rtol=PRINTED)
+    assert_printed(printed.u, own.u, 6e-6)
 
 
 # Large deformation

@@ -107,6 +107,11 @@ def _moduli_lines(output: Path, model: Model) -> Iterator[str]:
             f"Young's modulus {range_words(table.young)} {model.units}, nu {range_words(table.nu)}"
         )
         yield f"{count_text(len(table.young), 'material')}, {moduli}"
+        if (along := table.along) is not None:
+            yield (
+                f"along fibres: {range_words(along.young_along)} {model.units}, shear modulus "
+                f"{range_words(along.shear_along)} {model.units}"
+            )
         yield from _materials_by_name(model, table)
         if model.gauss_young is not None:
             yield (
@@ -119,6 +124,9 @@ def _moduli_lines(output: Path, model: Model) -> Iterator[str]:
         if table.binning is not None:
             mean, largest = table.binning
             yield f"bins: modulus error {mean:.2%} on average by volume, {largest:.2%} at most"
+        if table.fibre_binning is not None:
+            mean, largest = table.fibre_binning
+            yield f"bins: fibres turned by {mean:.2f} degrees on average, {largest:.2f} at most"
     if model.node_young is not None:
         low = model.node_young.min()
         high = model.node_young.max()

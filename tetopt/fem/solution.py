@@ -23,6 +23,7 @@ from tetopt.fem.elasticity import (
     System,
     cell_means,
     constrain_nodes,
+    fibre_tensor,
     gauss_strains,
     gauss_volumes,
     lame_constants,
@@ -34,7 +35,7 @@ from tetopt.geometry.simplex import volumes
 from tetopt.mesh import Mesh
 from tetopt.model.averages import gauss_young
 from tetopt.model.loads import Load, count_of_steps, facet_forces, in_step, spring_constants
-from tetopt.model.materials import density_of
+from tetopt.model.materials import along_of, density_of
 from tetopt.model.model import Model, element_facets, elements, in_units
 from tetopt.system.arrays import Bools, Floats
 
@@ -169,6 +170,7 @@ def solve(model: Model, step: int = 1, method: Method = "auto") -> Solution:
     task = _task(model, in_step(model.loads, step))
     young = gauss_moduli(model)
     nu = model.materials.nu[model.materials.of_cell]
+    along = along_of(model.materials)
     system = constrain_nodes(
         model.mesh,
         young,
@@ -177,10 +179,14 @@ def solve(model: Model, step: int = 1, method: Method = "auto") -> Solution:
         task.prescribed,
         order=model.order,
         outside=task.outside,
+        along=along,
     )
     u, n_iterations = solve_in_steps(system, method)
     strain = gauss_strains(model.mesh, u)
-    stress = _stress(strain, young, nu)
+    if along is None:
+        stress = _stress(strain, young, nu)
+    else:
+        stress = np.einsum("cijkl,cqkl->cqij", fibre_tensor(young[:, 0], nu, along), strain)
     strain_energy = 0.5 * float(
         (gauss_volumes(model.mesh, model.order) * (strain * stress).sum(axis=(2, 3))).sum()
     )

@@ -18,7 +18,14 @@ from tetopt.model.loads import (
     load_words,
     spring_constants,
 )
-from tetopt.model.materials import Materials, cells_of, without_moduli
+from tetopt.model.materials import (
+    Materials,
+    axes_across,
+    cells_of,
+    engineering_constants,
+    is_fibrous,
+    without_moduli,
+)
 from tetopt.model.model import (
     Model,
     element_facets,
@@ -30,6 +37,7 @@ from tetopt.model.model import (
 from tetopt.system.arrays import Floats, Ints
 
 ALL_ELEMENTS = "all_cells"  # the set for which results are requested
+FIBRES_PREFIX = "fibres-"  # of orientations, and of the sets of cells that have them
 SPRING_PREFIX = "spring-"  # of sets of one spring each; springs are elements after the cells
 # for the largest modulus; CalculiX rounds temperatures to about 1e-8 degrees
 HOTTEST_DEGREES = 1000.0
@@ -68,6 +76,9 @@ def abaqus(model: Model) -> bytes:
     temperature-dependent modulus: the temperature at each node is the modulus in thousandths of the
     largest; both solvers interpolate it linearly between corners, and there is no expansion.
 
+    A material with fibres has engineering constants, and a section with an *ORIENTATION for each
+    direction among its cells, which both solvers read (CalculiX knows no *DISTRIBUTION).
+
     Each step of the loads becomes a static step, a separate load case, whose strain energy and
     reaction forces both solvers print: pressure on faces, tractions as nodal forces and springs
     from nodes to the ground by `tetopt.model.loads.facet_weights`, and gravity on all cells. Steps
@@ -82,7 +93,7 @@ def abaqus(model: Model) -> bytes:
     ------
     InputError
         The model is 2-D; loads have no materials; springs are in only some steps; a set has a name
-        that the file uses itself.
+        that the file uses itself; a nonlinear model has fibres.
     """
     if model.materials is not None and model.node_young is not None:
         model = model._replace(materials=without_moduli(model.materials))
@@ -120,10 +131,16 @@ def _check(model: Model) -> None:
             f"abaqus: expected one nonlinear step, got {count} (each would continue from the "
             "previous one); write a file for each"
         )
+    has_fibres = model.materials is not None and model.materials.along is not None
+    if model.is_nonlinear and has_fibres:
+        raise InputError("abaqus: materials with fibres are linear; omit `nonlinear`")
     others = {
         name: cells for name, cells in model.sets.cells.items() if name not in _shared_sets(model)
     }
-    check_apart([ALL_ELEMENTS, *named_materials(model)], others)
+    own = [ALL_ELEMENTS, *named_materials(model)]
+    if has_fibres:
+        own += [name for name in others if name.lower().startswith(FIBRES_PREFIX)]
+    check_apart(own, others)
 
 
 def _shared_sets(model: Model) -> set[str]:
@@ -167,7 +184,10 @@ def _materials(model: Model) -> list[str]:
         parts.append(f"*MATERIAL, NAME={name}\n{_law(model, model.materials, k)}")
         if densities:
             parts.append(f"*DENSITY\n{_number(densities[k])}\n")
-        parts.append(f"*SOLID SECTION, ELSET={name}, MATERIAL={name}\n")
+        if is_fibrous(model.materials, members):
+            parts += _oriented_sections(model.materials, name, members)
+        else:
+            parts.append(f"*SOLID SECTION, ELSET={name}, MATERIAL={name}\n")
     if model.node_young is not None:
         temperatures = _temperatures(model, node_field(model.node_young, model.mesh, model.order))
         parts.append(
@@ -176,9 +196,32 @@ def _materials(model: Model) -> list[str]:
     return parts
 
 
+def _oriented_sections(materials: Materials, name: str, members: Ints) -> list[str]:
+    """Return an orientation, a set and a section for each direction of fibres in a material; they
+    are named after the first cell.
+    """
+    assert materials.along is not None
+    directions, which = np.unique(materials.along.fibre[members], axis=0, return_inverse=True)
+    order = np.argsort(which.ravel(), kind="stable")
+    groups = np.split(members[order], np.cumsum(np.bincount(which.ravel()))[:-1])
+    axes = rows(_fitting(directions), _fitting(axes_across(directions)), separator=", ")
+    return [
+        f"*ORIENTATION, NAME={FIBRES_PREFIX}{cells[0] + 1}\n{axis}\n"
+        f"*ELSET, ELSET={FIBRES_PREFIX}{cells[0] + 1}\n{_list(cells)}"
+        f"*SOLID SECTION, ELSET={FIBRES_PREFIX}{cells[0] + 1}, MATERIAL={name}, "
+        f"ORIENTATION={FIBRES_PREFIX}{cells[0] + 1}\n"
+        for cells, axis in zip(groups, axes.splitlines(), strict=True)
+    ]
+
+
 def _law(model: Model, materials: Materials, k: int) -> str:
     """Return the elastic constants of a material, at several temperatures if it depends on them."""
     nu = float(materials.nu[k])
+    if is_fibrous(materials, np.flatnonzero(materials.of_cell == k)):
+        of = {name: values[k : k + 1] for name, values in engineering_constants(materials).items()}
+        first = [of[name] for name in ("E1", "E2", "E2", "v", "v", "v", "G12", "G12")]
+        lines = [rows(*map(_fitting, each), separator=", ") for each in (first, [of["G23"]])]
+        return f"*ELASTIC, TYPE=ENGINEERING CONSTANTS\n{''.join(lines)}"
     if model.node_young is None:
         young = materials.young[k : k + 1]
     else:

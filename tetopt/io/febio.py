@@ -15,7 +15,13 @@ from tetopt.errors import InputError
 from tetopt.io.tags import named_materials
 from tetopt.io.text import rows, xml_attribute, xml_comment
 from tetopt.model.loads import Load, count_of_steps, spring_constants
-from tetopt.model.materials import cells_of, density_of
+from tetopt.model.materials import (
+    axes_across,
+    cells_of,
+    density_of,
+    engineering_constants,
+    is_fibrous,
+)
 from tetopt.model.model import (
     STRESS_UNITS,
     Model,
@@ -33,7 +39,18 @@ STUDIO_UNITS = {"kPa": "mm-kg-s", "MPa": "mm-N-s", "Pa": "SI"}
 # Names of sets have no spaces, so that these names, and those of parts ("cells of liver"), never
 # clash with them.
 ALL_NODES, ALL_CELLS = "all nodes", "all cells"
-YOUNG_MAP, NU_MAP, DENSITY_MAP = "E", "v", "density"  # maps, named after their parameters
+# maps, and the constants that they have, of `tetopt.model.materials.engineering_constants` if these
+# have fibres
+YOUNG_MAP, NU_MAP, DENSITY_MAP = "E", "v", "density"
+# parameters of a material by its type, and their constants
+NEO_HOOKEAN, ORTHOTROPIC = "neo-Hookean", "orthotropic elastic"
+PARAMETERS = {
+    NEO_HOOKEAN: {"E": YOUNG_MAP, "v": NU_MAP},
+    ORTHOTROPIC: {
+        **{"E1": "E1", "E2": "E2", "E3": "E2", "v12": NU_MAP, "v23": NU_MAP, "v31": "v31"},
+        **{"G12": "G12", "G23": "G23", "G31": "G12"},
+    },
+}
 # the set of nodes with forces from tractions and weight, and the map of these forces
 DEAD_FORCES = "dead forces"
 GROUND_NODES = "ground nodes"  # the far ends of springs
@@ -85,9 +102,8 @@ class _Part(NamedTuple):
 
     name: str
     material: str  # its name
-    young: str  # a number, or the name of a map
-    nu: str
-    density: str
+    kind: str  # of material
+    constants: dict[str, str]  # by name: a number, or this name for a map
     cells: Ints
 
 
@@ -106,7 +122,9 @@ def febio(model: Model) -> bytes:
 
     The material is neo-Hookean: at small strains it equals linear elasticity with these moduli, as
     solved by `tetopt fem`, and it withstands large compression, where FEBio's "isotropic elastic"
-    (St. Venant-Kirchhoff) softens until cells collapse. Loads are applied in a static step of ten
+    (St. Venant-Kirchhoff) softens until cells collapse. With fibres it is "orthotropic elastic",
+    FEBio's only linear law with a direction, which softens likewise, with the axes of each cell as
+    element data "mat_axis". Loads are applied in a static step of ten
     increments with large deformation. Pressures follow their surfaces; tractions and weight are
     nodal forces by `tetopt.model.loads.facet_weights`, with constant direction; the springs of a
     set are three long springs at each of its nodes. The plot file includes the strain energy
@@ -152,25 +170,37 @@ def _check(model: Model) -> None:
 
 
 def _parts(model: Model) -> list[_Part]:
-    assert model.materials is not None
-    young = model.materials.young
-    nu = model.materials.nu
-    of_cell = model.materials.of_cell
-    density = mass_densities(model)
-    if len(young) > MOST_MATERIAL_PARTS:
-        ratio, mass = (
-            name if np.ptp(values) > 0.0 else repr(float(values[0]))
-            for name, values in ((NU_MAP, nu), (DENSITY_MAP, density))
-        )
-        return [_Part(ALL_CELLS, ALL_CELLS, YOUNG_MAP, ratio, mass, np.arange(len(of_cell)))]
-    rows = zip(named_materials(model), young.tolist(), nu.tolist(), density.tolist(), strict=True)
+    table = model.materials
+    assert table is not None
+    constants = _constants(model)
+    if len(table.young) > MOST_MATERIAL_PARTS:
+        texts = {
+            name: name if np.ptp(values) > 0.0 or name == YOUNG_MAP else repr(float(values[0]))
+            for name, values in constants.items()
+        }
+        kind = NEO_HOOKEAN if table.along is None else ORTHOTROPIC
+        return [_Part(ALL_CELLS, ALL_CELLS, kind, texts, np.arange(len(table.of_cell)))]
     return [
-        _Part(f"cells of {name}", name, repr(young_of), repr(nu_of), repr(density_of), members)
-        for (name, young_of, nu_of, density_of), members in zip(
-            rows, cells_of(model.materials), strict=True
+        _Part(
+            f"cells of {name}",
+            name,
+            ORTHOTROPIC if is_fibrous(table, members) else NEO_HOOKEAN,
+            {each: repr(float(values[k])) for each, values in constants.items()},
+            members,
+        )
+        for k, (name, members) in enumerate(
+            zip(named_materials(model), cells_of(table), strict=True)
         )
         if len(members)
     ]
+
+
+def _constants(model: Model) -> dict[str, Floats]:
+    """Return the constants of each material, (K,), by name."""
+    table = model.materials
+    assert table is not None
+    isotropic = {YOUNG_MAP: table.young, NU_MAP: table.nu, DENSITY_MAP: mass_densities(model)}
+    return isotropic | engineering_constants(table)
 
 
 def _head(model: Model) -> str:
@@ -186,10 +216,12 @@ def _materials(parts: list[_Part]) -> str:
         [
             "<Material>\n",
             *(
-                f'<material id="{k}" name="{part.material}" type="neo-Hookean">\n'
-                f"{_parameter('density', part.density, DENSITY_MAP)}"
-                f"{_parameter('E', part.young, YOUNG_MAP)}"
-                f"{_parameter('v', part.nu, NU_MAP)}</material>\n"
+                f'<material id="{k}" name="{part.material}" type="{part.kind}">\n'
+                + "".join(
+                    _parameter(tag, part.constants[name], name)
+                    for tag, name in ({DENSITY_MAP: DENSITY_MAP} | PARAMETERS[part.kind]).items()
+                )
+                + "</material>\n"
                 for k, part in enumerate(parts, start=1)
             ),
             "</Material>\n",
@@ -231,25 +263,28 @@ def _mesh(model: Model, parts: list[_Part]) -> list[str]:
 
 
 def _mesh_data(model: Model, parts: list[_Part]) -> list[str]:
-    """Return moduli by part, which FEBio joins by name: `lid` follows the order of the part's
-    cells.
+    """Return moduli by part, which FEBio joins by name, and axes of fibres: `lid` follows the order
+    of the part's cells.
 
     FEBio reads no other element data, which would be nine tenths of a head's file. A set of all
     cells would not work: across parts, FEBio uses their order and not that of the set.
     """
-    assert model.materials is not None
-    young = model.materials.young
-    nu = model.materials.nu
-    of_cell = model.materials.of_cell
-    stated = {YOUNG_MAP: (parts[0].young, young), NU_MAP: (parts[0].nu, nu)}
-    stated[DENSITY_MAP] = parts[0].density, mass_densities(model)
-    fields = {name: values[of_cell] for name, (word, values) in stated.items() if word == name}
+    table = model.materials
+    assert table is not None
+    used = {DENSITY_MAP, *PARAMETERS[parts[0].kind].values()}
+    fields = {
+        name: values[table.of_cell]
+        for name, values in _constants(model).items()
+        if name in used and parts[0].constants[name] == name
+    }
     data = [
         f'<ElementData name="{xml_attribute(name)}" elem_set="{part.name}" data_type="scalar">\n'
         f"{_items('elem', values[part.cells], number='lid')}</ElementData>\n"
         for name, values in fields.items()
         for part in parts
     ]
+    if table.along is not None:
+        data += [_axes(part, table.along.fibre) for part in parts if part.kind == ORTHOTROPIC]
     nodes, forces = _dead_forces(model)
     if len(nodes):
         data.append(
@@ -257,6 +292,21 @@ def _mesh_data(model: Model, parts: list[_Part]) -> list[str]:
             f"{_items('node', forces, number='lid')}</NodeData>\n"
         )
     return ["<MeshData>\n", *data, "</MeshData>\n"] if data else []
+
+
+def _axes(part: _Part, fibre: Floats) -> str:
+    """Return the axes of a part's cells: the first along the fibres, the second in the plane of
+    them and another vector; any where a cell is isotropic.
+    """
+    own = fibre[part.cells]
+    own = np.where(own.any(axis=1, keepdims=True), own, [1.0, 0.0, 0.0])
+    axes = zip(
+        *(rows(each, separator=",").splitlines() for each in (own, axes_across(own))), strict=True
+    )
+    lines = "".join(
+        f'<elem lid="{k}"><a>{a}</a><d>{d}</d></elem>\n' for k, (a, d) in enumerate(axes, start=1)
+    )
+    return f'<ElementData type="mat_axis" elem_set="{part.name}">\n{lines}</ElementData>\n'
 
 
 def _loads(model: Model) -> list[str]:

@@ -46,6 +46,7 @@ class Format(NamedTuple):
     # otherwise a modulus that varies within cells is averaged over each
     has_node_moduli: bool = False
     has_large: bool = False  # whether a step can request large deformation
+    has_fibres: bool = True  # otherwise materials with fibres are refused
     # those of `FIELDS` that commands write by default, "" if the format has no place for them
     fields: str = "all"
 
@@ -55,13 +56,13 @@ FORMATS = {
     ".vtk": Format("legacy VTK, 3D Slicer", vtk, has_node_moduli=True),
     ".xdmf": Format("XDMF with tags, FEniCSx", xdmf, has_node_moduli=True),
     ".msh": Format("gmsh 4.1", gmsh41, fields="none"),
-    ".msh2": Format("gmsh 2.2", gmsh22, fields=""),
+    ".msh2": Format("gmsh 2.2", gmsh22, has_fibres=False, fields=""),
     ".inp": Format(
         "Abaqus, CalculiX", abaqus, runs=True, has_node_moduli=True, has_large=True, fields=""
     ),
     ".feb": Format("FEBio 4.0", febio, runs=True, has_large=True, fields=""),
-    ".mfem": Format("MFEM mesh", mfem, fields=""),
-    ".mesh": Format("medit", medit, fields=""),
+    ".mfem": Format("MFEM mesh", mfem, has_fibres=False, fields=""),
+    ".mesh": Format("medit", medit, has_fibres=False, fields=""),
 }
 FIELDS = ("none", "mean", "all")  # of cells, besides labels and results
 # formats of 64-bit integers; others convert large ones to float64
@@ -84,6 +85,7 @@ def register_format(
     runs: bool = False,
     has_node_moduli: bool = False,
     has_large: bool = False,
+    has_fibres: bool = False,
 ) -> None:
     """Register a format for `save_model`, `run` and the command, in this process.
 
@@ -107,6 +109,8 @@ def register_format(
         have their mean.
     has_large : bool
         True if a step can request large deformation.
+    has_fibres : bool
+        True if it supports transversely isotropic materials; otherwise they are rejected.
 
     Raises
     ------
@@ -134,7 +138,9 @@ def register_format(
         raise InputError(
             f"suffix: {suffix} is a built-in format ({FORMATS[suffix].what}); choose another suffix"
         )
-    FORMATS[suffix] = Format(what, write, has_quadratic, runs, has_node_moduli, has_large)
+    FORMATS[suffix] = Format(
+        what, write, has_quadratic, runs, has_node_moduli, has_large, has_fibres
+    )
 
 
 def format_of(path: Path) -> Format:
@@ -286,6 +292,9 @@ def file_bytes(path: Path, model: Model, *, space: str = "ras", units: str = "kP
     if model.order == 2 and not kind.has_quadratic:
         able = ", ".join(name for name, other in FORMATS.items() if other.has_quadratic)
         raise InputError(f"{path}: only {able} support quadratic cells; omit `order` 2")
+    if not kind.has_fibres and model.materials is not None and model.materials.along is not None:
+        able = ", ".join(name for name, other in FORMATS.items() if other.has_fibres)
+        raise InputError(f"{path}: only {able} support fibres; omit `fibre`")
     checked = _check_model(path, model)
     if PLACE_TEXT not in checked.about and not {MASK_TEXT, "options"}.isdisjoint(checked.about):
         of_place = {PLACE_TEXT: place_words(checked.mesh)}
@@ -378,8 +387,11 @@ def _check_materials(path: Path, table: Materials, n_cells: int) -> None:
             f"{path}: materials: expected a number from 0 to {n_kinds - 1} for each of {n_cells} "
             "cells"
         )
-    for name in ("young", "nu", "density"):
-        values = getattr(table, name)
+    named = {name: getattr(table, name) for name in ("young", "nu", "density")}
+    along = {} if table.along is None else table.along._asdict()
+    if np.shape(along.pop("fibre", np.empty((n_cells, 3)))) != (n_cells, 3):
+        raise InputError(f"{path}: materials: expected a direction of fibres for each cell")
+    for name, values in (named | along).items():
         if values is not None and (np.shape(values) != (n_kinds,) or not np.isfinite(values).all()):
             raise InputError(
                 f"{path}: materials: expected a finite {name} for each of {n_kinds} materials"

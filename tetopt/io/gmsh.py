@@ -393,5 +393,5 @@ def _fields(model: Model) -> dict[str, Floats]:
     fields = dict(model.cell_data)
     if model.materials is not None:
         own = model.materials.fields()
-        fields |= {"young": own["young"], "nu": own["nu"]}
+        fields |= {name: own[name] for name in own if name not in ("material", "density")}
     return _view_columns(fields)

@@ -400,7 +400,11 @@ def _raw_of(file: FileNumbers, lines: list[str]) -> Raw:
     kind = main_kind(raw)
     is_ours = own_comments(lines) is not None
     parts = {name: places_of(ids[kind], file.cells.get(name, numbers[:0])) for name in file.parts}
-    own = {ALL_ELEMENTS, *file.parts} - _label_sets(lines).keys() if is_ours else set()
+    own = (
+        {ALL_ELEMENTS, *file.parts, *file.parts.values()} - _label_sets(lines).keys()
+        if is_ours
+        else set()
+    )
     members = {
         name: np.unique(places_of(ids[kind], those))
         for name, those in file.cells.items()

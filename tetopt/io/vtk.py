@@ -127,6 +127,8 @@ def model_grid(model: Model) -> vtkUnstructuredGrid:
     texts = dict(model.about) | {"space": model.space}
     if model.materials is not None and model.materials.binning is not None:
         texts["binning"] = model.materials.binning._asdict()
+    if model.materials is not None and model.materials.fibre_binning is not None:
+        texts["fibre_binning"] = model.materials.fibre_binning._asdict()
     has_stresses = any(map(is_stress, [*model.cell_data, *model.point_data]))
     if (
         model.materials is not None

@@ -527,6 +527,24 @@ class ModelOptions:
         str | None,
         Option("MAPPING", "Density, kg/m3, in the same forms (water: 1000); needed for gravity."),
     ] = None
+    fibre: Annotated[
+        str | None,
+        Option(
+            "NAME",
+            "Directions of fibres: data of cells with three numbers. `young` and `nu` then hold "
+            "across them.",
+        ),
+    ] = None
+    young_along: Annotated[
+        str | None, Option("MAPPING", "Young's modulus along fibres, in the forms of `young`.")
+    ] = None
+    shear_along: Annotated[
+        str | None,
+        Option(
+            "MAPPING",
+            "Shear modulus along fibres, in the forms of `young` (default: as across them).",
+        ),
+    ] = None
     average: Annotated[str | None, AVERAGE_OPTION] = None
     bins: Annotated[
         str | None,

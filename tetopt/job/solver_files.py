@@ -179,6 +179,9 @@ def choices_of(options: ModelOptions) -> Choices:
         spacing,
         options.order or 1,
         options.units if isinstance(options, SolverOptions) else "kPa",
+        fibre=options.fibre,
+        young_along=options.young_along,
+        shear_along=options.shear_along,
     )
 
 

@@ -39,7 +39,7 @@ from tetopt.model.label_names import (
     table_of_labels,
     table_words,
 )
-from tetopt.model.model import Model
+from tetopt.model.model import Model, grid_fields
 from tetopt.model.sets import Sets, box_of, label_set_names, surviving_sets
 from tetopt.report.summary import run_summary
 from tetopt.start.sizes import edge_ratios
@@ -260,6 +260,7 @@ def draw(task: Task, outcome: Meshed, model: Model) -> None:
         image,
         source.mask,
         source.table if is_labels else None,
+        grid_fields(model)[0].get("fibre"),
     )
     of_cell = model.cell_data.get(LABEL_FIELD)
     # none for the mask of a mesh to start from

@@ -35,13 +35,13 @@ from tetopt.model.averages import (
 from tetopt.model.fields import KINDS_TEXT, cell_fields, check_field_name, field_kinds
 from tetopt.model.file import (
     MASK_TEXT,
-    MATERIAL_FIELDS,
     OWN_MASK,
     MeshFile,
     complete_model,
     count_of_other_voxels,
     loads_in,
     mask_in,
+    material_fields,
     moduli_in,
     own_mask,
     sets_beside,
@@ -61,6 +61,7 @@ from tetopt.model.label_names import (
 )
 from tetopt.model.loads import parse_load, parse_loads
 from tetopt.model.mappings import (
+    MODULI,
     ByLabel,
     ModulusMapping,
     has_column,
@@ -69,7 +70,9 @@ from tetopt.model.mappings import (
     young_from,
 )
 from tetopt.model.materials import (
+    ALONG_FIELDS,
     DEFAULT_NU,
+    Along,
     Spacing,
     bin_moduli,
     by_label,
@@ -88,6 +91,9 @@ def build_model(
     young: str | float | Floats | ModulusMapping | ByLabel = None,
     nu: str | float | Floats | ModulusMapping | ByLabel = None,
     density: str | float | Floats | ModulusMapping | ByLabel = None,
+    fibre: str | Floats | None = None,
+    young_along: str | float | Floats | ModulusMapping | ByLabel = None,
+    shear_along: str | float | Floats | ModulusMapping | ByLabel = None,
     average: str = DEFAULT_AVERAGE,
     fields: Mapping[str, Image | Field] | None = None,
     sets: Iterable[str] = (),
@@ -123,6 +129,15 @@ def build_model(
     density : number, (M,) array, mapping or str, optional
         Density, kg/m3, above 0, in the same forms; defaults to the column "density" of the file
         that `young` names, or to none. Gravity needs it.
+    fibre : str or (M, 3) array, optional
+        Directions of fibres, of any length and sign, or the name of such data of cells. The
+        material is transversely isotropic about them, see `tetopt.model.materials`: `young` and
+        `nu` then hold across the fibres, and moduli are constant within cells. Cells whose
+        direction is 0 or NaN are isotropic.
+    young_along, shear_along : number, (M,) array, mapping or str, optional
+        With `fibre`: Young's modulus along the fibres, and the shear modulus between them and the
+        directions across, kPa, in the forms of `young`; one of them may be left to its isotropic
+        value, `young` or young / (2 (1 + nu)).
     average : str
         The average of Young's modulus over voxels, see `tetopt.model.averages.parse_average`;
         "mean" is Eq. (2). With "gauss" and quadratic cells, moduli vary within a cell in
@@ -170,14 +185,15 @@ def build_model(
     InputError
         For the reasons of the functions named above; an invalid dimension or order; gravity without
         a density; an image beside a result of `mesh_image`; a field that lies elsewhere, or without
-        a value in the mesh.
+        a value in the mesh; fibres without moduli along them, or with moduli at nodes, or of a 2-D
+        mesh; no such material.
 
     Warns
     -----
     UserWarning
         Sets of the file had to be renamed; its loads or moduli no longer fit; the content's mask is
         another one; part of the mesh lies outside the image or a field, has no value of a field, or
-        is outside of the range of a mapping.
+        is outside of the range of a mapping; cells have no direction.
 
     See Also
     --------
@@ -201,6 +217,7 @@ def build_model(
     """
     choices = Choices(young, nu, density, average, _texts(sets), _texts(loads), bins, spacing)
     choices = choices._replace(fields={} if fields is None else dict(fields))
+    choices = choices._replace(fibre=fibre, young_along=young_along, shear_along=shear_along)
     if isinstance(mesh, MeshingResult):
         mesh, image, order, cell_data = _of_result(mesh, image, order, cell_data)
     image, whole, about = _voxels(image, mesh, about or {})
@@ -251,11 +268,14 @@ class Choices(NamedTuple):
     units: str = "kPa"  # of moduli and pressures in texts without a unit
     fields: Mapping[str, Image | Field] = {}  # whose images mappings may name
     mask: Image | None = None  # of the fields' voxels, if the mesh's file has none
+    fibre: Any = None
+    young_along: Any = None
+    shear_along: Any = None
 
     @property
     def is_new(self) -> bool:
         """True if results that were computed with a file's own moduli and loads no longer hold."""
-        mappings = (self.young, self.nu, self.density, self.bins)
+        mappings = (self.young, self.nu, self.density, self.bins, self.fibre)
         return bool(self.loads) or any(each is not None for each in mappings)
 
 
@@ -277,7 +297,8 @@ def model_of_file(
     young, nu, density = moduli_in(fields, choices.young, choices.nu, choices.density)
     if nu is None and "nu" in fields:
         warn(f"ignored nu in the mesh's file; nu comes from `young`, or is {DEFAULT_NU:g}", Note)
-    fields = {name: rows for name, rows in fields.items() if name not in MATERIAL_FIELDS}
+    choices = _with_own_fibres(choices, fields)
+    fields = {name: rows for name, rows in fields.items() if name not in material_fields(fields)}
     cells = _cells_of(mesh, image, fields, about)
     if known_sets is None:
         of_loads = {parse_load(text, mesh.ndim).set_name for text in choices.loads}
@@ -317,17 +338,21 @@ def _model(
         laws = _laws(choices)
         cells = _with_fields(cells, _images_of(choices), laws, mask)
         nodal, at_gauss = _varying_moduli(cells, laws.young, choices)
-        values = [
-            None if law is None else _values(law, name, cells, choices.average)
+        values = {
+            name: None if law is None else _values(law, name, cells, choices.average)
             for name, law in laws._asdict().items()
-        ]
-        table = materials(values[0], values[1], len(cells.mesh.cells), values[2])
+        }
+        along = _along(mesh, choices, values, cell_data)
+        n_cells = len(mesh.cells)
+        table = materials(values["young"], values["nu"], n_cells, values["density"], along)
+        _warn_of_isotropic(mesh, table.along)
         if bins is not None:
             table = bin_moduli(table, volumes(mesh.points, mesh.cells), bins, choices.spacing)
     elif bins is not None:
         raise InputError("bins: the model has no moduli to group; give `young`")
-    elif choices.density is not None:
-        raise InputError("density: a material also needs a modulus; give `young`")
+    elif choices.density is not None or choices.fibre is not None:
+        name = "fibre" if choices.density is None else "density"
+        raise InputError(f"{name}: a material also needs a modulus; give `young`")
     loads = parse_loads(choices.loads, mesh, all_sets, choices.units)
     if any(load.kind == "gravity" for load in loads):
         density_of(table)  # raises InputError without a density
@@ -422,6 +447,8 @@ class _Laws(NamedTuple):
     young: Any
     nu: Any
     density: Any  # None for none
+    young_along: Any  # None for isotropic ones
+    shear_along: Any
 
 
 def _laws(choices: Choices) -> _Laws:
@@ -440,9 +467,74 @@ def _laws(choices: Choices) -> _Laws:
             parse_any_mapping(law, name, choices.units, _images_of(choices))
             if isinstance(law, str)
             else law
-            for name, law in (("young", young), ("nu", nu), ("density", density))
+            for name, law in zip(
+                _Laws._fields,
+                (young, nu, density, choices.young_along, choices.shear_along),
+                strict=True,
+            )
         )
     )
+
+
+def _with_own_fibres(choices: Choices, fields: Arrays) -> Choices:
+    """Return the choices with the fibres of a mesh's file, if its moduli are kept, or if the name
+    chosen is that of its fibres.
+    """
+    if "young_along" not in fields:
+        return choices
+    if isinstance(choices.fibre, str) and choices.fibre == "fibre":
+        return choices._replace(fibre=fields["fibre"])
+    if choices.fibre is None and choices.young is None:
+        return choices._replace(**{name: fields[name] for name in ALONG_FIELDS if name in fields})
+    warn("dropped the fibres of the mesh's file, as `young` or `fibre` replaces them", Note)
+    return choices
+
+
+def _directions(fibre: str | Floats, cell_data: Arrays) -> Floats:
+    """Return directions, or the data of cells that they name."""
+    if not isinstance(fibre, str):
+        return fibre
+    vectors = [name for name, rows in cell_data.items() if rows.shape[1:] == (3,)]
+    if fibre not in vectors:
+        raise InputError(
+            f"fibre: expected data of cells with three numbers, such as "
+            f"{', '.join(vectors) or 'of `fields`'}, got {fibre!r}"
+        )
+    return cell_data[fibre]
+
+
+def _along(mesh: Mesh, choices: Choices, values: dict[str, Any], cell_data: Arrays) -> Along | None:
+    """Return the fibres and the moduli along them, isotropic ones if not stated."""
+    stated = {name: values[name] for name in ALONG_FIELDS[:2] if values[name] is not None}
+    if choices.fibre is None:
+        if stated:
+            raise InputError(f"{next(iter(stated))}: needs the direction of fibres; give `fibre`")
+        return None
+    if not stated:
+        raise InputError("fibre: needs a modulus along; give `young_along` or `shear_along`")
+    if mesh.ndim != 3:
+        raise InputError("fibre: expected a tetrahedral mesh, got triangles")
+    if parse_average(choices.average).place == "nodes":
+        raise InputError(
+            "fibre: moduli along fibres are constant within cells; use an average other than nodes"
+        )
+    shear = values["young"] / (2.0 * (1.0 + values["nu"]))
+    return Along(
+        **{"young_along": values["young"], "shear_along": shear, **stated},
+        fibre=_directions(choices.fibre, cell_data),
+    )
+
+
+def _warn_of_isotropic(mesh: Mesh, along: Along | None) -> None:
+    """Warn of cells that have no direction beside others that have fibres."""
+    is_isotropic = np.zeros(1) if along is None else ~along.fibre.any(axis=1)
+    if is_isotropic.any():
+        of_cells = volumes(mesh.points, mesh.cells)
+        warn(
+            f"fibre: {is_isotropic.sum()} of {len(mesh.cells)} cells, "
+            f"{of_cells[is_isotropic].sum() / of_cells.sum():.1%} of the volume, have no "
+            "direction: they are isotropic, with `young` and `nu`"
+        )
 
 
 def _with_fields(
@@ -528,6 +620,8 @@ def _varying_moduli(
     place = parse_average(average).place
     if place not in ("nodes", "gauss") or not (callable(young) or np.ndim(young) == 2):
         return None, None
+    if choices.fibre is not None:
+        return None, None
     if (images := _images_for(young, "young", cells)) is None:
         return None, None
     if place == "nodes" and choices.bins is not None:
@@ -590,7 +684,7 @@ def _values(mapping: Any, name: str, cells: _ModelCells, average: str) -> Floats
     is_linear = parse_average(average).place == "linear"
     if images is not None:  # map each voxel, then average, as in Eq. (2)
         _warn_of_range(mapping, name, cells, images, is_linear=is_linear)
-        if name == "young":
+        if name in MODULI:
             if isinstance(images, Mapping) and not is_linear:
                 _warn_of_empty_cells(cells.mesh, images)
             return cell_young(images, cells.mesh, mapping, average)
@@ -599,14 +693,12 @@ def _values(mapping: Any, name: str, cells: _ModelCells, average: str) -> Floats
         raise InputError(
             f"{name} depends on intensity, but the mesh has no cell means; give the image (`image`)"
         )
-    if name == "young" and average != DEFAULT_AVERAGE:
+    if name in MODULI and average != DEFAULT_AVERAGE:
         raise InputError(f"average: {average} needs the image's voxels; give the image (`image`)")
     # The mapping of each cell's mean equals the mean of the mapping only where the mapping is
     # linear.
     _warn_of_range(mapping, name, cells, None)
-    return (
-        young_from(mapping, cells.mean) if name == "young" else mapped_values(mapping, cells.mean)
-    )
+    return young_from(mapping, cells.mean) if name in MODULI else mapped_values(mapping, cells.mean)
 
 
 def _warn_of_empty_cells(mesh: Mesh, images: Mapping[str, Image]) -> None:

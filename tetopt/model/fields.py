@@ -24,6 +24,7 @@ from tetopt.system.incoming import json_of
 # Fields that depend on the world's axes or on the unit of stress, by name; a suffix such as _step2
 # may follow.
 VECTOR_FIELDS = ("displacement",)
+DIRECTION_FIELDS = ("fibre",)
 TENSOR_FIELDS = ("strain", "stress", "strain_nodes", "stress_nodes")
 NODE_MODULI = "young_nodes"  # point data in tetopt's files: moduli that are linear within cells
 # cell data in tetopt's files: moduli at Gauss points of quadratic cells, one per column
@@ -32,6 +33,8 @@ STRESS_FIELDS = (
     "young",
     NODE_MODULI,
     GAUSS_MODULI,
+    "young_along",
+    "shear_along",
     "stress",
     "von_mises",
     "stress_nodes",
@@ -140,7 +143,8 @@ def half_turned_fields(fields: Arrays, kinds: Mapping[str, str] | None = None) -
     for name, values in fields.items():
         base = _base_name(name)
         kind = (kinds or {}).get(name)
-        if (base in VECTOR_FIELDS or kind in ("vector", "direction")) and values.shape[1:] == (3,):
+        is_vector = base in (*VECTOR_FIELDS, *DIRECTION_FIELDS) or kind in ("vector", "direction")
+        if is_vector and values.shape[1:] == (3,):
             turned[name] = values * HALF_TURN + 0.0  # + 0.0: no -0
         elif (base in TENSOR_FIELDS or kind == "tensor") and values.shape[1:] == (9,):
             turned[name] = values * np.outer(HALF_TURN, HALF_TURN).ravel() + 0.0

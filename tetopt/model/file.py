@@ -22,7 +22,7 @@ from tetopt.model.fields import GAUSS_MODULI, KINDS_TEXT, NODE_MODULI, is_result
 from tetopt.model.label_names import TABLE_TEXT, LabelTable, labels_of, table_of_words
 from tetopt.model.loads import load_words, parse_load
 from tetopt.model.mappings import check_young
-from tetopt.model.materials import BinningError
+from tetopt.model.materials import ALONG_FIELDS, BinningError
 from tetopt.model.model import STRESS_UNITS, Model, half_turned, scale_load
 from tetopt.model.sets import (
     Box,
@@ -40,7 +40,7 @@ from tetopt.system.arrays import Arrays, Bools, Floats, Ints, Json
 from tetopt.system.incoming import json_of
 
 # cell data in tetopt's files
-MATERIAL_FIELDS = ("young", "nu", "density", "material", GAUSS_MODULI)
+MATERIAL_FIELDS = ("young", "nu", "density", "material", GAUSS_MODULI, *ALONG_FIELDS)
 # relative, between a cell's modulus and those at its Gauss points, in files of other units
 MODULUS_ROUNDING = 1e-9
 # text of a mesh's file: `tetopt.contents.domain.mask_text` of what the mesh was built within
@@ -348,6 +348,14 @@ def loads_in(loaded: MeshFile) -> list[str]:
     return [load_words(load, units="kPa") for load in scaled]
 
 
+def material_fields(cell_data: Mapping[str, NDArray]) -> set[str]:
+    """Return the names of data of cells that are of a file's materials: `MATERIAL_FIELDS`, but not
+    a user's own directions.
+    """
+    is_own = "young_along" not in cell_data
+    return set(MATERIAL_FIELDS) - (set(ALONG_FIELDS) if is_own else set())
+
+
 def moduli_in(
     cell_data: Mapping[str, NDArray], young: Any, nu: Any, density: Any
 ) -> tuple[Any, Any, Any]:
@@ -375,6 +383,8 @@ def complete_model(model: Model, loaded: MeshFile, *, is_of_file: bool) -> Model
     if (moduli := loaded.point_data.get(NODE_MODULI)) is not None:
         model = model._replace(node_young=check_young(moduli[: len(model.mesh.points)]))
     table = table._replace(binning=_binning_error(loaded))
+    if table.along is not None:
+        table = table._replace(fibre_binning=_binning_error(loaded, "fibre_binning"))
     at_gauss = _gauss_moduli(model, loaded)
     if at_gauss is None and model.order == 2 and GAUSS_MODULI in loaded.cell_data:
         words = "it does not match the cells and their moduli"
@@ -382,10 +392,10 @@ def complete_model(model: Model, loaded: MeshFile, *, is_of_file: bool) -> Model
     return model._replace(materials=table, gauss_young=at_gauss)
 
 
-def _binning_error(loaded: MeshFile) -> BinningError | None:
+def _binning_error(loaded: MeshFile, name: str = "binning") -> BinningError | None:
     """Return the binning error in a file of tetopt's, None if there is none."""
     try:
-        words = loaded.table("binning")
+        words = loaded.table(name)
         return BinningError(float(words["mean"]), float(words["largest"]))
     # missing, or written by another program
     except (ValueError, TypeError, KeyError):

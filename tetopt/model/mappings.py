@@ -20,7 +20,8 @@ from tetopt.model.formula import INTENSITY, Formula, Named, parse_formula, parse
 from tetopt.system.arrays import Bools, Floats
 from tetopt.system.incoming import text_of, toml_of
 
-MAPPED_OPTIONS = ("young", "nu", "density")  # options of commands whose text is a mapping
+MODULI = ("young", "young_along", "shear_along")  # quantities in units of stress
+MAPPED_OPTIONS = (*MODULI, "nu", "density")  # options of commands whose text is a mapping
 FILES_IN_TEXTS = (*MAPPED_OPTIONS, "merge", "label_size")  # options whose text may name a file
 NAMED_SUFFIXES = (".toml", ".csv")  # of that file
 BY_LABEL = re.compile("(?<![<>=!])=(?!=)")  # not a comparison
@@ -307,7 +308,7 @@ def parse_any_mapping(
         "2017*h**2.5 MPa for 0.1 < h < 1.8"; outside of it they are used, too, and
         `tetopt.build_model` warns.
     quantity : str
-        The file's column; "young" is returned in kPa.
+        The file's column; `MODULI` are returned in kPa.
     units : {"Pa", "kPa", "MPa", "GPa"}
         Of moduli without a unit.
     fields : iterable of str
@@ -322,11 +323,11 @@ def parse_any_mapping(
     if (file := named_file(text)) is not None:
         return load_mapping(file, quantity, units)
     if BY_LABEL.search(text):
-        return parse_labels(text, units if quantity == "young" else None)
+        return parse_labels(text, units if quantity in MODULI else None)
     ranged = RANGE_AT_END.fullmatch(text)
     law = text if ranged is None else ranged[1]
     unit = "kPa"
-    if quantity == "young":
+    if quantity in MODULI:
         law, unit = without_unit(law, units)
     mapping = _scale_mapping(_parse_by_intensity(law, fields), MODULUS_UNITS[unit])
     return mapping if ranged is None else _within_range(mapping, ranged[2].strip(), fields)
@@ -372,8 +373,9 @@ def load_mapping(
     Commas, semicolons or tabs separate the columns of CSV.
 
     One column is "intensity", or "label" (numbers or names, "*" for all others), or "name" instead;
-    another is the quantity, such as "young" or "nu". Moduli are in `units` unless the column is
-    named "young [MPa]" or similar, or a value has its own unit, and are returned in kPa.
+    another is the quantity, such as "young" or "nu". Moduli are in `units` unless the column of
+    young is named "young [MPa]" or similar, whose unit is that of all moduli, or a value has its
+    own unit, and are returned in kPa.
 
     Raises
     ------
@@ -405,7 +407,7 @@ def _mapping_in(path: Path, quantity: str, units: str) -> ModulusMapping | ByLab
     if len(columns[keys[0]]) != len(columns[quantity]):
         counts = f"{len(columns[keys[0]])} of {keys[0]} and {len(columns[quantity])} of {quantity}"
         raise InputError(f"expected columns of the same length, got {counts}")
-    units_of = (unit or units) if quantity == "young" else None
+    units_of = (unit or units) if quantity in MODULI else None
     numbers = [_value(value, units_of) for value in columns[quantity]]
     pairs = list(zip(columns[keys[0]], numbers, strict=True))
     if keys != ["intensity"]:

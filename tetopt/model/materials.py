@@ -1,7 +1,14 @@
 """Materials: Young's modulus and Poisson's ratio of each cell, and their grouping into fewer
 materials.
 
-Isotropic linear elasticity at the undeformed state, which one modulus per cell, Eq. (2), describes.
+Linear elasticity at the undeformed state: isotropic, which one modulus per cell, Eq. (2),
+describes, or transversely isotropic about a direction, the fibres. Then `young` (E) and `nu` hold
+across the fibres, `young_along` (E_a) and `shear_along` (G_a) along them, and `nu` is also the
+ratio of the strain across to that along under tension along them. In the fibres' axes, the first
+along them, the strains are
+
+    e_1 = s_1 / E_a - nu (s_2 + s_3) / E_a,   2 e_12 = s_12 / G_a,
+    e_2 = s_2 / E - nu s_3 / E - nu s_1 / E_a,   2 e_23 = s_23 2 (1 + nu) / E.
 """
 
 from __future__ import annotations
@@ -21,12 +28,14 @@ from tetopt.system.arrays import Arrays, Floats, Ints
 # Poisson's ratio of soft tissue that linear cells still represent: they lock closer to 0.5
 DEFAULT_NU = 0.45
 LABELS_LISTED = 8  # of labels without cells, in a message
+UNIT_ROUNDING = 4.0 * np.finfo(np.float64).eps  # of the length of a unit vector
 Spacing = Literal["equal", "quantile", "log"]
 SPACINGS = get_args(Spacing)
 
 
 class BinningError(NamedTuple):
-    """The error of the bins' moduli, relative to the moduli of cells.
+    """The error of the bins' moduli, relative to the moduli of cells; or the angle between fibres
+    and those of their group, degrees.
 
     Parameters
     ----------
@@ -48,6 +57,33 @@ class BinningError(NamedTuple):
     largest: float
 
 
+class Along(NamedTuple):
+    """The fibres of materials, or of each cell; across them are the isotropic constants.
+
+    Parameters
+    ----------
+    young_along, shear_along : (K,) or (M,) float64
+        Young's modulus along fibres, and the shear modulus between them and the directions across,
+        in the unit of those across.
+    fibre : (M, 3) float64
+        Unit vector along the fibres of each cell; 0 in isotropic cells.
+
+    Examples
+    --------
+    >>> mesh = tetopt.Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2, 3]])
+    >>> model = tetopt.build_model(mesh, young=3, fibre=[[0, 0, 2]], young_along=9)
+    >>> model.materials.along.fibre.tolist()
+    [[0.0, 0.0, 1.0]]
+    """
+
+    young_along: Floats
+    shear_along: Floats
+    fibre: Floats
+
+
+ALONG_FIELDS = Along._fields  # cell data in tetopt's files
+
+
 class Materials(NamedTuple):
     """The distinct materials, softest first, and the material of each cell.
 
@@ -63,6 +99,10 @@ class Materials(NamedTuple):
         The error of the moduli, if they were grouped into bins.
     density : (K,) float64, optional
         kg/m3 in all systems of units.
+    along : Along, optional
+        Fibres, across which `young` and `nu` then hold.
+    fibre_binning : BinningError, optional
+        The error of directions, if they were grouped.
 
     Examples
     --------
@@ -78,6 +118,8 @@ class Materials(NamedTuple):
     of_cell: Ints
     binning: BinningError | None = None
     density: Floats | None = None
+    along: Along | None = None
+    fibre_binning: BinningError | None = None
 
     def fields(self) -> Arrays:
         """Values of each cell, as files have them.
@@ -85,7 +127,8 @@ class Materials(NamedTuple):
         Returns
         -------
         dict of (M,) arrays
-            `young`, `nu`, `material`, counted from 1, and, if known, `density`.
+            `young`, `nu`, `material`, counted from 1, and, if known, `density`; with fibres
+            `young_along`, `shear_along` and `fibre`, (M, 3).
 
         Examples
         --------
@@ -96,13 +139,63 @@ class Materials(NamedTuple):
         fields["material"] = self.of_cell + 1
         if self.density is not None:
             fields["density"] = self.density[self.of_cell]
-        return fields
+        return fields if (along := along_of(self)) is None else fields | along._asdict()
+
+
+def along_of(table: Materials) -> Along | None:
+    """Return the fibres of each cell; None without fibres."""
+    if (of := table.along) is None:
+        return None
+    return Along(of.young_along[table.of_cell], of.shear_along[table.of_cell], of.fibre)
+
+
+def unit_directions(vectors: ArrayLike) -> Floats:
+    """Return vectors (M, 3) of length 1; 0 for those of length 0, or with NaN."""
+    vectors = np.asarray(vectors, dtype=np.float64)
+    length = np.sqrt((vectors**2).sum(axis=1, keepdims=True))
+    is_vector = np.isfinite(length) & (length > 0.0)
+    # so that directions that are read back stay as they are
+    is_scaled = is_vector & (np.abs(length - 1.0) > UNIT_ROUNDING)
+    return np.where(is_vector, vectors, 0.0) / np.where(is_scaled, length, 1.0)
+
+
+def is_fibrous(table: Materials, members: Ints) -> bool:
+    """Return whether any of some cells has fibres."""
+    return table.along is not None and bool(table.along.fibre[members].any())
+
+
+def engineering_constants(table: Materials) -> dict[str, Floats]:
+    """Return constants of the materials, (K,), in the fibres' axes, of which the first is along
+    them: moduli E1 and E2 = E3, G12 = G31 and G23; ratios v = v12 = v13 = v23 and v31; none
+    without fibres.
+    """
+    if (along := table.along) is None:
+        return {}
+    return {
+        "E1": along.young_along,
+        "E2": table.young,
+        "v": table.nu,
+        "v31": table.nu * (table.young / along.young_along),
+        "G12": along.shear_along,
+        "G23": table.young / (2.0 * (1.0 + table.nu)),
+    }
+
+
+def axes_across(fibre: Floats) -> Floats:
+    """Return a second axis for each direction, (M, 3): that of the world with the least part along
+    it; not perpendicular to it.
+    """
+    return np.eye(3)[np.abs(fibre).argmin(axis=1)]
 
 
 def materials(
-    young: ArrayLike, nu: ArrayLike, n_cells: int, density: ArrayLike | None = None
+    young: ArrayLike,
+    nu: ArrayLike,
+    n_cells: int,
+    density: ArrayLike | None = None,
+    along: Along | None = None,
 ) -> Materials:
-    """Group cells of equal modulus, ratio and density into materials.
+    """Group cells of equal moduli, ratio and density into materials.
 
     Parameters
     ----------
@@ -111,11 +204,14 @@ def materials(
     n_cells : int
     density : (M,) array, or one number for all, optional
         kg/m3, above 0.
+    along : Along, optional
+        See `check_along`.
 
     Raises
     ------
     InputError
-        Values are out of range, or their number is not that of the cells.
+        Values are out of range, or their number is not that of the cells; no material has such
+        moduli.
     """
     columns = [_of_cells("young", young, n_cells), _of_cells("nu", nu, n_cells)]
     check_young(columns[0])
@@ -125,16 +221,62 @@ def materials(
         columns.append(
             check_cells("density", masses, masses > 0.0, "kg/m3 above 0", "water has 1000")
         )
+    if along is not None:
+        along = check_along(along, columns[0], columns[1])
+        columns += along[:2]
     kinds, of_cell = np.unique(np.column_stack(columns), axis=0, return_inverse=True)
     columns = [column.copy() for column in kinds.T]
     of_cell = of_cell.ravel().astype(np.int64)
-    return Materials(columns[0], columns[1], of_cell, None, *columns[2:])
+    along = None if along is None else Along(*columns[-2:], along.fibre)
+    mass = None if density is None else columns[2]
+    return Materials(columns[0], columns[1], of_cell, None, mass, along)
+
+
+def check_along(along: Along, young: Floats, nu: Floats) -> Along:
+    """Return the fibres of cells, with unit vectors and, in cells whose direction is 0 or NaN, the
+    isotropic moduli of `young` and `nu`, (M,).
+
+    Raises
+    ------
+    InputError
+        Another number of moduli or directions; a modulus that is not above 0; an elasticity tensor
+        that is not positive definite; no cell has a direction.
+    """
+    n_cells = len(young)
+    if np.shape(along.fibre) != (n_cells, 3):
+        raise InputError(
+            f"fibre: expected three numbers for each of {n_cells} tetrahedra, got shape "
+            f"{np.shape(along.fibre)}"
+        )
+    fibre = unit_directions(along.fibre)
+    is_along = fibre.any(axis=1)
+    if not is_along.any():
+        raise InputError("fibre: expected directions, got only 0 or NaN")
+    stiff, shear = (
+        np.where(is_along, _of_cells(name, own, n_cells), isotropic)
+        for name, own, isotropic in zip(
+            ALONG_FIELDS, along, (young, young / (2.0 * (1.0 + nu))), strict=False
+        )
+    )
+    least = 2.0 * nu**2 * young / (1.0 - nu)
+    expected = f"moduli above 2 nu^2 young / (1 - nu), up to {least.max():.4g} kPa here"
+    hint = "otherwise the elasticity tensor is not positive definite"
+    check_cells("young_along", stiff, stiff > least, expected, hint)
+    check_cells("shear_along", shear, shear > 0.0, "moduli above 0 kPa", hint)
+    return Along(stiff, shear, fibre)
 
 
 def without_moduli(table: Materials) -> Materials:
-    """Return materials by ratio and density only; their moduli are 1."""
+    """Return materials by ratio and density only, without fibres; their moduli are 1."""
     density = None if table.density is None else table.density[table.of_cell]
     return materials(1.0, table.nu[table.of_cell], len(table.of_cell), density)
+
+
+def scale_moduli(table: Materials, factor: float) -> Materials:
+    """Return the materials with all moduli multiplied, for another unit."""
+    if (along := table.along) is not None:
+        along = Along(along.young_along * factor, along.shear_along * factor, along.fibre)
+    return table._replace(young=table.young * factor, along=along)
 
 
 def density_of(table: Materials | None) -> Floats:
@@ -220,8 +362,9 @@ def bin_moduli(
     """Group moduli into at most `count` bins.
 
     The modulus of a bin is the mean over its cells, weighted by volume. Ratios and densities are
-    unchanged if there are at most `count` of them; otherwise they are binned in the same way. A
-    material is a combination of bins.
+    unchanged if there are at most `count` of them; otherwise they are binned in the same way, as
+    are moduli along fibres, and directions become those of at most `count` groups
+    (`group_directions`). A material is a combination of bins.
 
     Parameters
     ----------
@@ -252,8 +395,43 @@ def bin_moduli(
         else _bin_means(exact.density[exact.of_cell], volumes, count, linear)
     )
     off = np.abs(fewer - young) / young
+    along = along_of(exact)
+    of_fibres = None
+    if along is not None:
+        moduli = [_bin_means(each, volumes, count, spacing) for each in along[:2]]
+        for new, old in zip(moduli, along[:2], strict=True):
+            off = np.maximum(off, np.abs(new - old) / old)
+        fibre, angle = group_directions(along.fibre, count)
+        along = Along(*moduli, fibre)
+        of_fibres = BinningError(float((angle * volumes).sum() / volumes.sum()), float(angle.max()))
     error = BinningError(float((off * volumes).sum() / volumes.sum()), float(off.max()))
-    return materials(fewer, ratios, len(young), density)._replace(binning=error)
+    binned = materials(fewer, ratios, len(young), density, along)
+    return binned._replace(binning=error, fibre_binning=of_fibres)
+
+
+def group_directions(fibre: Floats, count: int) -> tuple[Floats, Floats]:
+    """Return directions (M, 3) of at most `count` groups, and the angle of each cell to its own,
+    (M,) degrees; signs do not matter, and cells without a direction keep none.
+
+    A group has the direction that is farthest from those of all groups before: the largest angle is
+    at most twice the least possible (T.F. Gonzalez, Theoretical Computer Science 38, 1985,
+    293-306), whereas groups of least mean angle turned single cells by 58 degrees.
+    """
+    is_along = fibre.any(axis=1)
+    own = fibre[is_along]
+    nearest, cosine = own, np.full(len(own), -1.0)
+    for _ in range(count if len(own) else 0):
+        axis = own[cosine.argmin()]
+        towards = np.abs((own * axis).sum(axis=1))  # not by BLAS, which rounds by threads
+        nearest = np.where((towards > cosine)[:, None], axis, nearest)
+        cosine = np.maximum(cosine, towards)
+        if cosine.min() > 1.0 - UNIT_ROUNDING:
+            break
+    sign = np.where((own * nearest).sum(axis=1) < 0.0, -1.0, 1.0)
+    chord = np.sqrt(((own - sign[:, None] * nearest) ** 2).sum(axis=1))
+    grouped, angle = fibre.copy(), np.zeros(len(fibre))
+    grouped[is_along], angle[is_along] = nearest, np.degrees(2.0 * np.arcsin(0.5 * chord))
+    return grouped, angle
 
 
 def _bin_means(values: Floats, volumes: Floats, count: int, spacing: Spacing) -> Floats:

@@ -26,7 +26,7 @@ from tetopt.model.fields import (
 from tetopt.model.label_names import TABLE_TEXT, labels_of, table_of_words
 from tetopt.model.loads import FACET_FORCES, SHOWN_LOAD_DIGITS, Load, facet_forces, load_words
 from tetopt.model.mappings import MODULUS_UNITS
-from tetopt.model.materials import Materials
+from tetopt.model.materials import Materials, scale_moduli
 from tetopt.model.sets import Sets, facet_triples, label_set_names
 from tetopt.model.skfem import skfem_mesh
 from tetopt.system.arrays import Arrays, Floats, Ints, Json
@@ -269,9 +269,11 @@ def in_space(model: Model, space: str) -> Model:
         half_turned_fields(each, field_kinds(model.about.get(KINDS_TEXT)))
         for each in (model.cell_data, model.point_data)
     )
-    return model._replace(
-        mesh=mesh, loads=loads, space=space, cell_data=cell_data, point_data=point_data
-    )
+    table = model.materials
+    if table is not None and (along := table.along) is not None:
+        table = table._replace(along=along._replace(fibre=half_turn(along.fibre)))
+    model = model._replace(cell_data=cell_data, point_data=point_data, materials=table)
+    return model._replace(mesh=mesh, loads=loads, space=space)
 
 
 def half_turn(vectors: Floats) -> Floats:
@@ -308,7 +310,7 @@ def in_units(model: Model, units: str, *, with_lengths: bool = True) -> Model:
         mesh = Mesh(mesh.points * length, mesh.cells, middles)
     return model._replace(
         mesh=mesh,
-        materials=None if table is None else table._replace(young=table.young * stress),
+        materials=None if table is None else scale_moduli(table, stress),
         loads=tuple(scale_load(load, stress, length) for load in model.loads),
         node_young=None if model.node_young is None else model.node_young * stress,
         gauss_young=None if model.gauss_young is None else model.gauss_young * stress,
@@ -390,6 +392,13 @@ def header_lines(model: Model) -> list[str]:
         lines.append(
             f"materials: bins, error of the modulus {error.mean:.3%} (mean by volume), "
             f"{error.largest:.3%} (largest)"
+        )
+        if (angle := model.materials.fibre_binning) is not None:
+            lines[-1] += f"; of fibres {angle.mean:.3f} and {angle.largest:.3f} degrees"
+    if model.materials is not None and model.materials.along is not None:
+        lines.append(
+            "transversely isotropic: young and nu across the fibres; nu is also the ratio of the "
+            "strain across to that along under tension along"
         )
     if (labels := model.labels) is not None:
         names = label_set_names(np.unique(labels).tolist(), model.label_names)

@@ -15,12 +15,14 @@ from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
 from tetopt.model.label_names import LABEL_FIELD, NO_TABLE, LabelTable, table_of_labels
+from tetopt.model.materials import group_directions, unit_directions
 from tetopt.report.colours import grey_limits, label_colours
 from tetopt.system.arrays import Floats
 
 COLOUR_MAP = "viridis"  # perceptually even
 # whole numbers with more values are a quantity: a longer list of colours is unreadable
 MOST_CATEGORIES = 128
+MOST_DIRECTIONS = 64  # groups of directions, of which the farthest cell is 14 degrees away
 NO_VALUE = "#aaaaaa"  # colour of cells whose value is NaN
 # of the cells, at either end of a field, which do not affect its colour range
 OUTLIERS_PERCENT = 1.0
@@ -98,7 +100,8 @@ def exhibit(
     cell_data : dict of arrays of M rows
         By name, as `tetopt.load_mesh` returns them. Data with one number per cell are fields: whole
         numbers from 0 with up to `MOST_CATEGORIES` values are labels, all others are quantities.
-        Without any, the fields of `tetopt.cell_fields` are used.
+        Without any, the fields of `tetopt.cell_fields` are used. Those with three numbers are
+        directions, of `MOST_DIRECTIONS` groups, in red (x), green (y) and blue (z).
     image : Image, optional
         Shown in the plane of the cut.
     title : str
@@ -142,7 +145,13 @@ def exhibit(
         _field(name, values, table=table if name == LABEL_FIELD else NO_TABLE)
         for name, values in (scalars or cell_fields(mesh, image)).items()
     ]
-    skipped = [name for name in cell_data if name not in scalars] + others
+    vectors = {
+        name: values
+        for name, values in arrays.items()
+        if values.shape[1:] == (3,) and values.dtype.kind in "iuf"
+    }
+    fields += [_directions(name, values) for name, values in vectors.items()]
+    skipped = [name for name in cell_data if name not in {**scalars, **vectors}] + others
     if len(displacements) > 1:
         skipped = list(dict.fromkeys(STEP_NAME.sub(r"\1", name) for name in skipped))
     forces = {
@@ -294,6 +303,18 @@ def _field(
     categories = [] if is_quantity else _categories(finite, table)
     names = table_of_labels(table, [label for label, _ in categories]).names
     return ShownField(name, unit, values, limits, categories, at_nodes, names=names)
+
+
+def _directions(name: str, vectors: NDArray) -> ShownField:
+    """Create a field of the nearest of some directions; NaN in cells without one."""
+    units, _ = group_directions(unit_directions(vectors), MOST_DIRECTIONS)
+    largest = np.take_along_axis(units, np.abs(units).argmax(axis=1)[:, None], axis=1)
+    kinds, which = np.unique(np.where(largest < 0.0, -units, units), axis=0, return_inverse=True)
+    values = np.where(units.any(axis=1), which.ravel(), np.nan).astype(np.float32)
+    present = np.flatnonzero(kinds.any(axis=1)).tolist()
+    colours = [(k, to_hex(np.abs(kinds[k]).clip(max=1.0))) for k in present]
+    names = {k: " ".join(f"{x:.2f}" for x in (kinds[k].round(2) + 0.0).tolist()) for k in present}
+    return ShownField(name, "direction", values, (0.0, float(len(kinds))), colours, names=names)
 
 
 def _single(values: NDArray) -> NDArray[np.float32]:

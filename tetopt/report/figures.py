@@ -29,6 +29,7 @@ from tetopt.measure.fidelity import cell_labels, half_level_surface
 from tetopt.measure.quality import BAD_SHAPE, quality_errors, rho_histogram
 from tetopt.mesh import Mesh
 from tetopt.model.label_names import NO_TABLE, LabelTable
+from tetopt.model.materials import unit_directions
 from tetopt.report.colours import (
     LISTED_LABELS,
     UNCOVERED_COLOUR,
@@ -51,6 +52,7 @@ DETAIL_VOXELS = 25  # along the side of an enlarged region: single voxels remain
 SLICE_WIDTH_INCHES = 4.2  # of the widest slice in a figure of several planes: two fill a page
 SLICES_HEIGHT_INCHES = 12.0  # of all its planes, one above the other, which fit on a page
 LETTER_INCHES = 0.075  # width of a letter in a legend, in 9 points
+FIBRE_FRACTION = 0.8  # of a section's mean radius: half of a line along fibres
 FRAME_FRACTION = 0.1  # of a mesh's larger side in a slice: the image that is shown around it
 NUMBER_RADIUS_FRACTION = 0.014  # of a slice's width: the radius of a label's number in 5 points
 
@@ -70,13 +72,14 @@ def save_run_figures(
     whole: Image | None = None,
     mask: Image | None = None,
     table: LabelTable | None = None,
+    fibre: Floats | None = None,
 ) -> None:
     """Write three PNGs of a run: slice with mesh before and after, rho histograms before and after,
     energies.
 
     `paths` are their names, and `start` names the initial mesh. If `image`
     is extended beyond a mask, `whole` is the image to show; the colours of a label map are those of
-    the `table`.
+    the `table`; `fibre` (M, 3) are directions in the result's cells.
     """
     first, last = result.history[0], result.history[-1]
     fit = f"{last.E_D / first.E_D:.3f} of the initial E_D" if first.E_D > 0.0 else "constant image"
@@ -84,7 +87,7 @@ def save_run_figures(
     after = f"optimised, {fit}"
     meshes = [(before, initial), (after, result.mesh)]
     shown = image if whole is None else whole
-    save_figure(slice_figure(shown, meshes, means_of=image, mask=mask, table=table), paths[0])
+    save_figure(slice_figure(shown, meshes, image, mask, table, fibre), paths[0])
     save_figure(histogram_figure(meshes), paths[1])
     save_figure(energy_figure(result.history), paths[2])
 
@@ -95,6 +98,7 @@ def slice_figure(
     means_of: Image | None = None,
     mask: Image | None = None,
     table: LabelTable | None = None,
+    fibre: Floats | None = None,
 ) -> Figure:
     """Draw a slice of the volume with the section of each mesh, and below it the mean of each cell,
     or, of a label map with this `table`, the label of most of its voxels.
@@ -103,6 +107,8 @@ def slice_figure(
     middle one if the mesh does not reach it, as far as the meshes reach. Black and white are those
     of the voxels in the last mesh and its mask. The means are those of `means_of`, by default of
     the image itself. In their row, parts of the image that a mesh does not cover are light blue.
+    Directions `fibre` (M, 3) in the cells of the last mesh are lines over its means: red from left
+    to right, green from back to front, blue upwards, shorter out of the slice.
     """
     view = SliceView(image, None, _slice_through(meshes[-1][1], image))
     sections = [view.section(mesh) for _, mesh in meshes]
@@ -128,6 +134,8 @@ def slice_figure(
             flat.set_facecolor(UNCOVERED_COLOUR)
             flat.set_title("label of most voxels in each cell", fontsize=10)
         draw_edges(over, polygons)
+        if fibre is not None and mesh is meshes[-1][1]:
+            view.draw_directions(flat, polygons, fibre[cells])
         over.set_title(title + _curved_words(mesh), fontsize=11)
         for axes in (over, flat):
             view.frame(axes, window)
@@ -546,6 +554,18 @@ class SliceView:
         """Convert index coordinates (..., n) to positions in the picture (..., 2), mm."""
         flat = (index[..., self.axes] + 0.5) * self.steps
         return np.where(self.flip, self.size - flat, flat)
+
+    def draw_directions(self, axes: Axes, polygons: Floats, vectors: Floats) -> None:
+        """Draw directions (K, 3) as coloured lines across polygons."""
+        units = unit_directions(vectors)
+        index = units @ np.linalg.inv(self.image.affine[:3, :3]).T
+        flat = index[:, self.axes] * self.steps * np.where(self.flip, -1.0, 1.0)
+        middle = polygons.mean(axis=1)
+        radius = np.sqrt(((polygons - middle[:, None]) ** 2).sum(axis=2)).mean(axis=1)
+        ends = flat * (FIBRE_FRACTION * radius)[:, None]
+        lines = np.stack([middle - ends, middle + ends], axis=1)
+        for colour, width in (("black", 1.4), (np.abs(units), 0.9)):
+            axes.add_collection(LineCollection(list(lines), colors=colour, linewidths=width))
 
     def window(self, polygons: Sequence[Floats]) -> Floats:
         """Return the corners of the part of the slice around polygons (K, 3 or 4, 2), (2, 2) mm."""

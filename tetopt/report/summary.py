@@ -144,6 +144,9 @@ def model_summary(model: Model) -> dict[str, Any]:
             "nu": nu,
             "binning": table.binning,
         }
+        if (along := table.along) is not None:
+            own = {"young_along_kPa": along.young_along, "shear_along_kPa": along.shear_along}
+            summary["materials"] |= {**own, "fibre_binning": table.fibre_binning}
         if table.density is not None:
             summary["materials"]["density_kg_m3"] = table.density
     if model.loads:
