@@ -93,6 +93,8 @@ def test_a_label_of_another_volume_is_among_the_worst(labels):
     rows[3] = with_numbers(rows[3], mesh_volume=0.1 * rows[3].extent.volume)
     assert 3 in worst_labels(rows)
     assert len(worst_labels(rows)) == 12
+    rows[3] = with_numbers(rows[3], covered_voxels=0)  # outside the mesh
+    assert 3 not in worst_labels(rows)
 
 
 def test_a_run_prints_ten_rows_and_quality_all_of_them(here):

@@ -313,6 +313,18 @@ def test_level_of_noisy_air(air):
     assert_array_equal(foreground_mask(image).data, body)
 
 
+@pytest.mark.parametrize(("value", "is_air"), [(-1000.0, True), (-870.0, False)])
+def test_air_of_a_ct_beside_padding_is_background(value, is_air):
+    """The padding has the least value; lungs that were cut out stay."""
+    shape, rng = (40, 40, 20), np.random.default_rng(5)
+    body, round_view = (
+        np.broadcast_to(ball(shape[:2], radius)[:, :, None], shape) for radius in (10, 19)
+    )
+    data = np.where(body, 40.0, value) + rng.normal(0.0, 10.0, shape)
+    image = Image(np.where(round_view, np.maximum(data, -1024.0), -1024.0))
+    assert_array_equal(foreground_mask(image).data, body if is_air else image.data > -1024.0)
+
+
 def test_background_of_one_value_is_exact():
     """As around an extracted brain: the faintest voxel beside it is foreground."""
     body = ball((20, 20, 20), 7)

@@ -27,7 +27,7 @@ from tetopt.job.advice import (
 from tetopt.job.advice import unmet_requirements as unmet_of
 from tetopt.job.events import listen_with
 from tetopt.measure.fidelity import LabelPieces, MaskFidelity
-from tetopt.measure.judge import LABEL_REMEDY, PIECES_REMEDY, judge
+from tetopt.measure.judge import LABEL_REMEDY, PIECES_REMEDY, MaskComponents, judge
 from tetopt.start.label_sizes import sizes_by_label
 from tetopt.start.sizes import EdgeRatios, Sizes
 
@@ -264,10 +264,35 @@ def test_labels_that_cells_cannot_show_violate_nothing():
         assert list(told(*unmet({}, labels=[row]))[0]) == expected
 
 
+def test_labels_that_lie_outside_the_mesh_are_told_once():
+    """They need no cell, and more nodes would not help; nor does label 0, the space around it."""
+    rows = [label_of(k, 0.0, k > 1, voxels=1000) for k in range(7)]
+    for covered, names, n_told in ((499, [], 1), (500, ["labels"], 0)):
+        outside = [with_numbers(row, covered_voxels=covered) for row in rows[:1]]
+        named, text = told(*unmet({}, labels=outside))
+        assert list(named) == names
+        outside = [with_numbers(row, covered_voxels=covered * (covered > 499)) for row in rows]
+        named, text = told(*unmet({}, labels=outside))
+        assert list(named) == names
+        part = "the mesh covers a part of the labels' image: of 6 labels, less than half lies in it"
+        assert text.count(f"{part}: 1, 2, 3, 4, 5 and 1 more\n") == n_told
+        assert text.count("\n") == 1
+    assert beyond_requirements({"labels": [with_numbers(rows[3], covered_voxels=499)]}) == {}
+
+
+@pytest.mark.parametrize(("word", "is_told"), [("foreground", True), ("mask", False)])
+def test_a_foreground_of_more_than_the_body_asks_for_a_higher_background(word, is_told):
+    required = required_of(word, {})
+    rows = {"components": MaskComponents(2, (90, 8, 3), (), ())}
+    words = judge(rows, required)["components"]
+    assert ("use a higher `background` or a `mask`" in words) == is_told
+    assert words.endswith("allow more nodes")
+
+
 def test_more_nodes_do_not_help_crumbs():
     few = label_of(3, 2.0)
     for components, n_remedies in ((1, 1), (5, 0)):
-        row = with_numbers(few, voxels=90, components=components)
+        row = with_numbers(few, voxels=90, covered_voxels=90, components=components)
         assert told(*unmet({}, labels=[row]))[1].count("allow more nodes") == n_remedies
 
 

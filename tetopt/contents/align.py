@@ -30,6 +30,8 @@ SAME_GRID_VOXELS = 1e-4
 SAME_BOX_VOXELS = 1.01  # the same of boxes: resampling rounds a box to whole voxels
 LEAST_COVERED_FRACTION = 0.5  # of the image's voxel centres, which a further contrast must cover
 LEAST_DARKER = 0.1  # of dark voxels: a CT's air beside a constant of -1000 has .24, an organ none
+# Hounsfield units: air has -1000, lungs more than this, below which they count as emphysema
+CT_AIR_BELOW = -950.0
 # of the background's noise above its median, up to which voxels count as background
 BACKGROUND_SIGMAS = 4.0
 MAD_TO_SIGMA = 1.4826  # sigma of a normal distribution over its median absolute deviation
@@ -435,7 +437,7 @@ def background_level(image: Image) -> float:
     from the median absolute deviation, which is robust against body on the faces (Hampel, The
     influence curve and its role in robust estimation, JASA 69, 1974). The level of a constant
     background, as around an extracted brain, is its value; if a tenth of the other dark voxels are
-    darker, as noise of air beside padding is, their level counts.
+    darker, or half are air of a CT, as beside padding, their level counts.
 
     Raises
     ------
@@ -461,9 +463,10 @@ def background_level(image: Image) -> float:
     spread = np.median(np.abs(dark - middle))
     if spread == 0.0:
         others = image.data[(image.data <= threshold) & (image.data != middle)].astype(np.float64)
-        if np.count_nonzero(others < middle) > LEAST_DARKER * len(others):
-            middle = np.median(others)
-            spread = np.median(np.abs(others - middle))
+        of_others = np.median(others) if len(others) else np.inf
+        n_darker = np.count_nonzero(others < middle)
+        if n_darker > LEAST_DARKER * len(others) or of_others < CT_AIR_BELOW:
+            middle, spread = of_others, np.median(np.abs(others - of_others))
     level = float(middle + BACKGROUND_SIGMAS * MAD_TO_SIGMA * spread)
     if level >= threshold:
         raise _no_background(

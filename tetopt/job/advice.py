@@ -41,6 +41,10 @@ from tetopt.system.arrays import Floats, Json
 # Of the cells, over the voxels': other volumes are told beside the verdict.
 NEAR_VOLUME, NEAR_MASK = (0.85, 1.15), (0.95, 1.05)
 POCKETS = "voxels without a label, enclosed or bright"  # label 0 where a background was removed
+FOREGROUND_REMEDY = (
+    "if it holds more than the body, as a table, use a higher `background` or a `mask`; otherwise "
+    f"{MORE_NODES}"
+)
 Wanted = Literal["smaller", "larger"]
 # Requirements whose sentences ask for smaller cells.
 SMALLER_CELLS: Mapping[str, Wanted] = dict.fromkeys(
@@ -185,7 +189,8 @@ def _of_labels(measured: Json, required: Requirements) -> Iterator[Problem]:
     """
     labels = measured.get("labels", [])
     faulty = set(faulty_labels(labels, required))
-    others = [row for row in labels if row.label not in faulty and not is_pocket(row, required)]
+    judged = [row for row in labels if row.label not in faulty and not is_pocket(row, required)]
+    others = [row for row in judged if not row.extent.is_beyond]
     for row in labels:
         if is_pocket(row, required) and row.overlap.dice < LEAST_DICE:
             count = count_text(row.pieces.components, "piece")
@@ -204,6 +209,14 @@ def _of_labels(measured: Json, required: Requirements) -> Iterator[Problem]:
     def words(row: LabelFidelity) -> str:
         return required.label_words(row.label)
 
+    yield from find_odd_labels(
+        (row for row in judged if row.label != BACKGROUND_LABEL),
+        lambda row: row.extent.is_beyond,
+        0,
+        words,
+        "the mesh covers a part of the labels' image: of {}, less than half lies in it: {}",
+        most=5,
+    )
     yield from find_odd_labels(
         others,
         lambda row: row.extent.is_lost,
@@ -233,12 +246,13 @@ def _of_labels(measured: Json, required: Requirements) -> Iterator[Problem]:
     )
 
 
-def required_of(word: str, names: Mapping[int, str], remedy: str = MORE_NODES) -> Requirements:
+def required_of(word: str, names: Mapping[int, str], remedy: str = "") -> Requirements:
     """Return the words for a verdict: of the meshed region, and of labels by their names."""
+    usual = FOREGROUND_REMEDY if word == FOREGROUND else MORE_NODES
     pockets = {BACKGROUND_LABEL: POCKETS} if word == FOREGROUND else {}
     known = {**names, **pockets}
     return Requirements(
-        region=word, label_words=lambda label: label_words(label, known), remedy=remedy
+        region=word, label_words=lambda label: label_words(label, known), remedy=remedy or usual
     )
 
 
@@ -258,7 +272,7 @@ def beyond_requirements(measured: Mapping[str, Any], word: str = "mask") -> dict
     rows, names = measured.get("labels", []), measured.get("label_names", {})
     for row in rows:
         extent = row.extent
-        ratio = extent.ratio if extent.covered_voxels else 1.0
+        ratio = 1.0 if extent.is_beyond else extent.ratio
         is_whole = extent.covered_voxels == extent.voxels
         faults = _faults(row.pieces, ratio, NEAR_VOLUME, row.surface, is_whole)
         for what, rank, words in faults:

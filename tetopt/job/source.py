@@ -50,7 +50,7 @@ from tetopt.job.option_values import (
 from tetopt.job.options import SourceOptions
 from tetopt.job.request import checksum
 from tetopt.measure.fidelity import cell_labels, unexplained_of
-from tetopt.measure.judge import MORE_NODES, Requirements
+from tetopt.measure.judge import Requirements
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
 from tetopt.model.file import MASK_TEXT, MeshFile
@@ -83,7 +83,7 @@ class Source(NamedTuple):
     mask: Image | None
     about: Json  # names, checksums, weights and the image's box, for the mesh's file
     table: LabelTable  # of the labels
-    remedy: str = MORE_NODES  # if the region has more detail than cells
+    remedy: str = ""  # if noise is what gives the region more detail than cells
 
     @property
     def image(self) -> Image:
@@ -249,18 +249,18 @@ def _region(
     beside: Beside,
     loaded: MeshFile | None,
 ) -> tuple[Image | None, float | None, str]:
-    """Return the mask, the background's level if the options remove one, and the remedy if cells
-    are too large for the mask.
+    """Return the mask, the background's level if the options remove one, and the remedy if that
+    leaves noise.
     """
     if options.background is None:
-        return mask_for(options, image, beside, loaded), None, MORE_NODES
+        return mask_for(options, image, beside, loaded), None, ""
     is_auto = options.background == "auto"
     level = background_level(image) if is_auto else number_of("`background`", options.background)
     front = _foreground(image, level, labels)
     noise = "" if is_auto else _words_on_noise(image, level, front)
     if noise:
         warning(f"background: {noise}; {AUTO_BACKGROUND}")
-    return front, level, AUTO_BACKGROUND if noise else MORE_NODES
+    return front, level, AUTO_BACKGROUND if noise else ""
 
 
 def _words_on_noise(image: Image, level: float, front: Image) -> str:

@@ -142,6 +142,11 @@ class LabelExtent(NamedTuple):
         """Ratio of the volume of its cells to that of its voxels that they should represent."""
         return self.mesh_volume / self.volume * self.voxels / max(self.covered_voxels, 1)
 
+    @property
+    def is_beyond(self) -> bool:
+        """True if cells should represent less than half of its voxels, as most are outside."""
+        return 2 * self.covered_voxels < self.voxels
+
 
 class LabelPieces(NamedTuple):
     """Connected components of a label.

@@ -211,7 +211,8 @@ def judge(rows: dict[str, Any], required: Requirements) -> dict[str, str]:
     boundary, within a mask or of the user's own mesh, or the interface of two labels is not a
     manifold. `labels`: labels of 200 voxels or more without a cell at one of them, or with
     0.6 to 1.5 times their volume exceeded, or components of 50 voxels or more without a cell; not
-    of components smaller than two mean cells around them, nor of label 0 in a foreground.
+    of components smaller than two mean cells around them, nor of label 0 in a foreground,
+    or where most of it lies outside the mesh.
     `error`: more unexplained variance than allowed. One that cannot be checked counts as violated,
     with the reason.
     """
@@ -333,8 +334,13 @@ def is_pocket(row: LabelFidelity, required: Requirements) -> bool:
 
 
 def _is_judged(row: LabelFidelity) -> bool:
-    """Return whether a label has voxels for a verdict, and a component that cells can show."""
-    return row.extent.covered_voxels >= LABEL_VOXELS and row.extent.size_in_cells >= LEAST_CELLS
+    """Return whether a label has voxels for a verdict, and a component that cells can show.
+
+    Label 0 is that of the space outside the mesh, too: where most of it lies, it needs no cell.
+    """
+    is_space = row.label == BACKGROUND_LABEL and row.extent.is_beyond
+    is_shown = row.extent.size_in_cells >= LEAST_CELLS
+    return row.extent.covered_voxels >= LABEL_VOXELS and is_shown and not is_space
 
 
 def _is_absent(row: LabelFidelity) -> bool:

@@ -193,15 +193,16 @@ def curving_in_words(curving: Curving) -> str:
 
 def worst_labels(rows: Sequence[LabelFidelity], most: int | None = WORST_LABELS) -> list[int]:
     """Return the places of at most `most` labels, by default 12: the worst by Dice or volume if
-    there are more.
+    there are more, those outside the mesh last.
     """
     places = list(range(len(rows)))
     if most is None or len(rows) <= most:
         return places
 
-    def fit(place: int) -> float:
-        volume, voxels = rows[place].extent.mesh_volume, rows[place].extent.volume
-        return min(rows[place].overlap.dice, min(volume, voxels) / max(volume, voxels))
+    def fit(place: int) -> tuple[bool, float]:
+        extent, dice = rows[place].extent, rows[place].overlap.dice
+        volume, voxels = extent.mesh_volume, extent.volume
+        return extent.is_beyond, min(dice, min(volume, voxels) / max(volume, voxels))
 
     return sorted(sorted(places, key=fit)[:most])
 
