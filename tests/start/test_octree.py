@@ -270,6 +270,15 @@ def test_a_wall_with_holes_too_small_to_lose_volume_has_a_finer_octree(monkeypat
     assert hole_numbers(torn, mask, content.region) == (1, -1)
 
 
+def test_tears_that_hardly_become_fewer_ask_for_no_more_cells_than_the_volume(monkeypatch):
+    """As of the cortex of a brain, which has hundreds."""
+    content, meshes = shell(26, 9.0), []
+    for torn in ([*range(300, 400, 10)], [0] * 9):
+        monkeypatch.setattr(octree, "misfit_of_holes", lambda _, left=torn: left.pop())
+        meshes.append(octree_mesh(content, 500))
+    assert_same_mesh(*meshes)
+
+
 @pytest.mark.parametrize("sigma", [0.0, 3.0])
 def test_facets_of_a_ball_cut_off_what_it_lacks(monkeypatch, sigma):
     """Also of a blurred one, whose level rises by an eighth per voxel, not by 1, so that depths

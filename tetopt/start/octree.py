@@ -389,8 +389,10 @@ def _finer_octrees(
         faults = octree.faults
         is_larger = STALLED_FRACTION * least[0] < faults[0] < SMALL_LOSS
         n_stalled = n_stalled + 1 if is_larger or least <= faults < (SMALL_LOSS,) else 0
+        # cells that keep the volume but hardly tear less than those before: the mask is rough
+        is_rough = faults[0] == 0.0 < least[0] < 1.0 and faults[1] > LESS_LOST * least[1]
         least = min(least, faults)
-        if faults == (0.0, 0) or n_stalled == STALLED_STEPS or is_over():
+        if faults == (0.0, 0) or is_rough or n_stalled == STALLED_STEPS or is_over():
             return
 
 
