@@ -337,7 +337,7 @@ def test_a_gap_that_closing_fills_is_no_hole():
     [
         ("dihedral_angles", ["min_dihedral"]),
         ("beyond_box", ["box"]),
-        ("cell_of_voxel", ["overlap", "mask", "components"]),
+        ("voxel_cells", ["overlap", "mask", "components"]),
         ("hole_numbers", ["euler"]),
         ("manifold_problems", ["manifold"]),
     ],
