@@ -279,7 +279,7 @@ def _table_of_labels(*columns: str) -> Table:
     for column in table.columns:
         column.vertical = "bottom"
     for column in table.columns[1:]:
-        column.no_wrap, column.overflow = True, "fold"  # a number is never cut
+        column.no_wrap = True
     return table
 
 
