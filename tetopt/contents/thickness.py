@@ -193,13 +193,14 @@ def _chords(
     """
     (steps, ways, _), partition = rays, labels.partition
     n_planes, n_rows, n_columns = partition.shape
-    least, best = np.full(partition.shape, most), np.full(partition.shape, -1, dtype=np.int8)
-    is_middle = np.zeros(partition.shape, dtype=np.bool_)
+    least, best = np.full(partition.size, most), np.full(partition.size, -1, dtype=np.int8)
+    is_middle = np.zeros(partition.size, dtype=np.bool_)
     # of the last two planes
     before = np.empty((2, n_rows, n_columns), dtype=np.int16)
     begin = np.empty((2, n_rows, n_columns))
     for d in range(len(steps)):
         (s, t, u), length = row(steps, d), ways[d, 1]
+        stride = (s * n_rows + t) * n_columns + u
         before[:] = NO_RUN
         for i in range(n_planes):
             a = i - s
@@ -220,15 +221,19 @@ def _chords(
                     end, begin_here[k] = _surface_between(labels, (a, b, c), (i, j, k), d, length)
                     if here[k] >= 0:
                         n_here[k] = 0
-                    for m in range(n + 1 if n >= 0 and ways[d, n] < most else 0):
-                        p, q, r = a - m * s, b - m * t, c - m * u
-                        if not ends[0] <= (p if axis == 0 else q) < ends[1]:
-                            continue
-                        forth, back = ways[d, m] + end, ways[d, n - m] + begin_there[c]
-                        if forth + back < least[p, q, r]:
-                            least[p, q, r], best[p, q, r] = forth + back, d
-                            is_middle[p, q, r] = abs(forth - back) / length <= OFF_MIDDLE_STEPS
-    return least, best, is_middle
+                    chord = most if n < 0 else ways[d, n] + end + begin_there[c]
+                    if chord >= most:
+                        continue
+                    uneven = (end - begin_there[c]) / length - n
+                    v = (a * n_rows + b) * n_columns + c
+                    for m in range(n + 1):
+                        place = a - m * s if axis == 0 else b - m * t
+                        if chord < least[v] and ends[0] <= place < ends[1]:
+                            least[v], best[v] = chord, d
+                            is_middle[v] = abs(uneven + 2 * m) <= OFF_MIDDLE_STEPS
+                        v -= stride
+    shape = partition.shape
+    return least.reshape(shape), best.reshape(shape), is_middle.reshape(shape)
 
 
 @njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")
@@ -339,22 +344,21 @@ def _thickness(
             for k in range(shape[2]):
                 if not is_middle[i, j, k]:
                     continue
-                place = (i, j, k)
+                place, own = (i, j, k), partition[i, j, k]
                 size = np.float32(_across(labels, place, rays, best[place], least[place]))
-                r = 0.5 * size
-                r0, r1, r2 = int(r / edges[0]), int(r / edges[1]), int(r / edges[2])
+                square = 0.25 * size * size
+                r0, r1 = int(0.5 * size / edges[0]), int(0.5 * size / edges[1])
                 for a in range(max(i - r0, low), min(i + r0 + 1, high)):
-                    x = 0.0 if a == i else ((a - i) * edges[0]) ** 2
+                    rest = square - ((a - i) * edges[0]) ** 2
                     for b in range(max(j - r1, bottom), min(j + r1 + 1, top)):
-                        y = x + ((b - j) * edges[1]) ** 2
-                        if y > r * r:
+                        width = rest - ((b - j) * edges[1]) ** 2
+                        if width < 0.0:
                             continue
+                        r2 = int(np.sqrt(width) / edges[2])
+                        sizes, labels_there = thickness[a, b], partition[a, b]
                         for c in range(max(k - r2, 0), min(k + r2 + 1, shape[2])):
-                            is_in = (
-                                thickness[a, b, c] < size and y + ((c - k) * edges[2]) ** 2 <= r * r
-                            )
-                            if is_in and partition[a, b, c] == partition[i, j, k]:
-                                thickness[a, b, c] = size
+                            if sizes[c] < size and labels_there[c] == own:
+                                sizes[c] = size
     for i in range(low, high):
         for j in range(bottom, top):
             for k in range(shape[2]):
