@@ -235,7 +235,7 @@ class Image:
         return notebook.card_html("Image", rows, notebook.slice_html(self.data, self.affine))
 
 
-def transform_vectors(vectors: Floats, matrix: Floats) -> Floats:
+def transform_vectors(vectors: Floats, matrix: NDArray[np.floating]) -> Floats:
     """Multiply each of the vectors (..., n) by `matrix` (n, n), term by term in the order of the
     columns.
 

@@ -151,7 +151,8 @@ def convert_file(
 
     model = with_chosen_sets(convert_model(loaded, what, solver, about, box), output, solver)
     save_for_solver(output, model, solver)
-    files = {"mesh": mesh.name, "output": output.name, "units": solver.units, "space": solver.space}
+    files: Json = {"mesh": mesh.name, "output": output.name}
+    files |= {"units": solver.units, "space": solver.space}
     files |= {} if results is None else {"results": results.name}
     files |= stated_files(part)
     files |= {"transforms": [each.name for each in move.transform]} if move.transform else {}

@@ -781,7 +781,7 @@ def check_followed(cell_labels: Ints | None, content: Content, mesh: Mesh) -> In
     """
     assert content.memberships is not None
     known = content.memberships.labels
-    if np.shape(cell_labels) != (len(mesh.cells),):
+    if cell_labels is None or cell_labels.shape != (len(mesh.cells),):
         raise InputError(
             "keep_connectivity: the image has labels, and the cells have none to keep; leave out "
             "`labels`, or give the mesh labels (`tetopt convert`)"

@@ -254,7 +254,8 @@ def _eigen(components: Floats) -> tuple[Floats, Floats]:
     Jacobi's rotations of all at a time take a fourth of LAPACK's time, and keep the digits of small
     eigenvalues.
     """
-    a = {(i, j): components[k].copy() for k, (i, j) in enumerate(zip(ROWS, COLUMNS, strict=True))}
+    pairs = zip(ROWS.tolist(), COLUMNS.tolist(), strict=True)
+    a = {(i, j): components[k].copy() for k, (i, j) in enumerate(pairs)}
     v = np.zeros((3, 3, components.shape[1]))
     v[range(3), range(3)] = 1.0
     for _ in range(EIGEN_SWEEPS):

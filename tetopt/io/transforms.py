@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -44,7 +45,7 @@ Step = Callable[[Floats], Floats]
 class Linear(NamedTuple):
     """An affine map of points."""
 
-    matrix: Floats  # (4, 4), RAS+ mm
+    matrix: NDArray[np.floating]  # (4, 4), RAS+ mm
 
     def __call__(self, points: Floats) -> Floats:
         """Map points (K, 3), mm."""
@@ -115,7 +116,8 @@ class Dense(NamedTuple):
         return solve
 
 
-class Chain(NamedTuple):
+@dataclass(frozen=True)
+class Chain:
     """Maps, one after the other, with their files."""
 
     steps: Sequence[Any]
@@ -134,7 +136,7 @@ def load_transform(
     inverse: bool = False,
     fixed: Image | None = None,
     moving: Image | None = None,
-) -> Step:
+) -> Chain:
     """Read the transform of a registration: one file, or several as antsApplyTransforms has them.
 
     Parameters

@@ -303,8 +303,9 @@ def _mode(job: JobOptions) -> Mode:
                 "`lattice` octree: has no single spacing; use `nodes` instead of `spacing`"
             )
     if job.start is not None:
-        regions = ("lattice", "mask", "background", "keep_labels", "drop_labels")
-        regions = regions[:1] if job.keep_connectivity else regions
+        regions = ["lattice"]
+        if not job.keep_connectivity:
+            regions += ["mask", "background", "keep_labels", "drop_labels"]
         others = [*counts, *(name for name in regions if getattr(job, name) is not None)]
         if others := [*others, *["uniform"] * job.uniform]:
             raise InputError(

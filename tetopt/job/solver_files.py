@@ -269,8 +269,8 @@ def convert_model(
     mask = None if what is None or not options.fields else what.own_mask
     if image is not None:
         check_mesh_place("mesh and image", loaded.mesh, image)
-        fields = loaded.cell_data | cell_fields(loaded.mesh, image)
-        loaded = loaded._replace(cell_data=fields)
+        cell_data = loaded.cell_data | cell_fields(loaded.mesh, image)
+        loaded = loaded._replace(cell_data=cell_data)
     table = label_table(options.label_names, loaded)
     about = about | ({TABLE_TEXT: table} if table.names or table.colours else {})
     with warnings_heard():

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from itertools import permutations, product
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -295,7 +295,7 @@ def _see_voxels(image: Images, mesh: Mesh) -> _Seen:
             is_seen[np.ravel_multi_index(tuple(nearest_voxels(grid, points).T), grid.shape)] = True
     used = np.flatnonzero(is_seen)
 
-    def values(each: Image) -> Floats:
+    def values(each: Image) -> Any:
         data = each.data.ravel()
         if each.shape != grid.shape or not np.array_equal(each.affine, grid.affine):
             data = np.empty(len(owner))
@@ -357,9 +357,9 @@ def _parts_places(n: int, k: int) -> Floats:
             steps[row:, axis] = 1
         corners = lows[:, None] + steps
         parts.append(corners[(np.diff(corners, axis=2) <= 0).all(axis=(1, 2))])
-    corners = np.concatenate(parts) / k
-    ends = np.pad(corners, ((0, 0), (0, 0), (1, 1)), constant_values=((0, 0), (0, 0), (1, 0)))
-    barycentric = -np.diff(ends, axis=2)
+    places = np.concatenate(parts) / k
+    padded = np.pad(places, ((0, 0), (0, 0), (1, 1)), constant_values=((0, 0), (0, 0), (1, 0)))
+    barycentric = -np.diff(padded, axis=2)
     return np.einsum("qa,pab->pqb", gauss_rule(n, 2)[0], barycentric).reshape(-1, n + 1)
 
 

@@ -338,7 +338,7 @@ def _model(
         laws = _laws(choices)
         cells = _with_fields(cells, _images_of(choices), laws, mask)
         nodal, at_gauss = _varying_moduli(cells, laws.young, choices)
-        values = {
+        values: dict[str, Any] = {
             name: None if law is None else _values(law, name, cells, choices.average)
             for name, law in laws._asdict().items()
         }
@@ -485,7 +485,8 @@ def _with_own_fibres(choices: Choices, fields: Arrays) -> Choices:
     if isinstance(choices.fibre, str) and choices.fibre == "fibre":
         return choices._replace(fibre=fields["fibre"])
     if choices.fibre is None and choices.young is None:
-        return choices._replace(**{name: fields[name] for name in ALONG_FIELDS if name in fields})
+        own: dict[str, Any] = {name: fields[name] for name in ALONG_FIELDS if name in fields}
+        return choices._replace(**own)
     warn("dropped the fibres of the mesh's file, as `young` or `fibre` replaces them", Note)
     return choices
 
@@ -577,12 +578,13 @@ def _with_cell_fields(
     check_field_names(fields)
     for name, field in fields.items():
         check_field_name(name)
-        is_field = isinstance(field, Field)
-        grid = field.grid if is_field else check_image(f"field {name}", field)
+        if isinstance(field, Field):
+            grid, kinds[name] = field.grid, field.kind
+        else:
+            grid, kinds[name] = check_image(f"field {name}", field), "scalar"
         with prefix_errors(f"field {name}"):
             check_place(mesh, grid, f"field {name}")
             own = cell_field(field, mesh, mask)
-        kinds[name] = field.kind if is_field else "scalar"
         cell_data = {**cell_data, name: own.values}
         if own.coherence is not None:
             cell_data[f"{name}_coherence"] = own.coherence
@@ -721,6 +723,7 @@ def _warn_of_range(
     if not isinstance(mapping, Formula) or mapping.outside is None:
         return
     if images is None:
+        assert cells.mean is not None, "the caller requires one"
         outside = mapping.outside(cells.mean)
     else:
         outside = cell_values(images, cells.mesh, mapping.outside, is_linear=is_linear)

@@ -227,7 +227,7 @@ def materials(
     kinds, of_cell = np.unique(np.column_stack(columns), axis=0, return_inverse=True)
     columns = [column.copy() for column in kinds.T]
     of_cell = of_cell.ravel().astype(np.int64)
-    along = None if along is None else Along(*columns[-2:], along.fibre)
+    along = None if along is None else Along(columns[-2], columns[-1], along.fibre)
     mass = None if density is None else columns[2]
     return Materials(columns[0], columns[1], of_cell, None, mass, along)
 
@@ -402,7 +402,7 @@ def bin_moduli(
         for new, old in zip(moduli, along[:2], strict=True):
             off = np.maximum(off, np.abs(new - old) / old)
         fibre, angle = group_directions(along.fibre, count)
-        along = Along(*moduli, fibre)
+        along = Along(moduli[0], moduli[1], fibre)
         of_fibres = BinningError(float((angle * volumes).sum() / volumes.sum()), float(angle.max()))
     error = BinningError(float((off * volumes).sum() / volumes.sum()), float(off.max()))
     binned = materials(fewer, ratios, len(young), density, along)
