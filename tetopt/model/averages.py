@@ -14,7 +14,7 @@ Power means lie between them; power 0 is the geometric mean (Lichtenecker, Physi
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from itertools import permutations, product
+from itertools import product
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -40,9 +40,9 @@ DEFAULT_AVERAGE = "gauss"  # of moduli (docs/understand/moduli.md); the paper's 
 # in absolute value; beyond it a power mean is almost the largest or the smallest value
 LARGEST_POWER = 10.0
 VOXELS_PER_CHUNK = 2**20  # whose positions in their cells are computed at once, 100 MB
-# along an edge of a cell, for the average "linear": of cells 4 voxels wide or wider, whose values
-# have 2,048 places in a tetrahedron
-MOST_PARTS = 8
+# along an edge of a cell, for the average "linear": of cells 6 voxels wide or wider, whose values
+# have 2,600 places in a tetrahedron
+MOST_PLACES = 24
 EMPTY_FRACTION = 0.02  # of the cells: a note on more without a voxel
 
 Images = Image | Mapping[str, Image]  # the image, or those that a formula names, without gaps
@@ -316,9 +316,8 @@ def _linear_means(image: Images, mesh: Mesh, mapped: Callable[[Floats | Named], 
     """Return the mean over each straight cell, (M,), of a mapping of images that are linear between
     voxel centres.
 
-    A cell that is w voxels wide, along the axis of a grid where it is widest, is divided into k^n
-    parts of equal volume, about half a voxel wide or less: k is the next whole number above 2 w, at
-    most `MOST_PARTS`. Each part has the rule of n + 1 points, exact for quadratic functions.
+    A cell that is w voxels wide, along the axis of a grid where it is widest, has k places along
+    each edge: twice the next whole number above 2 w, at most `MOST_PLACES`.
     """
     images = {"": without_gaps(image, mesh)} if isinstance(image, Image) else image
     width = np.max(
@@ -328,11 +327,11 @@ def _linear_means(image: Images, mesh: Mesh, mapped: Callable[[Floats | Named], 
         ],
         axis=0,
     )
-    n_parts = np.minimum(np.floor(2.0 * width).astype(np.int64) + 1, MOST_PARTS)
+    n_places = np.minimum(2 * np.floor(2.0 * width).astype(np.int64) + 2, MOST_PLACES)
     means = np.empty(len(mesh.cells))
-    for k in np.unique(n_parts).tolist():
-        places = _parts_places(mesh.ndim, k)
-        cells = np.flatnonzero(n_parts == k)
+    for k in np.unique(n_places).tolist():
+        places = _equal_places(mesh.ndim, k)
+        cells = np.flatnonzero(n_places == k)
         n_at_once = max(1, VOXELS_PER_CHUNK // len(places))
         for start in range(0, len(cells), n_at_once):
             part = cells[start : start + n_at_once]
@@ -345,22 +344,14 @@ def _linear_means(image: Images, mesh: Mesh, mapped: Callable[[Floats | Named], 
     return means
 
 
-def _parts_places(n: int, k: int) -> Floats:
-    """Return places of equal weight, barycentric, (Q, n+1): the Gauss points of the k^n parts of a
-    simplex in Kuhn's subdivision, which has those of k^n cubes that lie where x_1 >= ... >= x_n.
+def _equal_places(n: int, k: int) -> Floats:
+    """Return places of equal weight in a simplex, barycentric, (Q, n+1), k along each edge: a
+    lattice around the centroid, of the size with which it is exact for quadratic functions.
     """
-    lows = np.array(list(product(range(k), repeat=n)))
-    parts = []
-    for order in permutations(range(n)):
-        steps = np.zeros((n + 1, n), dtype=np.int64)
-        for row, axis in enumerate(order, start=1):
-            steps[row:, axis] = 1
-        corners = lows[:, None] + steps
-        parts.append(corners[(np.diff(corners, axis=2) <= 0).all(axis=(1, 2))])
-    places = np.concatenate(parts) / k
-    padded = np.pad(places, ((0, 0), (0, 0), (1, 1)), constant_values=((0, 0), (0, 0), (1, 0)))
-    barycentric = -np.diff(padded, axis=2)
-    return np.einsum("qa,pab->pqb", gauss_rule(n, 2)[0], barycentric).reshape(-1, n + 1)
+    lattice = [each for each in product(range(k), repeat=n + 1) if sum(each) == k - 1]
+    around = np.array(lattice) - (k - 1) / (n + 1)
+    size = np.sqrt(n / ((n + 1) ** 2 * (n + 2)) / (around**2).mean())
+    return 1.0 / (n + 1) + size * around
 
 
 def _places(image: Image, mesh: Mesh, owner: Ints) -> Iterator[tuple[Ints, Floats]]:

@@ -116,7 +116,9 @@ def young_from(mapping: ModulusMapping, intensities: ArrayLike | Named) -> Float
     young = mapped_values(mapping, intensities)
     is_bad = ~(np.isfinite(young) & (young >= 0.0))
     if is_bad.any():
-        first = ", ".join(f"{young[is_bad][k]:g} at {at}" for k, at in _places(intensities, is_bad))
+        first = ", ".join(
+            f"{young[is_bad][k]:g} at {at}" for k, at in _places(intensities, is_bad).items()
+        )
         undefined = (
             " (undefined, as the root or fractional power of a negative number: write max(h, 0))"
             if np.isnan(young).any()
@@ -143,23 +145,25 @@ def finite_values(mapping: ModulusMapping, intensities: ArrayLike | Named) -> Fl
     """
     values = mapped_values(mapping, intensities)
     if not (is_good := np.isfinite(values)).all():
-        ((_, at), *_) = _places(intensities, ~is_good)
+        at = [*_places(intensities, ~is_good).values()]
         raise InputError(
-            f"mapping: no value at {at}; give a mapping (`nu`, `density`) defined in the whole mesh"
+            f"mapping: no value at {at[0]}; give a mapping (`nu`, `density`) defined in the whole mesh"
         )
     return values
 
 
-def _places(intensities: ArrayLike | Named, is_bad: Bools) -> list[tuple[int, str]]:
-    """Return the number, among those that are bad, of up to three different places, and what they
-    are in words.
-    """
-    if not isinstance(intensities, Mapping):
-        values, first = np.unique(np.asarray(intensities)[is_bad], return_index=True)
-        words = [f"intensity {value:g}" for value in values[:3]]
-        return list(zip(first[:3].tolist(), words, strict=True))
-    bad = {name: values[is_bad] for name, values in intensities.items()}
-    return [(0, ", ".join(f"{name} = {values[0]:g}" for name, values in sorted(bad.items())))]
+def _places(intensities: ArrayLike | Named, is_bad: Bools) -> dict[int, str]:
+    """Return up to three different places, in words, by their numbers among those that are bad."""
+    is_named = isinstance(intensities, Mapping)
+    named = intensities if isinstance(intensities, Mapping) else {"intensity": intensities}
+    bad = np.column_stack([np.asarray(values)[is_bad] for values in named.values()])
+    _, first = np.unique(bad, axis=0, return_index=True)
+    return {
+        k: ", ".join(
+            f"{name} {'= ' * is_named}{x:g}" for name, x in zip(named, bad[k], strict=True)
+        )
+        for k in first[:3].tolist()
+    }
 
 
 def parse_table(text: str) -> list[tuple[float, float]]:
