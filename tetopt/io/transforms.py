@@ -25,14 +25,15 @@ from scipy.spatial.transform import Rotation
 from tetopt.errors import InputError, prefix_errors
 from tetopt.image import Image, transform_vectors
 from tetopt.io.apart import read_apart
+from tetopt.model.fields import HALF_TURN
 from tetopt.system.arrays import Floats
 from tetopt.system.extras import install_hint
 from tetopt.system.incoming import regular_file
 
-LPS_AXES = np.diag([-1.0, -1.0, 1.0, 1.0])  # from RAS+, or back
+LPS_AXES = np.diag([*HALF_TURN, 1.0])  # from RAS+, or back
 MATLAB_SUFFIX, HDF5_SUFFIXES, NIFTI_SUFFIXES = ".mat", (".h5", ".hdf5"), (".nii", ".nii.gz")
 TEXT_HEAD = "#Insight Transform File"
-VECTOR_INTENTS = {1007: "lps", 1006: "ras"}  # of ITK's files: vectors, displacements
+VECTOR_AXES = {1007: HALF_TURN, 1006: np.ones(3)}  # of ITK's vectors, displacements
 FIELD_EDGE_VOXELS = 0.5 + 1e-6  # beyond the outer voxel centres, to the field's end
 LEAST_DETERMINANT = 1e-9  # of a linear transform, over the product of its columns' lengths
 INVERSE_MM = 1e-9  # of a coordinate: an inverse is exact to this
@@ -64,9 +65,9 @@ class Dense(NamedTuple):
 
     def __call__(self, points: Floats) -> Floats:
         """Map points (K, 3), mm; InputError for points that the field does not cover."""
-        index = Linear(np.linalg.inv(self.affine))(points)
+        index = Linear(self.affine).inverse()(points)
         most = np.array(self.shifts.shape[:3]) - 1.0 + FIELD_EDGE_VOXELS
-        moved = points + self._shifts_at(index)
+        moved = self._moved(points)
         is_out = ((index < -FIELD_EDGE_VOXELS) | (index > most)).any(axis=1)
         is_out |= ~np.isfinite(moved).all(axis=1)
         if is_out.any():
@@ -77,40 +78,37 @@ class Dense(NamedTuple):
             )
         return moved
 
-    def _shifts_at(self, index: Floats) -> Floats:
-        parts = [
-            map_coordinates(part, index.T, order=1, mode="nearest")
-            for part in np.moveaxis(self.shifts, -1, 0)
-        ]
-        return np.column_stack(parts)
+    def _moved(self, points: Floats) -> Floats:
+        """Map points; those beyond the field have the shift of its nearest place."""
+        index = Linear(self.affine).inverse()(points).T
+        parts = np.moveaxis(self.shifts, -1, 0)
+        shifts = [map_coordinates(part, index, order=1, mode="nearest") for part in parts]
+        return points + np.column_stack(shifts)
 
     def inverse(self) -> Step:
         """Return the inverse map, by Newton's method; it raises InputError where it finds none."""
         if not np.isfinite(self.shifts).all():
             raise InputError("its field has NaN, so no inverse; pass the file of the inverse")
-        to_index = Linear(np.linalg.inv(self.affine))
         steps = 0.5 * np.diag(np.linalg.norm(self.affine[:3, :3], axis=0))
 
-        def moved(points: Floats) -> Floats:
-            return points + self._shifts_at(to_index(points))
-
         def solve(points: Floats) -> Floats:
-            places = points.copy()
+            places = points
             for _ in range(INVERSE_STEPS):
-                rest = moved(places) - points
-                if not (np.abs(rest) > INVERSE_MM).any():
+                rest = self._moved(places) - points
+                is_left = (np.abs(rest) > INVERSE_MM).any(axis=1)
+                if not is_left.any():
                     self(places)  # that the field covers
                     return places
                 slopes = [
-                    (moved(places + step) - moved(places - step)) / (2.0 * step.sum())
+                    (self._moved(places + step) - self._moved(places - step)) / (2.0 * step.sum())
                     for step in steps
                 ]
                 ways = np.linalg.pinv(np.stack(slopes, axis=-1)) @ rest[..., None]
                 places = places - ways[..., 0]
-            n_left = int((np.abs(rest) > INVERSE_MM).any(axis=1).sum())
             raise InputError(
-                f"its field has no inverse at {n_left} of {len(points)} points: it folds, or ends "
-                "there; pass the file of the inverse (ANTs: 1InverseWarp.nii.gz) instead"
+                f"its field has no inverse at {int(is_left.sum())} of {len(points)} points: it "
+                "folds, or ends there; pass the file of the inverse (ANTs: 1InverseWarp.nii.gz) "
+                "instead"
             )
 
         return solve
@@ -191,9 +189,9 @@ def _steps_of(path: Path, fixed: Image | None, moving: Image | None) -> list[Any
         return [_dense_of(path)]
     if name.endswith(HDF5_SUFFIXES) and importlib.util.find_spec("h5py") is None:
         raise InputError(f"transforms in HDF5 need h5py; {install_hint('h5py')}")
-    numbers, items = read_apart(_read_numbers, path, library="h5py or SciPy")
-    if numbers is not None:
-        return [_check_linear(_matrix_of(np.asarray(numbers), fixed, moving))]
+    items = read_apart(_read_items, path, library="h5py or SciPy")
+    if items and not items[0][0]:
+        return [_matrix_of(items[0][1], fixed, moving)]
     if is_composite := bool(items) and items[0][0].startswith("CompositeTransform"):
         items = items[1:]
     if not items or (len(items) > 1 and not is_composite):
@@ -202,35 +200,36 @@ def _steps_of(path: Path, fixed: Image | None, moving: Image | None) -> list[Any
     return [_itk_step(*item) for item in reversed(items)]
 
 
-def _read_numbers(path: str) -> tuple[NDArray | None, list[tuple[str, NDArray, NDArray]]]:
-    """Return the numbers of a plain matrix, or the kind, parameters and fixed parameters of each of
-    ITK's transforms; runs in a child.
+def _read_items(path: str) -> list[tuple[str, NDArray, NDArray]]:
+    """Return the kind, parameters and fixed parameters of each of ITK's transforms, or the numbers
+    of a plain matrix, of no kind; runs in a child.
     """
     if path.lower().endswith(HDF5_SUFFIXES):
-        return None, _read_hdf5(path)
+        return _read_hdf5(path)
     raw = Path(path).read_bytes()
     if path.lower().endswith(MATLAB_SUFFIX) and b"\0" in raw:
         table = {name: each for name, each in loadmat(path).items() if name[0] != "_"}
         centre = np.asarray(table.pop("fixed", []), dtype=np.float64).ravel()
-        return None, [(kind, np.ravel(each), centre) for kind, each in table.items()]
+        return [(kind, np.ravel(each), centre) for kind, each in table.items()]
     text = raw.decode()
     if not text.startswith(TEXT_HEAD):
         lines = [line for line in text.splitlines() if line.strip() and line.strip()[0] != "#"]
-        return np.array(" ".join(lines).split(), dtype=np.float64), []
+        return [("", np.array(" ".join(lines).split(), dtype=np.float64), np.empty(0))]
     rows = [line.partition(":") for line in text.splitlines() if line[:1] != "#" and line.strip()]
     kinds = [value.strip() for key, _, value in rows if key == "Transform"]
     values = {
         name: [np.array(value.split(), dtype=np.float64) for key, _, value in rows if key == name]
         for name in ("Parameters", "FixedParameters")
     }
-    return None, list(zip(kinds, *values.values(), strict=True))
+    return list(zip(kinds, *values.values(), strict=True))
 
 
 def _read_hdf5(path: str) -> list[tuple[str, NDArray, NDArray]]:
     import h5py
 
     with h5py.File(path) as file:
-        groups = [group for _, group in sorted(file["TransformGroup"].items(), key=_number_of)]
+        of = file["TransformGroup"]
+        groups = [of[number] for number in sorted(of, key=int)]
         return [
             (
                 group["TransformType"][0].decode(),
@@ -242,10 +241,6 @@ def _read_hdf5(path: str) -> list[tuple[str, NDArray, NDArray]]:
             )
             for group in groups
         ]
-
-
-def _number_of(item: tuple[str, Any]) -> int:
-    return int(item[0])
 
 
 def _itk_step(kind: str, values: NDArray, fixed: NDArray) -> Linear | Dense:
@@ -260,7 +255,7 @@ def _itk_step(kind: str, values: NDArray, fixed: NDArray) -> Linear | Dense:
         affine[:3, :3] = fixed[9:18].reshape(3, 3) * fixed[6:9]
         affine[:3, 3] = origin
         shifts = values.reshape(*shape[::-1], 3).transpose(2, 1, 0, 3)
-        return Dense(shifts * np.diag(LPS_AXES)[:3], LPS_AXES @ affine)
+        return Dense(shifts * HALF_TURN, LPS_AXES @ affine)
     if name in ("AffineTransform", "MatrixOffsetTransformBase"):
         turn, shift = values[:9].reshape(3, 3), values[9:12]
     elif name == "Euler3DTransform":
@@ -285,12 +280,10 @@ def _itk_step(kind: str, values: NDArray, fixed: NDArray) -> Linear | Dense:
     return _check_linear(LPS_AXES @ matrix @ LPS_AXES)
 
 
-def _matrix_of(numbers: NDArray, fixed: Image | None, moving: Image | None) -> Floats:
-    """Return AFNI's 12 numbers or FSL's 16 as a matrix from the fixed to the moving image."""
+def _matrix_of(numbers: NDArray, fixed: Image | None, moving: Image | None) -> Linear:
+    """Return AFNI's 12 numbers or FSL's 16 as a map from the fixed to the moving image."""
     if len(numbers) == 12:
-        return np.asarray(
-            LPS_AXES @ np.vstack([numbers.reshape(3, 4), [0.0, 0.0, 0.0, 1.0]]) @ LPS_AXES
-        )
+        return _check_linear(LPS_AXES @ np.vstack([numbers.reshape(3, 4), np.eye(4)[3]]) @ LPS_AXES)
     if len(numbers) != 16:
         raise InputError(
             f"expected a transform of ITK, ANTs, FSL (16 numbers), AFNI (12) or SPM, got "
@@ -298,24 +291,18 @@ def _matrix_of(numbers: NDArray, fixed: Image | None, moving: Image | None) -> F
         )
     if fixed is None or moving is None or {fixed.ndim, moving.ndim} != {3}:
         raise InputError("FSL's matrix is of two volumes' voxels: pass `fixed` and `image`")
-    matrix = numbers.reshape(4, 4)
-    _check_linear(matrix)
-    return np.asarray(
-        moving.affine
-        @ np.linalg.inv(_fsl_axes(moving))
-        @ np.linalg.inv(matrix)  # of flirt: from the moving to the fixed image
-        @ _fsl_axes(fixed)
-        @ np.linalg.inv(fixed.affine)
-    )
+    # of flirt: from the moving to the fixed image
+    to_fixed = _world_of_fsl(fixed) @ numbers.reshape(4, 4) @ np.linalg.inv(_world_of_fsl(moving))
+    return _check_linear(to_fixed).inverse()
 
 
-def _fsl_axes(image: Image) -> Floats:
-    """Return the map from voxel index to FSL's mm: x is flipped if the determinant is positive."""
-    axes = np.diag([*np.linalg.norm(image.affine[:3, :3], axis=0), 1.0])
+def _world_of_fsl(image: Image) -> Floats:
+    """Return the map from FSL's mm, whose x is flipped if the determinant is positive, to RAS+."""
+    axes = np.diag([*image.spacing, 1.0])
     if np.linalg.det(image.affine) > 0.0:
         axes[0, 3] = axes[0, 0] * (image.shape[0] - 1)
         axes[0, 0] *= -1.0
-    return axes
+    return image.affine @ np.linalg.inv(axes)
 
 
 def _check_linear(matrix: Floats) -> Linear:
@@ -338,14 +325,12 @@ def _dense_of(path: Path) -> Dense:
     if is_deformation:
         index = np.moveaxis(np.indices(values.shape[:3], dtype=np.float64), 0, -1)
         return Dense(values - Linear(affine)(index), affine)
-    if intent not in VECTOR_INTENTS:
+    if intent not in VECTOR_AXES:
         raise InputError(
             f"its vectors' axes are not stated: expected the intent 1007 of ITK's fields, or SPM's "
             f"y_*.nii, got intent {intent}"
         )
-    return Dense(
-        values * np.diag(LPS_AXES)[:3] if VECTOR_INTENTS[intent] == "lps" else values, affine
-    )
+    return Dense(values * VECTOR_AXES[intent], affine)
 
 
 def _read_nifti(path: str) -> tuple[NDArray, NDArray, int, bool]:
