@@ -16,19 +16,15 @@ from tetopt import InputError
 from tetopt.cli.console import print_line
 from tetopt.cli.options import FilesArgument, ForceOption, ShownOptions, mesh_and_image
 from tetopt.commands.beside import check_part, voxels_of
-from tetopt.errors import prefix_errors
-from tetopt.fields.onto_cells import cell_field, field_words
-from tetopt.image import Image
-from tetopt.job.events import note, warnings_heard
+from tetopt.job.events import warnings_heard
 from tetopt.job.field_files import read_fields
 from tetopt.job.mesh_file import label_table, read_mesh
 from tetopt.job.option_values import number_of
 from tetopt.job.options import BoxPart, MaskedPart, MaskPart, Option
-from tetopt.mesh import Mesh
+from tetopt.model.build import with_cell_fields
 from tetopt.model.fields import cell_fields
 from tetopt.model.file import MeshFile, sets_beside
 from tetopt.model.sets import facet_triples
-from tetopt.system.arrays import Arrays
 from tetopt.system.files import check_output
 from tetopt.system.incoming import json_of
 
@@ -61,7 +57,9 @@ def view_command(
     image = None if what is None else what.given
     if what is not None and "mean" not in fields:
         fields = cell_fields(mesh, what) | fields
-    fields |= _values_of(how.fields, mesh, None if what is None else what.own_mask)
+    with warnings_heard():
+        own_mask = None if what is None else what.own_mask
+        fields, _ = with_cell_fields(mesh, read_fields(how.fields), own_mask, fields, {})
     table = label_table(how.label_names, loaded)
     former = label_table(None, loaded).names
     sets = sets_beside(mesh, loaded.box, fields, loaded.sets, table.names, former)[0].facets
@@ -78,19 +76,6 @@ def view_command(
     words = "opened in the browser" if html is None and _is_opened(page) else "open it in a browser"
     print_line(f"{page}: {words}; {page.stat().st_size / 1e6:.1f} MB, self-contained")
     return 0
-
-
-def _values_of(texts: list[str] | None, mesh: Mesh, mask: Image | None) -> Arrays:
-    """Return the values of fields in cells."""
-    values = {}
-    with warnings_heard():
-        for name, field in read_fields(texts).items():
-            with prefix_errors(f"field {name}"):
-                own = cell_field(field, mesh, mask)
-            values[name] = own.values
-            if words := field_words(own):
-                note(f"field {name}: {words}")
-    return values
 
 
 def _is_opened(page: Path) -> bool:

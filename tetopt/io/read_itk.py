@@ -87,15 +87,15 @@ def _measurement_turn(fields: dict[str, str]) -> Floats | None:
     letters = space if len(space) == 3 else "".join(word[0] for word in space.split("-"))
     numbers = re.findall(r"[^\s(),]+", words)
     try:
+        if re.fullmatch("[rl][ap][si]", letters) is None:
+            raise ValueError(f"no axes of a body: {letters}")
         columns = np.array(numbers, dtype=np.float64).reshape(3, 3)
-        signs = [{"r": 1.0, "l": -1.0}[letters[0]], {"a": 1.0, "p": -1.0}[letters[1]]]
-        signs.append({"s": 1.0, "i": -1.0}[letters[2]])
-    except (ValueError, LookupError) as error:
+    except ValueError as error:
         raise InputError(
             "measurement frame: expected three vectors in a space such as "
             f'left-posterior-superior, got {words[:80]} in "{space[:40]}"'
         ) from error
-    return columns.T * np.array(signs)[:, None]
+    return columns.T * [[1.0 if letter in "ras" else -1.0] for letter in letters]
 
 
 def _checked_header(path: Path) -> tuple[VoxelHeader, int]:

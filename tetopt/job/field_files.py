@@ -13,7 +13,6 @@ from tetopt.image import Image
 from tetopt.io.components import load_field
 from tetopt.job.aligned import read_companion
 from tetopt.model.fields import check_field_name
-from tetopt.model.formula import check_field_names
 
 
 class FieldText(NamedTuple):
@@ -24,38 +23,31 @@ class FieldText(NamedTuple):
     kind: str  # KIND[@FRAME]
 
 
-def parse_field(text: str) -> FieldText:
-    """Parse the text of a field.
+def parse_fields(texts: Iterable[str] | None) -> list[FieldText]:
+    """Parse the texts of fields.
 
     Raises
     ------
     InputError
-        Without a name or a file; a name that formulas or other data of cells have; an unknown kind
-        or frame.
+        One without a name or a file; a name that formulas or other data of cells have, or two; an
+        unknown kind or frame.
     """
-    match = re.fullmatch(r"([^=]+)=(.+?)(?::([a-z]+(?:@[a-z-]*)?))?", text)
-    if match is None:
-        raise InputError(
-            "`fields`: expected NAME=FILE, NAME=FILE:KIND or NAME=FILE:KIND@FRAME, such as "
-            f'V1=dti_V1.nii.gz:direction@fsl, got "{text[:80]}"'
-        )
-    name, file, kind = match[1].strip(), match[2], match[3] or "scalar"
-    with prefix_errors("`fields`"):
-        check_field_names([name])
-        check_field_name(name)
-        parse_kind(kind)
-    return FieldText(name, Path(file), kind)
-
-
-def parse_fields(texts: Iterable[str] | None) -> list[FieldText]:
-    """Parse the texts of fields; raise InputError for the reasons of `parse_field`, and for a name
-    that two have.
-    """
-    parsed = [parse_field(text) for text in texts or ()]
-    names = [each.name for each in parsed]
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise InputError(f'`fields`: two are called "{twice[0]}"')
-    return parsed
+    parsed: dict[str, FieldText] = {}
+    for text in texts or ():
+        match = re.fullmatch(r"([^=]+)=(.+?)(?::([a-z]+(?:@[a-z-]*)?))?", text)
+        if match is None:
+            raise InputError(
+                "`fields`: expected NAME=FILE, NAME=FILE:KIND or NAME=FILE:KIND@FRAME, such as "
+                f'V1=dti_V1.nii.gz:direction@fsl, got "{text[:80]}"'
+            )
+        name, kind = match[1].strip(), match[3] or "scalar"
+        with prefix_errors("`fields`"):
+            check_field_name(name)
+            parse_kind(kind)
+            if name in parsed:
+                raise InputError(f'two are called "{name}"')
+        parsed[name] = FieldText(name, Path(match[2]), kind)
+    return list(parsed.values())
 
 
 def scalar_names(texts: Iterable[str] | None) -> list[str]:

@@ -63,10 +63,10 @@ def move_file(loaded: MeshFile, move: MoveOptions, image: Path | None) -> MeshFi
     mesh = loaded.mesh
     if mesh.ndim != 3:
         raise InputError("`transform`: expected a mesh of tetrahedra, got triangles")
-    has_both = move.fixed is not None and image is not None
-    ends = (move.fixed, image) if has_both else ()
-    images = (read_image(path, WHOLE_BOX) for path in ends if path is not None)
-    fixed, moving = images if has_both else (None, None)
+    fixed, moving = (
+        read_image(path, WHOLE_BOX) if path and move.fixed and image else None
+        for path in (move.fixed, image)
+    )
     transform = load_transform(*move.transform, inverse=move.inverse, fixed=fixed, moving=moving)
     there = transform(mesh.points)
     with prefix_errors(list_names([str(path) for path in move.transform])):
@@ -98,18 +98,16 @@ def _without_old(loaded: MeshFile) -> MeshFile:
     """Return a moved mesh's file without what is of its old place or image; note it."""
     rest = without_results(loaded)
     cells, nodes = (
-        {name: rows for name, rows in data.items() if rows.ndim == 1 or name == GAUSS_MODULI}
+        {
+            name: rows
+            for name, rows in data.items()
+            if (rows.ndim == 1 or name == GAUSS_MODULI) and not re.fullmatch(IMAGE_FIELD, name)
+        }
         for data in (rest.cell_data, rest.point_data)
     )
-    cells = {name: rows for name, rows in cells.items() if not re.fullmatch(IMAGE_FIELD, name)}
-    lost = [
-        name
-        for data in (loaded.cell_data, loaded.point_data)
-        for name in data
-        if name not in cells and name not in nodes
-    ]
-    if lost:
-        note(f"left out, as of the old image or its axes: {list_names(list(dict.fromkeys(lost)))}")
+    names = [*loaded.cell_data, *loaded.point_data]
+    if lost := [name for name in dict.fromkeys(names) if name not in cells and name not in nodes]:
+        note(f"left out, as of the old image or its axes: {list_names(lost)}")
     shapes: Arrays = cell_fields(loaded.mesh)
     cells |= {name: rows for name, rows in shapes.items() if name in cells}
     had_mask = {MASK_TEXT} & set(loaded.field_data) or loaded.text(PLACE_TEXT) == MOVED_FROM_MASK

@@ -49,7 +49,7 @@ from tetopt.model.file import (
     without_stale_results,
     words_of_other_box,
 )
-from tetopt.model.formula import INTENSITY, Formula, check_field_names
+from tetopt.model.formula import INTENSITY, Formula
 from tetopt.model.label_names import (
     LABEL_FIELD,
     TABLE_TEXT,
@@ -330,7 +330,7 @@ def _model(
     parse_average(choices.average)
     all_sets = with_requested(mesh, known_sets, choices.sets, cells.mean)
     mask = choices.mask if about.get(MASK_TEXT) is None else _mask_of(about)
-    cell_data, about = _with_cell_fields(mesh, choices.fields, mask, cell_data, about)
+    cell_data, about = with_cell_fields(mesh, choices.fields, mask, cell_data, about)
     table = None
     nodal = None
     at_gauss = None
@@ -564,7 +564,7 @@ def _mask_of(about: Json) -> Image | None:
     return mask_in(json.loads(text) if isinstance(text, str) else text)
 
 
-def _with_cell_fields(
+def with_cell_fields(
     mesh: Mesh,
     fields: Mapping[str, Image | Field],
     mask: Image | None,
@@ -575,7 +575,6 @@ def _with_cell_fields(
     cells and voxels without own data.
     """
     kinds = field_kinds(about.get(KINDS_TEXT))
-    check_field_names(fields)
     for name, field in fields.items():
         check_field_name(name)
         if isinstance(field, Field):

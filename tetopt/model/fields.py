@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import keyword
 import re
 from collections.abc import Mapping
 from typing import Any
@@ -18,6 +19,7 @@ from tetopt.geometry.simplex import dihedral_angles, rho
 from tetopt.image import Image
 from tetopt.measure.judge import warn_of_other_mask
 from tetopt.mesh import Mesh
+from tetopt.model.formula import FORMULA_FUNCTIONS, INTENSITY, formula_text
 from tetopt.system.arrays import Arrays
 from tetopt.system.incoming import json_of
 
@@ -163,10 +165,18 @@ def field_kinds(text: Any) -> dict[str, str]:
 
 
 def check_field_name(name: str) -> None:
-    """Raise InputError for the name of a field that cells have anyway, or results."""
+    """Raise InputError for the name of a field that cells have anyway, or results, or that a
+    formula could not use.
+    """
     own = (*STANDARD_FIELDS, *STRESS_FIELDS, *VECTOR_FIELDS, *TENSOR_FIELDS, "von_mises_nodes")
     if _base_name(name) in own or re.fullmatch(r"(mean|variance)_\d+", name):
         raise InputError(f'field: "{name}" is the name of other data of cells; choose another')
+    is_taken = name in (INTENSITY, *FORMULA_FUNCTIONS) or keyword.iskeyword(name)
+    if is_taken or not (name.isidentifier() and name.isascii()):
+        raise InputError(
+            f"field: expected a name of letters, digits and _, other than h, of formulas and "
+            f'of functions, got "{formula_text(name)}"'
+        )
 
 
 def is_result(name: str) -> bool:

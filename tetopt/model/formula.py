@@ -5,7 +5,6 @@ executing code.
 from __future__ import annotations
 
 import ast
-import keyword
 import operator
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -131,22 +130,11 @@ def parse_range(text: str, fields: Iterable[str] = ()) -> Formula:
     return Formula(condition.names, lambda values: 1.0 - condition.function(values))
 
 
-def check_field_names(names: Iterable[str]) -> None:
-    """Raise InputError for a name that a formula could not use."""
-    for name in names:
-        is_taken = name in (INTENSITY, *FORMULA_FUNCTIONS) or keyword.iskeyword(name)
-        if is_taken or not (name.isidentifier() and name.isascii()):
-            raise InputError(
-                f"field: expected a name of letters, digits and _, other than h, of formulas and "
-                f'of functions, got "{_formula_text(name)}"'
-            )
-
-
 def _parse(text: str, names: frozenset[str], *, is_condition: bool = False) -> Formula:
     if len(text) > MOST_FORMULA_LETTERS:
         raise InputError(
             f"formula: expected at most {MOST_FORMULA_LETTERS} characters, got "
-            f'"{_formula_text(text[:1000])}"'
+            f'"{formula_text(text[:1000])}"'
         )
     try:
         with warnings.catch_warnings():
@@ -168,7 +156,7 @@ def _parse(text: str, names: frozenset[str], *, is_condition: bool = False) -> F
         what = "a range, such as 0.1 < h <= 1.8, of" if is_condition else ""
         raise InputError(
             f"formula: expected {what}{' ' * is_condition}{_parts(names)}, got "
-            f'"{_formula_text(text)}"'
+            f'"{formula_text(text)}"'
         ) from error
     used = {each.id for each in ast.walk(tree) if isinstance(each, ast.Name)}
     return Formula(names & used, value)
@@ -180,7 +168,7 @@ def _parts(names: frozenset[str]) -> str:
     return f"numbers, {known}, + - * / **, brackets and {', '.join(FORMULA_FUNCTIONS)}"
 
 
-def _formula_text(text: str) -> str:
+def formula_text(text: str) -> str:
     """Format a formula on one line, truncated."""
     line = " ".join(text.split())
     return line if len(line) <= 60 else f"{line[:57]}..."
@@ -209,7 +197,7 @@ def _compile_node(
     if depth > MOST_NESTED_OPERATIONS:
         raise InputError(
             f"formula: expected at most {MOST_NESTED_OPERATIONS} nested operations, got "
-            f'"{_formula_text(text)}"'
+            f'"{formula_text(text)}"'
         )
     match node:
         case ast.Constant(value=float() | int() as value) if not isinstance(value, bool):
@@ -237,12 +225,12 @@ def _compile_node(
             if len(operands) != count:
                 raise InputError(
                     f"formula: {name} takes {count} arguments, got {len(operands)} in "
-                    f'"{_formula_text(text)}"'
+                    f'"{formula_text(text)}"'
                 )
         case _:
             part = ast.get_source_segment(text.strip(), node) or text
             raise InputError(
-                f'formula: expected {_parts(names)}; cannot use "{_formula_text(part)}"'
+                f'formula: expected {_parts(names)}; cannot use "{formula_text(part)}"'
                 f"{_hints(node, names)}"
             )
     inner = [_compile_node(operand, text, names, depth + 1) for operand in operands]

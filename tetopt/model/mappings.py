@@ -145,9 +145,9 @@ def finite_values(mapping: ModulusMapping, intensities: ArrayLike | Named) -> Fl
     """
     values = mapped_values(mapping, intensities)
     if not (is_good := np.isfinite(values)).all():
-        at = [*_places(intensities, ~is_good).values()]
+        at, *_ = _places(intensities, ~is_good).values()
         raise InputError(
-            f"mapping: no value at {at[0]}; give a mapping (`nu`, `density`) defined in the whole mesh"
+            f"mapping: no value at {at}; give a mapping (`nu`, `density`) defined in the whole mesh"
         )
     return values
 
