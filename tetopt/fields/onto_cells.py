@@ -26,7 +26,7 @@ from tetopt.system.slabs import over_slabs
 LEAST_EIGENVALUE = 1e-3  # of a tensor's largest, chosen: far below tissue's, 0.05 and more
 EIGEN_SWEEPS = 8  # at most, of rotations; 4 or 5 are usual
 EIGEN_ROUNDING = 1e-20  # of the trace: a smaller rest has no effect on the least eigenvalue
-DIAGONAL, OFF_DIAGONAL = ([0, 1, 2], [0, 1, 2]), ([0, 0, 1], [1, 2, 2])
+ON_DIAGONAL, OFF_DIAGONAL = ([0, 1, 2], [0, 1, 2]), ([0, 0, 1], [1, 2, 2])  # of 3 x 3 matrices
 AVERAGED_AT_ONCE = 1 << 12  # voxels, whose temporary arrays fit into a core's cache
 
 
@@ -258,7 +258,7 @@ def _eigen(components: Floats) -> tuple[Floats, Floats]:
     a[:3] = components[NINE_OF_SIX].reshape(3, 3, -1)
     a[[3, 4, 5], [0, 1, 2]] = 1.0
     for _ in range(EIGEN_SWEEPS):
-        size, rest = (np.abs(a[rows]).sum(axis=0) for rows in (DIAGONAL, OFF_DIAGONAL))
+        size, rest = (np.abs(a[rows]).sum(axis=0) for rows in (ON_DIAGONAL, OFF_DIAGONAL))
         if not (rest > EIGEN_ROUNDING * size).any():
             break
         for p, q in zip(*OFF_DIAGONAL, strict=True):
@@ -274,4 +274,4 @@ def _eigen(components: Floats) -> tuple[Floats, Floats]:
                     sine * rows[p] + cosine * rows[q],
                 )
             a[[p, q], [q, p]] = 0.0
-    return a[DIAGONAL], a[3:]
+    return a[ON_DIAGONAL], a[3:]
