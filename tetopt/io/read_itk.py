@@ -69,14 +69,8 @@ def itk_components(path: Path) -> tuple[NDArray, Floats, Convention]:
     kind = next(iter(others.values()), "")
     if kind == "3d-masked-symmetric-matrix":
         data = np.where(data[..., :1] >= SURE_CONFIDENCE, data[..., 1:], np.nan)
-    return (
-        data,
-        affine,
-        Convention(
-            order="upper" if kind.endswith("symmetric-matrix") else None,
-            turn=turn,
-        ),
-    )
+    order = "upper" if kind.endswith("symmetric-matrix") else None
+    return data, affine, Convention(order=order, turn=turn)
 
 
 def _measurement_turn(fields: dict[str, str]) -> Floats | None:

@@ -216,8 +216,8 @@ def build_model(
     [2.0, 10.0]
     """
     choices = Choices(young, nu, density, average, _texts(sets), _texts(loads), bins, spacing)
-    choices = choices._replace(fields={} if fields is None else dict(fields))
-    choices = choices._replace(fibre=fibre, young_along=young_along, shear_along=shear_along)
+    choices = choices._replace(fields=fields or {}, fibre=fibre)
+    choices = choices._replace(young_along=young_along, shear_along=shear_along)
     if isinstance(mesh, MeshingResult):
         mesh, image, order, cell_data = _of_result(mesh, image, order, cell_data)
     image, whole, about = _voxels(image, mesh, about or {})
@@ -617,13 +617,11 @@ def _varying_moduli(
     has none.
     """
     average = choices.average
-    order = choices.order
     place = parse_average(average).place
     if place not in ("nodes", "gauss") or not (callable(young) or np.ndim(young) == 2):
         return None, None
-    if choices.fibre is not None:
-        return None, None
-    if (images := _images_for(young, "young", cells)) is None:
+    images = None if choices.fibre is not None else _images_for(young, "young", cells)
+    if images is None:
         return None, None
     if place == "nodes" and choices.bins is not None:
         raise InputError(
@@ -632,8 +630,8 @@ def _varying_moduli(
         )
     if place == "nodes":
         return node_young(images, cells.mesh, young), None
-    if order == 2 and choices.bins is None:
-        return None, element_young(images, cells.mesh, young, average, order)
+    if choices.order == 2 and choices.bins is None:
+        return None, element_young(images, cells.mesh, young, average, choices.order)
     return None, None
 
 
@@ -705,8 +703,8 @@ def _values(mapping: Any, name: str, cells: _ModelCells, average: str) -> Floats
 def _warn_of_empty_cells(mesh: Mesh, images: Mapping[str, Image]) -> None:
     """Warn if many cells contain no voxel of the grid on which a formula is averaged."""
     name = finest_of(images)
-    owner = np.unique(cell_of_voxel(images[name], mesh))
-    empty = 1.0 - int((owner >= 0).sum()) / len(mesh.cells)
+    owner = cell_of_voxel(images[name], mesh)
+    empty = 1.0 - len(np.unique(owner[owner >= 0])) / len(mesh.cells)
     if empty > EMPTY_FRACTION:
         what = "the image" if name == INTENSITY else f"field {name}"
         warn(

@@ -168,15 +168,15 @@ def check_field_name(name: str) -> None:
     """Raise InputError for the name of a field that cells have anyway, or results, or that a
     formula could not use.
     """
-    own = (*STANDARD_FIELDS, *STRESS_FIELDS, *VECTOR_FIELDS, *TENSOR_FIELDS, "von_mises_nodes")
-    if _base_name(name) in own or re.fullmatch(r"(mean|variance)_\d+", name):
-        raise InputError(f'field: "{name}" is the name of other data of cells; choose another')
     is_taken = name in (INTENSITY, *FORMULA_FUNCTIONS) or keyword.iskeyword(name)
     if is_taken or not (name.isidentifier() and name.isascii()):
         raise InputError(
             f"field: expected a name of letters, digits and _, other than h, of formulas and "
             f'of functions, got "{formula_text(name)}"'
         )
+    own = (*STANDARD_FIELDS, *STRESS_FIELDS, *VECTOR_FIELDS, *TENSOR_FIELDS, "von_mises_nodes")
+    if _base_name(name) in own or re.fullmatch(r"(mean|variance)_\d+", name):
+        raise InputError(f'field: "{name}" is the name of other data of cells; choose another')
 
 
 def is_result(name: str) -> bool:
