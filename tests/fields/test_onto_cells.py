@@ -226,6 +226,22 @@ def test_tensors_that_are_not_positive_are_repaired(mesh, components):
     assert np.linalg.eigvalsh(result.values.reshape(-1, 3, 3)).min() > 0.0
 
 
+@pytest.mark.parametrize("kind", ["vector", "direction", "tensor"])
+def test_a_voxel_without_one_component_has_no_data(kind, mesh, components):
+    rows = components[kind].copy()
+    if kind == "tensor":  # diagonal ones, which need no rotation
+        rows[..., ROWS != COLUMNS] = 0.0
+    for component in range(KINDS[kind]):
+        rows[component, ..., component] = np.nan
+    whole = np.where(np.isnan(rows).any(axis=-1, keepdims=True), np.nan, rows)
+    partly, wholly = (
+        tetopt.cell_field(tetopt.Field(each, sheared(), kind), mesh) for each in (rows, whole)
+    )
+    assert np.isfinite(partly.values).all()
+    assert_array_equal(partly.values, wholly.values)
+    assert partly[2:] == wholly[2:]
+
+
 def test_curved_cells_own_the_voxels_within_their_curves(mesh, components):
     """The mean over a curved cell is that over its straight pieces."""
     middles = mesh.points[numbered_edges(mesh.cells)[0]].mean(axis=1)

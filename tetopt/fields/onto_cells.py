@@ -163,6 +163,7 @@ def _features(rows: NDArray, kind: Kind, voxels: Ints) -> tuple[Floats, int]:
         for start in starts[first:stop]:
             part = slice(start, start + AVERAGED_AT_ONCE)
             components = rows[voxels[part]].T.astype(np.float64, order="C")
+            components[:, np.isnan(components).any(axis=0)] = np.nan
             if kind == "tensor":
                 features[:, part], is_repaired = _logarithms(components)
                 n_repaired += int(is_repaired.sum())
@@ -171,7 +172,7 @@ def _features(rows: NDArray, kind: Kind, voxels: Ints) -> tuple[Floats, int]:
                     unit = components / np.sqrt((components**2).sum(axis=0))
                 features[:, part] = unit[ROWS] * unit[COLUMNS]
             else:
-                features[:, part] = np.where(np.isnan(components).any(axis=0), np.nan, components)
+                features[:, part] = components
         return n_repaired
 
     return features, sum(over_slabs(fill, len(starts), features.size))
