@@ -182,6 +182,8 @@ mesh i.nii.gz -o b.vtu --field stress=v.nii.gz:vector@ras
     --field: field: "stress" is the name of other data of cells
 mesh i.nii.gz -o b.vtu --field a=v.nii.gz:vector@ras --field a=m.nii.gz
     --field: two are called "a"
+mesh i.nii.gz -o b.vtu --field V=v.nii.gz:direction@fsl --field V_coherence=m.nii.gz
+    --field: field: "V_coherence" is the name of the coherence of the directions V
 convert a.vtu b.vtu --field a=v.nii.gz
     v.nii.gz: the file has 3 volumes; choose one
 """

@@ -21,6 +21,7 @@ from tetopt.model.file import MASK_TEXT, MeshFile
 AVERAGES = ["mean", "geometric", "harmonic", "hill", "power:2", "gauss", "nodes", "linear"]
 TURN = np.array([[0.8, -0.6, 0.0], [0.48, 0.64, -0.6], [0.36, 0.48, 0.8]])
 IMAGE = tetopt.Image(np.random.default_rng(1).uniform(1.0, 9.0, (10, 9, 8)), np.diag([2, 2, 3, 1]))
+VECTORS = tetopt.Field(np.ones((*IMAGE.shape, 3)), IMAGE.affine, "direction")
 MESH = tetopt.lattice_mesh(IMAGE, nodes=200)
 
 
@@ -173,6 +174,9 @@ def test_a_mesh_partly_outside_a_field():
         ("3", {"max": IMAGE}, 'got "max"'),
         ("3", {"for": IMAGE}, 'got "for"'),
         ("3", {"a b": IMAGE}, 'got "a b"'),
+        ("3", {"fibre": VECTORS}, 'field: "fibre" is the name of other data'),
+        ("3", {"V": VECTORS, "V_coherence": IMAGE}, "coherence of the directions V; choose"),
+        ("3", {"V_coherence": IMAGE, "V": VECTORS}, "coherence of the directions V; choose"),
     ],
 )
 def test_formulas_that_are_refused(young, fields, words):

@@ -12,7 +12,7 @@ from tetopt.fields.field import Field, parse_kind
 from tetopt.image import Image
 from tetopt.io.components import load_field
 from tetopt.job.aligned import read_companion
-from tetopt.model.fields import check_field_name
+from tetopt.model.fields import check_field_name, check_other_names
 
 
 class FieldText(NamedTuple):
@@ -47,6 +47,8 @@ def parse_fields(texts: Iterable[str] | None) -> list[FieldText]:
             if name in parsed:
                 raise InputError(f'two are called "{name}"')
         parsed[name] = FieldText(name, Path(match[2]), kind)
+    with prefix_errors("`fields`"):
+        check_other_names({name: each.kind.partition("@")[0] for name, each in parsed.items()})
     return list(parsed.values())
 
 

@@ -32,7 +32,14 @@ from tetopt.model.averages import (
     node_young,
     parse_average,
 )
-from tetopt.model.fields import KINDS_TEXT, cell_fields, check_field_name, field_kinds
+from tetopt.model.fields import (
+    COHERENCE_SUFFIX,
+    KINDS_TEXT,
+    cell_fields,
+    check_field_name,
+    check_other_names,
+    field_kinds,
+)
 from tetopt.model.file import (
     MASK_TEXT,
     OWN_MASK,
@@ -575,6 +582,7 @@ def with_cell_fields(
     cells and voxels without own data.
     """
     kinds = field_kinds(about.get(KINDS_TEXT))
+    check_other_names({name: getattr(each, "kind", "scalar") for name, each in fields.items()})
     for name, field in fields.items():
         check_field_name(name)
         if isinstance(field, Field):
@@ -586,7 +594,7 @@ def with_cell_fields(
             own = cell_field(field, mesh, mask)
         cell_data = {**cell_data, name: own.values}
         if own.coherence is not None:
-            cell_data[f"{name}_coherence"] = own.coherence
+            cell_data[f"{name}{COHERENCE_SUFFIX}"] = own.coherence
         if words := field_words(own):
             warn(f"field {name}: {words}", Note)
     return cell_data, about | ({KINDS_TEXT: kinds} if kinds else {})

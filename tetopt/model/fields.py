@@ -47,6 +47,7 @@ STANDARD_FIELDS = (
     *("mean", "variance", "n_voxels", "min", "max", "volume", "rho", "min_dihedral"),
     *("label", "material", "nu", "density", "facets", "cells"),
 )
+COHERENCE_SUFFIX = "_coherence"  # after a name of directions
 KINDS_TEXT = "field_kinds"  # text of a mesh's file: the kinds of fields from files, by name
 HALF_TURN = np.array([-1.0, -1.0, 1.0])  # about z, from RAS+ to LPS+ or back
 
@@ -174,9 +175,19 @@ def check_field_name(name: str) -> None:
             f"field: expected a name of letters, digits and _, other than h, of formulas and "
             f'of functions, got "{formula_text(name)}"'
         )
-    own = (*STANDARD_FIELDS, *STRESS_FIELDS, *VECTOR_FIELDS, *TENSOR_FIELDS, "von_mises_nodes")
+    own = STANDARD_FIELDS + STRESS_FIELDS + VECTOR_FIELDS + DIRECTION_FIELDS + TENSOR_FIELDS
     if _base_name(name) in own or re.fullmatch(r"(mean|variance)_\d+", name):
         raise InputError(f'field: "{name}" is the name of other data of cells; choose another')
+
+
+def check_other_names(kinds: Mapping[str, str]) -> None:
+    """Raise InputError for a field of the name of the coherence of another, of kinds by name."""
+    for name, kind in kinds.items():
+        if kind == "direction" and (other := f"{name}{COHERENCE_SUFFIX}") in kinds:
+            raise InputError(
+                f'field: "{other}" is the name of the coherence of the directions {name}; choose '
+                "another"
+            )
 
 
 def is_result(name: str) -> bool:
