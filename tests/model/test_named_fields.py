@@ -235,6 +235,24 @@ def test_a_range_of_several_fields(average):
         build_model(MESH, young=3, nu="0.3 for 3 < a and b < 35", fields=fields, average=average)
 
 
+@pytest.mark.parametrize("average", ["mean", "nodes", "linear"])
+def test_a_range_of_a_finer_grid_leaves_the_law_as_it_is(average):
+    fields = {"co": oblique(slope), "mu": oblique(slope, (60, 60, 60), (0.7, 0.7, 0.7))}
+    with pytest.warns(UserWarning, match="young: .* outside of the range of the mapping, mu < 30"):
+        ranged = build_model(MESH, young="2*co**2 for mu < 30", fields=fields, average=average)
+    law = build_model(MESH, young="2*co**2", fields=fields, average=average)
+    assert_array_equal(young_of(ranged), young_of(law))
+    assert_array_equal(ranged.node_young, law.node_young)
+
+
+def test_the_intensity_in_a_range_alone_needs_an_image():
+    law = {"young": "2*co for h < 5", "fields": {"co": IMAGE}}
+    with refusal("young depends on intensity, but the mesh has no cell means; give the image"):
+        build_model(MESH, cell_data={}, **law)
+    with pytest.warns(UserWarning, match="young: .* outside of the range of the mapping, h < 5"):
+        build_model(MESH, IMAGE, **law)
+
+
 def test_a_law_within_its_range_is_silent(recwarn):
     build_model(MESH, IMAGE, young="3*h for 0 < h < 10")
     means = {"mean": np.full(len(MESH.cells), 4.0)}

@@ -548,11 +548,13 @@ def _warn_of_isotropic(mesh: Mesh, along: Along | None) -> None:
 def _with_fields(
     cells: _ModelCells, fields: Mapping[str, Image], laws: _Laws, mask: Image | None
 ) -> _ModelCells:
-    """Return the cells with the fields that laws name, each with a value in every voxel.
+    """Return the cells with the fields that laws and ranges name, each with a value in every voxel.
 
     A voxel without one, or outside the mask, has that of the nearest other.
     """
-    named = [law.names for law in laws if isinstance(law, Formula)]
+    formulas = [law for law in laws if isinstance(law, Formula)]
+    formulas += [law.outside for law in formulas if law.outside is not None]
+    named = [each.names for each in formulas]
     images = dict(cells.images)
     for name in sorted(fields.keys() & frozenset().union(*named)):
         with prefix_errors(f"field {name}"):
@@ -690,22 +692,28 @@ def _values(mapping: Any, name: str, cells: _ModelCells, average: str) -> Floats
     images = _images_for(mapping, name, cells)
     is_linear = parse_average(average).place == "linear"
     if images is not None:  # map each voxel, then average, as in Eq. (2)
-        _warn_of_range(mapping, name, cells, images, is_linear=is_linear)
+        _warn_of_range(mapping, name, cells, is_linear=is_linear)
         if name in MODULI:
             if isinstance(images, Mapping) and not is_linear:
                 _warn_of_empty_cells(cells.mesh, images)
             return cell_young(images, cells.mesh, mapping, average)
         return cell_values(images, cells.mesh, mapping, is_linear=is_linear)
-    if cells.mean is None:
-        raise InputError(
-            f"{name} depends on intensity, but the mesh has no cell means; give the image (`image`)"
-        )
+    mean = _mean_for(name, cells)
     if name in MODULI and average != DEFAULT_AVERAGE:
         raise InputError(f"average: {average} needs the image's voxels; give the image (`image`)")
     # The mapping of each cell's mean equals the mean of the mapping only where the mapping is
     # linear.
-    _warn_of_range(mapping, name, cells, None)
-    return young_from(mapping, cells.mean) if name in MODULI else mapped_values(mapping, cells.mean)
+    _warn_of_range(mapping, name, cells)
+    return young_from(mapping, mean) if name in MODULI else mapped_values(mapping, mean)
+
+
+def _mean_for(name: str, cells: _ModelCells) -> Floats:
+    """Return the mean of each cell, which a mapping is applied to without an image."""
+    if cells.mean is None:
+        raise InputError(
+            f"{name} depends on intensity, but the mesh has no cell means; give the image (`image`)"
+        )
+    return cells.mean
 
 
 def _warn_of_empty_cells(mesh: Mesh, images: Mapping[str, Image]) -> None:
@@ -721,15 +729,15 @@ def _warn_of_empty_cells(mesh: Mesh, images: Mapping[str, Image]) -> None:
         )
 
 
-def _warn_of_range(
-    mapping: Any, name: str, cells: _ModelCells, images: Images | None, *, is_linear: bool = False
-) -> None:
-    """Warn of the share of the mesh's volume outside of the range that a mapping states."""
+def _warn_of_range(mapping: Any, name: str, cells: _ModelCells, *, is_linear: bool = False) -> None:
+    """Warn of the share of the mesh's volume outside of the range that a mapping states, on the
+    grids that the range names.
+    """
     if not isinstance(mapping, Formula) or mapping.outside is None:
         return
+    images = _images_for(mapping.outside, name, cells)
     if images is None:
-        assert cells.mean is not None, "the caller requires one"
-        outside = mapping.outside(cells.mean)
+        outside = mapping.outside(_mean_for(name, cells))
     else:
         outside = cell_values(images, cells.mesh, mapping.outside, is_linear=is_linear)
     volumes = cells.mesh.cell_volumes

@@ -61,7 +61,7 @@ class Formula:
     Parameters
     ----------
     names : frozenset of str
-        "h" and the fields that it names.
+        "h" and the fields that it names, those of its range not among them unless it names none.
     function : callable
         From arrays by name to an array, or a number.
     outside : Formula, optional

@@ -349,7 +349,7 @@ def _within_range(
         mapping = Formula(
             frozenset({INTENSITY}), lambda values: mapped_values(table, values[INTENSITY])
         )
-    names = mapping.names | outside.names
+    names = mapping.names or outside.names  # a number's: it is the same on all grids
     return replace(mapping, names=names, outside=outside, range_text=text)
 
 
