@@ -208,7 +208,7 @@ def of_itk(transform, name):
         (lambda: write("t.mat", b"\x00\x01"), "t.mat: truncated or damaged"),
         (lambda: write("t.h5", "no"), "t.h5: truncated or damaged"),
         (lambda: write("a.1D", "1 0 0 0 0 1 0 0 0 0 0 0"), "its matrix is singular"),
-        (lambda: write("f.mat", "1 0 0 0 " * 4), "pass `fixed` and `image`"),
+        (lambda: write("f.mat", "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"), "pass `fixed` and `image`"),
         (lambda: of_itk(sitk.AffineTransform(2), "t.tfm"), "expected a transform in 3-D"),
         (lambda: of_itk(sitk.ScaleTransform(3), "t.mat"), "ScaleTransform: no such transform"),
         (lambda: saved(np.zeros((4, 4, 4))), r"expected a dense field, .*got \(4, 4, 4\)"),
@@ -223,6 +223,47 @@ def test_bad_files_are_refused_in_one_line(here, make, words):
         load_transform(name)
     assert str(caught.value).startswith(name)
     assert "\n" not in str(caught.value)
+
+
+def text_of_itk(kind, values, fixed):
+    lines = "#Insight Transform File V1.0\n#Transform 0\n"
+    words = [
+        f"{name}: {' '.join(map(str, each))}\n"
+        for name, each in zip(("Parameters", "FixedParameters"), (values, fixed), strict=True)
+    ]
+    return f"{lines}Transform: {kind}_double_3_3\n{''.join(words)}"
+
+
+UNIT = [1, 0, 0, 0, 1, 0, 0, 0, 1]
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "fixed", "words"),
+    [
+        *[
+            ("AffineTransform", [*UNIT, 1, 2, 3, 4][:n], [0] * 3, f"expected 12 .*got {n} and 3")
+            for n in (9, 10, 11, 13)
+        ],
+        ("AffineTransform", [*UNIT, 1, 2, 3], [], "12 parameters and 3 fixed ones, got 12 and 0"),
+        ("AffineTransform", [*UNIT, 1, 2, 3], [1], "got 12 and 1"),
+        ("Euler3DTransform", [0, 0], [0] * 3, "6 parameters and 3 or 4 fixed ones, got 2 and 3"),
+        ("Similarity3DTransform", [0] * 6, [0] * 3, "expected 7 parameters .*got 6"),
+        ("TranslationTransform", [1], [], "expected 3 parameters .*got 1"),
+        ("VersorRigid3DTransform", [1, 1, 0, 0, 0, 0], [0] * 3, "norm up to 1, got 1.414"),
+        ("DisplacementFieldTransform", [0] * 23, [2, 2, 2, 0, 0, 0, 1, 1, 1, *UNIT], "per voxel"),
+        ("DisplacementFieldTransform", [0] * 24, [2, 2, 2], "18 fixed ones, got 24 and 3"),
+        ("DisplacementFieldTransform", [0] * 24, [8, 1], "18 fixed ones, got 24 and 2"),
+    ],
+)
+def test_other_numbers_of_parameters_are_refused(here, kind, values, fixed, words):
+    with pytest.raises(InputError, match=rf"^t\.tfm: {kind}: .*{words}"):
+        load_transform(write("t.tfm", text_of_itk(kind, values, fixed)))
+
+
+def test_a_transposed_matrix_is_refused(here):
+    name = write("f.mat", "1 0 0 0 0 1 0 0 0 0 1 0 5 6 7 1")
+    with pytest.raises(InputError, match=r"last row is 0 0 0 1, got .*5\.0, 6\.0, 7\.0"):
+        load_transform(name, fixed=oblique(1, (4, 4, 4)), moving=oblique(1, (4, 4, 4)))
 
 
 def test_hdf5_without_h5py_names_it(here, monkeypatch):

@@ -33,6 +33,18 @@ from tetopt.system.incoming import regular_file
 LPS_AXES = np.diag([*HALF_TURN, 1.0])  # from RAS+, or back
 MATLAB_SUFFIX, HDF5_SUFFIXES, NIFTI_SUFFIXES = ".mat", (".h5", ".hdf5"), (".nii", ".nii.gz")
 TEXT_HEAD = "#Insight Transform File"
+FIELD_KIND = "DisplacementFieldTransform"
+# of ITK's kinds: the number of parameters (of a field, per voxel), and those of fixed parameters
+ITK_COUNTS = {
+    FIELD_KIND: (3, (18,)),
+    "AffineTransform": (12, (3,)),
+    "MatrixOffsetTransformBase": (12, (3,)),
+    "Euler3DTransform": (6, (3, 4)),
+    "VersorRigid3DTransform": (6, (3,)),
+    "Similarity3DTransform": (7, (3,)),
+    "TranslationTransform": (3, (0, 3)),
+}
+ROUNDING = 1e-6  # of numbers in text: a versor's length, the last row of a matrix
 VECTOR_AXES = {1007: HALF_TURN, 1006: np.ones(3)}  # of ITK's vectors, displacements
 FIELD_EDGE_VOXELS = 0.5 + 1e-6  # beyond the outer voxel centres, to the field's end
 LEAST_DETERMINANT = 1e-9  # of a linear transform, over the product of its columns' lengths
@@ -249,7 +261,8 @@ def _itk_step(kind: str, values: NDArray, fixed: NDArray) -> Linear | Dense:
     values, fixed = np.asarray(values, dtype=np.float64), np.asarray(fixed, dtype=np.float64)
     if not axes.endswith("3_3"):
         raise InputError(f"expected a transform in 3-D, got {kind}")
-    if name == "DisplacementFieldTransform":
+    _check_counts(name, values, fixed)
+    if name == FIELD_KIND:
         shape, origin = fixed[:3].astype(np.int64), fixed[3:6]
         affine = np.eye(4)
         affine[:3, :3] = fixed[9:18].reshape(3, 3) * fixed[6:9]
@@ -264,20 +277,43 @@ def _itk_step(kind: str, values: NDArray, fixed: NDArray) -> Linear | Dense:
         order, angles = ("ZYX", [z, y, x]) if is_zyx else ("ZXY", [z, x, y])
         turn, shift = Rotation.from_euler(order, angles).as_matrix(), values[3:6]
     elif name in ("VersorRigid3DTransform", "Similarity3DTransform"):
-        w = np.sqrt(max(1.0 - (values[:3] ** 2).sum(), 0.0))
+        if not (square := (values[:3] ** 2).sum()) <= 1.0 + ROUNDING:
+            raise InputError(
+                f"{name}: expected a versor of norm up to 1, got {np.sqrt(square):.4g}; write the "
+                "transform again"
+            )
+        w = np.sqrt(max(1.0 - square, 0.0))
         size = values[6] if name == "Similarity3DTransform" else 1.0
         turn, shift = size * Rotation.from_quat([*values[:3], w]).as_matrix(), values[3:6]
-    elif name == "TranslationTransform":
-        turn, shift, fixed = np.eye(3), values[:3], np.zeros(3)
     else:
-        raise InputError(
-            f"{name}: no such transform is read; write it as a dense field (antsApplyTransforms "
-            "-o [field.nii.gz,1], or 3D Slicer's Convert)"
-        )
+        turn, shift, fixed = np.eye(3), values, np.zeros(3)
     matrix = np.eye(4)
     matrix[:3, :3] = turn
     matrix[:3, 3] = shift + fixed[:3] - transform_vectors(fixed[:3], turn)
     return _check_linear(LPS_AXES @ matrix @ LPS_AXES)
+
+
+def _check_counts(name: str, values: NDArray, fixed: NDArray) -> None:
+    """Refuse a kind that is not in `ITK_COUNTS`, or has other numbers of parameters."""
+    if name not in ITK_COUNTS:
+        raise InputError(
+            f"{name}: no such transform is read; write it as a dense field (antsApplyTransforms "
+            "-o [field.nii.gz,1], or 3D Slicer's Convert)"
+        )
+    count, fixed_counts = ITK_COUNTS[name]
+    is_good, each = len(fixed) in fixed_counts, ""
+    if name == FIELD_KIND:
+        size, each = fixed[:3], " per voxel"
+        is_good &= bool(((size >= 1.0) & (size == np.rint(size))).all())
+        is_good &= count * size.prod() == len(values)
+    else:
+        is_good &= count == len(values)
+    if not is_good:
+        raise InputError(
+            f"{name}: expected {count} parameters{each} and "
+            f"{' or '.join(map(str, fixed_counts))} fixed ones, got {len(values)} and "
+            f"{len(fixed)}; write the transform again"
+        )
 
 
 def _matrix_of(numbers: NDArray, fixed: Image | None, moving: Image | None) -> Linear:
@@ -288,6 +324,11 @@ def _matrix_of(numbers: NDArray, fixed: Image | None, moving: Image | None) -> L
         raise InputError(
             f"expected a transform of ITK, ANTs, FSL (16 numbers), AFNI (12) or SPM, got "
             f"{len(numbers)} numbers"
+        )
+    if not np.allclose(numbers[12:], [0.0, 0.0, 0.0, 1.0], rtol=0.0, atol=ROUNDING):
+        raise InputError(
+            f"expected a matrix whose last row is 0 0 0 1, got {numbers[12:].tolist()}; is it "
+            "transposed, or no matrix of flirt's?"
         )
     if fixed is None or moving is None or {fixed.ndim, moving.ndim} != {3}:
         raise InputError("FSL's matrix is of two volumes' voxels: pass `fixed` and `image`")
