@@ -162,23 +162,46 @@ def test_afni_matrices_move_points_as_nitransforms_does(here):
     assert_allclose(load_transform("a.aff12.1D")(points), expected, rtol=0, atol=1e-9)
 
 
-def spm_deformation(name, affine, shape, move):
+def spm_deformation(name, affine, shape, move, about="Deformation"):
     """A field of places, as SPM's Segment and Normalise write."""
     index = np.moveaxis(np.indices(shape), 0, -1)
     places = move(index @ affine[:3, :3].T + affine[:3, 3])
     header = nibabel.Nifti1Header()
-    header["descrip"] = "Deformation"
+    header["descrip"] = about
     header.set_data_dtype(np.float64)
     nibabel.save(nibabel.Nifti1Image(places[:, :, :, None], affine, header), name)
 
 
-def test_spm_deformations_have_the_places_themselves(here):
+@pytest.mark.parametrize(
+    ("name", "about"), [("y_T1.nii", "Deformation"), ("d.nii", "Deformation"), ("iy_T1.nii", "")]
+)
+def test_spm_deformations_have_the_places_themselves(here, name, about):
     affine = oblique(1, (1, 1, 1)).affine.astype(np.float32).astype(float)
     A = np.eye(3) + 0.1 * rng.normal(size=(3, 3))
-    spm_deformation("y_T1.nii", affine, (12, 11, 10), lambda x: x @ A + [5.0, 0.0, -3.0])
+    spm_deformation(name, affine, (12, 11, 10), lambda x: x @ A + [5.0, 0.0, -3.0], about)
     points = rng.uniform(0, 9, size=(1000, 3)) @ affine[:3, :3].T + affine[:3, 3]
-    moved = load_transform("y_T1.nii")(points)
+    moved = load_transform(name)(points)
     assert_allclose(moved, points @ A + [5.0, 0.0, -3.0], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("shift", [0.0, 40.0])
+def test_displacements_with_the_name_of_spm_s_places_are_refused(here, shift):
+    """Also large ones, which alone would be places within the image."""
+    image = field_image()
+    moved = sitk.GetImageFromArray(sitk.GetArrayFromImage(image) + shift, isVector=True)
+    moved.CopyInformation(image)
+    sitk.WriteImage(moved, "y_to_x_1Warp.nii.gz")
+    with pytest.raises(InputError, match=r"named as SPM's deformation .* give .* another name"):
+        load_transform("y_to_x_1Warp.nii.gz")
+
+
+def test_niftyreg_s_deformation_is_refused(here):
+    spm_deformation("cpp.nii", np.eye(4), (5, 5, 5), lambda x: x, about="")
+    image = nibabel.load("cpp.nii")
+    image.header.set_intent("vector", name="NREG_TRANS")
+    nibabel.save(image, "cpp.nii.gz")
+    with pytest.raises(InputError, match=r"got NiftyReg's \(NREG_TRANS\); write .*reg_transform"):
+        load_transform("cpp.nii.gz")
 
 
 def write(name, text):

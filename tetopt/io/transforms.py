@@ -44,8 +44,11 @@ ITK_COUNTS = {
     "Similarity3DTransform": (7, (3,)),
     "TranslationTransform": (3, (0, 3)),
 }
-ROUNDING = 1e-6  # of numbers in text: a versor's length, the last row of a matrix
+TEXT_ROUNDING = 1e-6  # of numbers in text: a versor's length, the last row of a matrix
 VECTOR_AXES = {1007: HALF_TURN, 1006: np.ones(3)}  # of ITK's vectors, displacements
+NIFTYREG_NAME = "NREG_TRANS"  # of the intent: values are of many kinds, in RAS+
+# of SPM's deformations, whose values are places: in the description, and of the file's name
+SPM_WORD, SPM_PREFIXES = "eformation", ("y_", "iy_")
 FIELD_EDGE_VOXELS = 0.5 + 1e-6  # beyond the outer voxel centres, to the field's end
 LEAST_DETERMINANT = 1e-9  # of a linear transform, over the product of its columns' lengths
 INVERSE_MM = 1e-9  # of a coordinate: an inverse is exact to this
@@ -277,7 +280,7 @@ def _itk_step(kind: str, values: NDArray, fixed: NDArray) -> Linear | Dense:
         order, angles = ("ZYX", [z, y, x]) if is_zyx else ("ZXY", [z, x, y])
         turn, shift = Rotation.from_euler(order, angles).as_matrix(), values[3:6]
     elif name in ("VersorRigid3DTransform", "Similarity3DTransform"):
-        if not (square := (values[:3] ** 2).sum()) <= 1.0 + ROUNDING:
+        if not (square := (values[:3] ** 2).sum()) <= 1.0 + TEXT_ROUNDING:
             raise InputError(
                 f"{name}: expected a versor of norm up to 1, got {np.sqrt(square):.4g}; write the "
                 "transform again"
@@ -325,7 +328,7 @@ def _matrix_of(numbers: NDArray, fixed: Image | None, moving: Image | None) -> L
             f"expected a transform of ITK, ANTs, FSL (16 numbers), AFNI (12) or SPM, got "
             f"{len(numbers)} numbers"
         )
-    if not np.allclose(numbers[12:], [0.0, 0.0, 0.0, 1.0], rtol=0.0, atol=ROUNDING):
+    if not np.allclose(numbers[12:], [0.0, 0.0, 0.0, 1.0], rtol=0.0, atol=TEXT_ROUNDING):
         raise InputError(
             f"expected a matrix whose last row is 0 0 0 1, got {numbers[12:].tolist()}; is it "
             "transposed, or no matrix of flirt's?"
@@ -356,16 +359,29 @@ def _check_linear(matrix: Floats) -> Linear:
 
 def _dense_of(path: Path) -> Dense:
     """Return the dense field in a NIfTI file: displacements of ITK's, or SPM's deformation."""
-    values, affine, intent, is_deformation = read_apart(_read_nifti, path, library="nibabel")
+    values, affine, intent, name, about = read_apart(_read_nifti, path, library="nibabel")
     if values.ndim != 5 or values.shape[3:] != (1, 3) or min(values.shape) < 1:
         raise InputError(
             f"expected a dense field, (i, j, k, 1, 3) values, got {values.shape}; of fnirt, write "
             "one with convertwarp and ITK's tools"
         )
+    if name == NIFTYREG_NAME:
+        raise InputError(
+            f"expected displacements of ITK's or SPM's deformation, got NiftyReg's ({name}); write "
+            "its displacements by reg_transform -disp, negate their x and y, and clear intent_name"
+        )
     values = np.asarray(values[..., 0, :], dtype=np.float64)
-    if is_deformation:
-        index = np.moveaxis(np.indices(values.shape[:3], dtype=np.float64), 0, -1)
-        return Dense(values - Linear(affine)(index), affine)
+    index = np.moveaxis(np.indices(values.shape[:3], dtype=np.float64), 0, -1)
+    shifts = values - Linear(affine)(index)
+    if SPM_WORD in about:
+        return Dense(shifts, affine)
+    if path.name.startswith(SPM_PREFIXES):
+        if _spread(shifts) < _spread(values):
+            return Dense(shifts, affine)
+        raise InputError(
+            "named as SPM's deformation (y_, iy_), whose values are places, but its values vary as "
+            "displacements do; give a file of displacements another name"
+        )
     if intent not in VECTOR_AXES:
         raise InputError(
             f"its vectors' axes are not stated: expected the intent 1007 of ITK's fields, or SPM's "
@@ -374,11 +390,19 @@ def _dense_of(path: Path) -> Dense:
     return Dense(values * VECTOR_AXES[intent], affine)
 
 
-def _read_nifti(path: str) -> tuple[NDArray, NDArray, int, bool]:
-    """Return values, affine, intent, and whether they are places, as SPM's; runs in a child."""
-    image: Any = nibabel.load(path)
-    header = image.header
-    is_places = Path(path).name.startswith(("y_", "iy_")) or b"eformation" in bytes(
-        header["descrip"]
+def _spread(vectors: Floats) -> float:
+    """Return the median distance of vectors (..., 3) from their median, without those of NaN."""
+    rows = vectors[np.isfinite(vectors).all(axis=-1)]
+    return (
+        float(np.median(np.linalg.norm(rows - np.median(rows, axis=0), axis=1)))
+        if len(rows)
+        else 0.0
     )
-    return np.asanyarray(image.dataobj), image.affine, int(header["intent_code"]), is_places
+
+
+def _read_nifti(path: str) -> tuple[NDArray, NDArray, int, str, str]:
+    """Return values, affine, intent, its name, and the description; runs in a child."""
+    image: Any = nibabel.load(path)
+    texts = [bytes(image.header[key]).decode("latin-1") for key in ("intent_name", "descrip")]
+    name, about = (text.strip("\0 ") for text in texts)
+    return np.asanyarray(image.dataobj), image.affine, int(image.header["intent_code"]), name, about
