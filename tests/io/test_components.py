@@ -9,6 +9,7 @@ import pytest
 import SimpleITK as sitk
 from dipy.reconst.utils import convert_tensors
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import refusal
 
 import tetopt
 from tetopt.fields.field import COLUMNS, NINE_OF_SIX, ROWS
@@ -147,6 +148,32 @@ def test_nrrd_states_axes_by_its_measurement_frame(six, space):
     nrrd("vector", six[..., :3], space, "measurement frame: (1,0,0) (0,1,0)\n")
     with pytest.raises(tetopt.InputError, match="measurement frame: expected three vectors"):
         tetopt.load_field("a.nrrd", "direction")
+
+
+@pytest.mark.parametrize(
+    "words", ["(0,0,0) (0,0,0) (0,0,0)", "(1,0,0) (0,1,0) (1,1,0)", "(nan,0,0) (0,1,0) (0,0,1)"]
+)
+def test_a_measurement_frame_in_a_plane_is_refused(six, words):
+    nrrd("vector", six[..., :3], more=f"measurement frame: {words}\n")
+    with refusal("a.nrrd: measurement frame: expected three vectors, not in one plane"):
+        tetopt.load_field("a.nrrd", "vector")
+
+
+def test_axes_other_than_those_of_the_header_are_refused(six):
+    """As is an order; the same axes may be given."""
+    upright = "measurement frame: (1,0,0) (0,1,0) (0,0,1)\n"
+    nrrd("vector", six[..., :3], more=upright)
+    alone = tetopt.load_field("a.nrrd", "vector").data
+    assert_array_equal(tetopt.load_field("a.nrrd", "vector@lps").data, alone)
+    for kind in ("vector@ras", "vector@fsl"):
+        with refusal(f"a.nrrd: its header states other axes .* than {kind}; give vector without"):
+            tetopt.load_field("a.nrrd", kind)
+    nrrd("list", six, more=upright)
+    with refusal("order of its six components is not stated; give it, as tensor@lps-ORDER"):
+        tetopt.load_field("a.nrrd", "tensor")
+    with refusal("a.nrrd: its header states other axes"):
+        tetopt.load_field("a.nrrd", "tensor@dipy")
+    assert tetopt.load_field("a.nrrd", "tensor@itk").shape == SHAPE
 
 
 def test_our_own_vectors_on_voxels_come_back(six):

@@ -9,11 +9,13 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError, warn
 from tetopt.fields.field import (
+    AXES,
     COLUMNS,
     N_COMPONENTS,
     ROWS,
     Convention,
     Field,
+    axes_of,
     frame_words,
     parse_kind,
     world_field,
@@ -21,8 +23,10 @@ from tetopt.fields.field import (
 from tetopt.image import Image
 from tetopt.io.images import READERS, errors_named, load_image, reader_of
 from tetopt.io.volumes import collect_notes
+from tetopt.system.arrays import Floats
 
 SYMMETRIC_TO = 1e-4  # relative: of tensors in single precision
+SAME_AXES = 1e-3  # components of unit vectors, chosen: headers in text have few digits
 
 
 def load_field(path: str | Path, kind: str = "scalar") -> Image | Field:
@@ -86,7 +90,8 @@ def load_field(path: str | Path, kind: str = "scalar") -> Image | Field:
             raise InputError(
                 f"expected {N_COMPONENTS[word]} components for a {word}, got {n_components}"
             )
-        field = world_field(data, affine, word, _whole_convention(kind, frame, of_file))
+        convention = _whole_convention(kind, frame, of_file, affine)
+        field = world_field(data, affine, word, convention)
     for words in notes:
         warn(f"{path}: {words}")
     return field
@@ -102,11 +107,23 @@ def _six(data: NDArray, of_file: Convention) -> tuple[NDArray, Convention]:
     return rows[..., ROWS, COLUMNS], of_file._replace(order="upper")
 
 
-def _whole_convention(text: str, frame: Convention, of_file: Convention) -> Convention:
+def _whole_convention(
+    text: str, frame: Convention, of_file: Convention, affine: Floats
+) -> Convention:
     """Return what components mean, of the words and the file; raise InputError for what neither
-    states, or for a program's order in a file that states another.
+    states, for axes other than the file's, or for a program's order in a file that states another.
     """
     kind = text.partition("@")[0]
+    same = [
+        name
+        for name in AXES
+        if of_file.turn is None or np.allclose(axes_of(name, affine), of_file.turn, atol=SAME_AXES)
+    ]
+    if frame.axes is not None and frame.axes not in same:
+        raise InputError(
+            f"its header states other axes by its measurement frame than {text}; give {kind} "
+            "without axes, or mend the header"
+        )
     axes, turn = frame.axes, None if frame.axes else of_file.turn
     order = frame.order or of_file.order
     if axes is None and turn is None:
@@ -116,9 +133,9 @@ def _whole_convention(text: str, frame: Convention, of_file: Convention) -> Conv
         )
     if kind == "tensor" and order is None:
         raise InputError(
-            f"the order of its six components is not stated; give it, as tensor@{axes or 'ras'}-"
-            "ORDER: upper (xx xy xz yy yz zz), lower (xx xy yy xz yz zz), diagonal (xx yy zz xy xz "
-            "yz)"
+            "the order of its six components is not stated; give it, as "
+            f"tensor@{axes or ''.join(same[:1]) or 'AXES'}-ORDER: upper (xx xy xz yy yz zz), "
+            "lower (xx xy yy xz yz zz), diagonal (xx yy zz xy xz yz)"
         )
     if of_file.order not in (None, order) and "-" not in text:
         raise InputError(

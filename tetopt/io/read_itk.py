@@ -43,6 +43,7 @@ ITK_READERS = {
     ".mhd": "MetaImageIO",
 }
 SURE_CONFIDENCE = 0.5  # of a tensor, in NRRD's masked ones from 0 to 1
+LEAST_FRAME = 1e-6  # of a measurement frame's vectors, relative to their box, chosen
 OTHER_READERS = {".gipl": "GiplImageIO", ".gz": "GiplImageIO", ".vtk": "VTKImageIO"}
 
 
@@ -84,9 +85,13 @@ def _measurement_turn(fields: dict[str, str]) -> Floats | None:
         if re.fullmatch("[rl][ap][si]", letters) is None:
             raise ValueError(f"no axes of a body: {letters}")
         columns = np.array(numbers, dtype=np.float64).reshape(3, 3)
+        sizes = np.linalg.norm(columns, axis=1)
+        is_finite = np.isfinite(columns).all()
+        if not (is_finite and abs(np.linalg.det(columns)) > LEAST_FRAME * sizes.prod()):
+            raise ValueError("vectors in one plane, or not finite")
     except ValueError as error:
         raise InputError(
-            "measurement frame: expected three vectors in a space such as "
+            "measurement frame: expected three vectors, not in one plane, in a space such as "
             f'left-posterior-superior, got {words[:80]} in "{space[:40]}"'
         ) from error
     return columns.T * [[1.0 if letter in "ras" else -1.0] for letter in letters]
