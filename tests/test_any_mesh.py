@@ -122,6 +122,7 @@ WITH_IMAGE = {
         mesh, mesh.points, image, at="nodes", outside=0.0
     ),
     "warped_image": lambda image, mesh: tetopt.warped_image(mesh, 0.0 * mesh.points, image),
+    "cell_field": lambda image, mesh: tetopt.cell_field(image, mesh),
     "cell_labels": lambda image, mesh: tetopt.cell_labels(labels_of(image), mesh),
     "cell_moments": tetopt.cell_moments,
     "cell_of_voxel": tetopt.cell_of_voxel,

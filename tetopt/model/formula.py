@@ -179,7 +179,10 @@ def _hints(node: ast.expr, names: frozenset[str]) -> str:
     inside = list(ast.walk(node))
     used = {each.id for each in inside if isinstance(each, ast.Name)}
     unknown = sorted(used - names - FORMULA_FUNCTIONS.keys())
-    hints = [f"; write h for the intensity, or give `fields` {each}=FILE" for each in unknown[:1]]
+    hints = [
+        f"; write h for the intensity, or give `fields` {formula_text(each)}=FILE"
+        for each in unknown[:1]
+    ]
     hints += ["; write ** for powers"] * any(isinstance(each, ast.BitXor) for each in inside)
     if isinstance(node, ast.Compare | ast.BoolOp):
         hints.append("; a comparison is a condition of where(h < 1.2, 2*h, 3*h)")

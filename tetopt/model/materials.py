@@ -34,8 +34,7 @@ SPACINGS = get_args(Spacing)
 
 
 class BinningError(NamedTuple):
-    """The error of the bins' moduli, relative to the moduli of cells; or the angle between fibres
-    and those of their group, degrees.
+    """The error of bins: of moduli, relative to those of cells, or of fibres, in degrees.
 
     Parameters
     ----------
