@@ -31,7 +31,8 @@ def mesh(here):
 
 def test_fem_solves_with_the_named_fibres(mesh):
     moduli = "--young 3 --nu 0.4 --young-along 9 --shear-along 0.0025MPa"
-    run_command(f"fem a.vtu --fibre v1 {moduli} {LOADS} -o solved.vtu")
+    out, _ = run_command(f"fem a.vtu --fibre v1 {moduli} {LOADS} -o solved.vtu")
+    assert "along fibres, kPa" in out
     loaded = tetopt.load_mesh("a.vtu")
     words = LOADS.replace("--load ", "").split()
     moduli = {"young": 3, "nu": 0.4, "young_along": 9, "shear_along": 2.5}

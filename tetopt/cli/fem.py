@@ -93,6 +93,9 @@ def _of_what(solved: SolvedModel) -> Iterator[tuple[str, str]]:
         "modulus mapping",
         "from the mesh's file" if options.young is None else escape(options.young),
     )
+    if model.materials is not None and (along := model.materials.along) is not None:
+        shear = range_words(along.shear_along)
+        yield "along fibres, kPa", f"{range_words(along.young_along)}, shear modulus {shear}"
     if model.node_young is not None:
         yield "modulus within a cell", "linear between its nodes"
     elif model.gauss_young is not None:

@@ -391,7 +391,7 @@ def _moduli(
         raise InputError(
             f"average: expected moduli above 0 kPa for {average.words}, got 0 in {len(empty)} "
             f"voxels of the mesh, e.g. at ({place}) mm; give empty "
-            'space a small modulus, as in `young` "0:0.1,255:6", or use `average` mean'
+            'space a small modulus, as in `young` "max(3*h, 0.1)", or use `average` mean'
         )
     return field, owner
 

@@ -495,7 +495,7 @@ def _check_pairs(pairs: list[tuple[float, float]]) -> list[tuple[float, float]]:
 
 def check_young(young: Floats) -> Floats:
     """Return the moduli of cells, (M,); InputError unless all are above 0."""
-    hint = 'give empty space a small modulus, as in `young` "0:0.1,255:6"'
+    hint = 'give empty space a small modulus, as in `young` "max(3*h, 0.1)"'
     return check_cells("young", young, young > 0.0, "moduli above 0 kPa", hint)
 
 
