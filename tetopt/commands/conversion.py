@@ -53,6 +53,7 @@ from tetopt.model.file import (
     without_stale_results,
 )
 from tetopt.model.label_names import kept_labels
+from tetopt.model.loads import parse_load
 from tetopt.model.model import Model
 from tetopt.model.sets import (
     INTERFACE_PREFIX,
@@ -135,7 +136,7 @@ def convert_file(
             "`fields`"
         )
     if not solver.loads:
-        solver = replace(solver, loads=_loads_of_file(loaded, choice))
+        solver = replace(solver, loads=_loads_of_file(loaded, choice, move))
     loaded, what, is_other = voxels_of(loaded, mesh, image, part, part.labels)
     if move.transform and what is not None:
         tell_fit(before, loaded.mesh, what, image)
@@ -159,17 +160,21 @@ def convert_file(
     return Converted(model, solver, files | {"versions": versions()} | model_summary(model))
 
 
-def _loads_of_file(loaded: MeshFile, choice: LabelChoice) -> list[str] | None:
-    """Return the loads of a mesh's file; without some of its labels, their sets would be others:
-    warn instead.
+def _loads_of_file(loaded: MeshFile, choice: LabelChoice, move: MoveOptions) -> list[str] | None:
+    """Return the loads of a mesh's file. Without some of its labels, their sets would be others,
+    and moved by a transform, their vectors and lengths would be: warn instead.
     """
     with warnings_heard():
         loads = loads_in(loaded)
-    if choice == ALL_LABELS or not loads:
+    parsed = [parse_load(text, loaded.mesh.ndim) for text in loads]
+    if choice != ALL_LABELS and loads:
+        reason, remedy = "were for all labels", "those of the rest"
+    elif move.transform and any(len(load.numbers) > 1 and load.numbers.any() for load in parsed):
+        reason, remedy = "have the old image's axes and lengths", "those of the new one"
+    else:
         return loads
     warning(
-        f"the file's loads were for all labels and are left out: {list_names(loads)}; give those "
-        "of the rest (`load`)"
+        f"the file's loads {reason} and are left out: {list_names(loads)}; give {remedy} (`load`)"
     )
     return None
 
