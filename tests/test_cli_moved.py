@@ -6,13 +6,14 @@ import nibabel
 import numpy as np
 import pytest
 import SimpleITK as sitk
-from commands import assert_done, in_copy_of, numbers_in, refusals, run_command
+from commands import assert_done, assert_refuses, in_copy_of, numbers_in, refusals, run_command
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.ndimage import binary_dilation
 
 import tetopt
 from tetopt import Image, load_image, load_mesh, save_image, save_mesh
 from tetopt.geometry.simplex import volumes
+from tetopt.model.file import loads_in
 
 pytestmark = pytest.mark.full
 TURN = np.array(sitk.Euler3DTransform((0, 0, 0), 0.2, -0.1, 0.3).GetMatrix()).reshape(3, 3)
@@ -146,6 +147,10 @@ def test_inverted_cells_are_counted_and_untangled():
     n_inverted = int((volumes(move(before.points), before.cells) <= 0).sum())
     assert n_inverted > 0
     assert f"the transform inverts {n_inverted} cell" in said
+    off = np.linalg.norm(after.points - move(before.points), axis=1).max()
+    assert float(re.search(r"off their places for it, up to (\S+) mm", said)[1]) == pytest.approx(
+        off, rel=0.01
+    )
     assert (after.cell_volumes > 0).all()
     assert_array_equal(after.cells, before.cells)
 
@@ -157,6 +162,40 @@ def test_vectors_and_results_are_left_out():
     said = run_command("convert v.vtu moved.vtu --transform affine.mat").err
     assert "left out, as of the old image or its axes: fibre, von_mises" in said
     assert {"dose"} == set(load_mesh("moved.vtu").cell_data) - {"material"}
+
+
+def test_materials_with_fibres_are_left_out_as_one():
+    loaded = load_mesh("bare.vtu")
+    fibre = np.tile([1.0, 0, 0], (len(loaded.mesh.cells), 1))
+    save_mesh("f.vtu", loaded.mesh, {"v": fibre, "dose": fibre[:, 0]})
+    assert_done("convert f.vtu stiff.vtu --fibre v --young 3 --young-along 9")
+    said = run_command("convert stiff.vtu moved.vtu --transform affine.mat").err
+    words = re.search("left out, as of the old image or its axes: (.*)", said)[1].split(", ")
+    assert {"fibre", "young", "nu", "young_along", "shear_along"} <= set(words)
+    assert {"dose"} == set(load_mesh("moved.vtu").cell_data)
+    save_mesh("lost.vtu", loaded.mesh, {"young_along": 9.0 * fibre[:, 0]})
+    words = "convert lost.vtu o.vtu --fibre fibre --young 3 --young-along 9"
+    assert_refuses(words, "--fibre: expected data of cells with three numbers")
+
+
+@pytest.mark.parametrize(
+    ("loads", "is_kept"),
+    [
+        ("compress:2%", False),
+        ("hold:inferior gravity:0,0,-9810", False),
+        ("hold:inferior traction:superior:0,0,1", False),
+        ("hold:inferior pressure:superior:0.1", True),
+    ],
+)
+def test_loads_of_the_template_s_axes_or_lengths_are_left_out(loads, is_kept):
+    words = " ".join(f"--load {each}" for each in loads.split())
+    assert_done(f"convert bare.vtu loaded.vtu --young 3 --density 1000 {words}")
+    said = run_command("convert loaded.vtu moved.vtu --transform affine.mat").err
+    before, after = (loads_in(load_mesh(name)) for name in ("loaded.vtu", "moved.vtu"))
+    assert before
+    assert after == (before if is_kept else [])
+    lost = re.search("the file's loads .* left out: (.*); give .*--load", said)
+    assert (lost is None) if is_kept else lost[1] == ", ".join(before)
 
 
 def test_fsl_matrices_move_from_the_fixed_to_the_moving_image():

@@ -28,6 +28,7 @@ from tetopt.model.file import (
     PLACE_TEXT,
     TEXTS_KEPT,
     MeshFile,
+    material_fields,
     without_results,
 )
 from tetopt.system.arrays import Arrays, Floats
@@ -40,8 +41,8 @@ def move_file(loaded: MeshFile, move: MoveOptions, image: Path | None) -> MeshFi
     """Return a mesh's file with its nodes moved by the options' transforms; report the move.
 
     Cells, labels, sets, moduli and other scalars stay. Fields of the old image, results, vectors
-    and tensors do not, nor do the texts on the old image. Inverted cells are untangled, and folded
-    quadratic cells get straight edges.
+    and tensors do not, nor do materials with fibres and the texts on the old image. Inverted cells
+    are untangled, and folded quadratic cells get straight edges.
 
     Parameters
     ----------
@@ -75,9 +76,10 @@ def move_file(loaded: MeshFile, move: MoveOptions, image: Path | None) -> MeshFi
     way = np.linalg.norm(points - mesh.points, axis=1)
     note(f"nodes moved by {way.mean():.3g} mm, up to {way.max():.3g} mm")
     if n_inverted:
+        off = np.linalg.norm(points - there, axis=1)
         warning(
             f"the transform inverts {count_text(n_inverted, 'cell')}, which are untangled; "
-            f"{int((points != there).any(axis=1).sum())} nodes are off their places for it"
+            f"{np.count_nonzero(off)} nodes are off their places for it, up to {off.max():.3g} mm"
         )
     return _without_old(loaded._replace(mesh=moved))
 
@@ -97,11 +99,15 @@ def _moved_midpoints(mesh: Mesh, transform: Step, points: Floats, there: Floats)
 def _without_old(loaded: MeshFile) -> MeshFile:
     """Return a moved mesh's file without what is of its old place or image; note it."""
     rest = without_results(loaded)
+    # materials with fibres are of no use without them
+    stale = material_fields(rest.cell_data) if "young_along" in rest.cell_data else set()
     cells, nodes = (
         {
             name: rows
             for name, rows in data.items()
-            if (rows.ndim == 1 or name == GAUSS_MODULI) and not re.fullmatch(IMAGE_FIELD, name)
+            if (rows.ndim == 1 or name == GAUSS_MODULI)
+            and not re.fullmatch(IMAGE_FIELD, name)
+            and name not in stale
         }
         for data in (rest.cell_data, rest.point_data)
     )

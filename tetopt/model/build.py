@@ -490,7 +490,7 @@ def _with_own_fibres(choices: Choices, fields: Arrays) -> Choices:
     if "young_along" not in fields:
         return choices
     if isinstance(choices.fibre, str) and choices.fibre == "fibre":
-        return choices._replace(fibre=fields["fibre"])
+        return choices._replace(fibre=fields.get("fibre", "fibre"))
     if choices.fibre is None and choices.young is None:
         own: dict[str, Any] = {name: fields[name] for name in ALONG_FIELDS if name in fields}
         return choices._replace(**own)
