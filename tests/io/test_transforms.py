@@ -274,12 +274,13 @@ UNIT = [1, 0, 0, 0, 1, 0, 0, 0, 1]
         ("TranslationTransform", [1], [], "expected 3 parameters .*got 1"),
         ("VersorRigid3DTransform", [1, 1, 0, 0, 0, 0], [0] * 3, "norm up to 1, got 1.414"),
         ("DisplacementFieldTransform", [0] * 23, [2, 2, 2, 0, 0, 0, 1, 1, 1, *UNIT], "per voxel"),
+        ("DisplacementFieldTransform", [0] * 24, [2, 2, 2] + [0] * 15, "singular"),
         ("DisplacementFieldTransform", [0] * 24, [2, 2, 2], "18 fixed ones, got 24 and 3"),
         ("DisplacementFieldTransform", [0] * 24, [8, 1], "18 fixed ones, got 24 and 2"),
     ],
 )
 def test_other_numbers_of_parameters_are_refused(here, kind, values, fixed, words):
-    with pytest.raises(InputError, match=rf"^t\.tfm: {kind}: .*{words}"):
+    with pytest.raises(InputError, match=rf"^t\.tfm: .*{words}"):
         load_transform(write("t.tfm", text_of_itk(kind, values, fixed)))
 
 

@@ -271,7 +271,7 @@ def _itk_step(kind: str, values: NDArray, fixed: NDArray) -> Linear | Dense:
         affine[:3, :3] = fixed[9:18].reshape(3, 3) * fixed[6:9]
         affine[:3, 3] = origin
         shifts = values.reshape(*shape[::-1], 3).transpose(2, 1, 0, 3)
-        return Dense(shifts * HALF_TURN, LPS_AXES @ affine)
+        return Dense(shifts * HALF_TURN, _check_linear(LPS_AXES @ affine).matrix)
     if name in ("AffineTransform", "MatrixOffsetTransformBase"):
         turn, shift = values[:9].reshape(3, 3), values[9:12]
     elif name == "Euler3DTransform":
