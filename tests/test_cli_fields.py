@@ -72,6 +72,12 @@ def test_a_file_has_the_values_and_their_kinds(output):
     assert again.table("field_kinds") == loaded.table("field_kinds")
 
 
+@pytest.mark.parametrize("name", ["b.inp", "b.feb", "b.msh2", "b.mesh"])
+def test_a_file_without_data_of_cells_has_no_kinds_of_them(name):
+    run_command(f"convert a.vtu {name} {FIELDS} --young 3")
+    assert "field_kinds" not in Path(name).read_text(encoding="utf-8")
+
+
 def test_vtk_sees_the_axes_of_the_file():
     import pyvista
 

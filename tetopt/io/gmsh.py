@@ -59,7 +59,7 @@ from tetopt.io.tags import (
 from tetopt.io.text import comment_lines, names_apart, rows
 from tetopt.model.fields import KINDS_TEXT
 from tetopt.model.file import MASK_TEXT, MOVED, PLACE_TEXT
-from tetopt.model.model import Model, element_facets, elements
+from tetopt.model.model import Model, element_facets, elements, kind_lines
 from tetopt.model.sets import facet_triples
 from tetopt.system.arrays import Arrays, Floats, Ints
 
@@ -160,7 +160,7 @@ def gmsh41(model: Model) -> bytes:
     points, cells = _geometry(model)
     parts = [_by_entity(part) for part in _parts(grouped)]
     remarked = [*remarks(model if labels is not None else grouped), *_text_comments(model)]
-    comments = [*remarked, *comments, *_entity_comments(model, parts)]
+    comments = [*remarked, *kind_lines(model), *comments, *_entity_comments(model, parts)]
     counts = {part.dim: len(part.groups_of) for part in parts}
     n_elements = sum(len(part.numbers) for part in parts)
     return _file(

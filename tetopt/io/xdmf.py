@@ -107,7 +107,7 @@ from tetopt.io.tags import (
 from tetopt.io.text import rows, xml_attribute
 from tetopt.model.fields import NODE_MODULI, node_field
 from tetopt.model.loads import load_words
-from tetopt.model.model import Model, element_facets, elements, header_lines
+from tetopt.model.model import Model, element_facets, elements, header_lines, kind_lines
 from tetopt.model.sets import Sets
 from tetopt.system.arrays import Ints
 
@@ -156,7 +156,7 @@ def _mesh_grid(model: Model, others: str) -> str:
     references, and `others`.
     """
     fields = model.cell_data
-    named = [("about", line) for line in header_lines(model)] + [
+    named = [("about", line) for line in header_lines(model) + kind_lines(model)] + [
         ("load", load_words(load)) for load in model.loads
     ]
     if model.materials is not None:

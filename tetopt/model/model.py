@@ -403,11 +403,17 @@ def header_lines(model: Model) -> list[str]:
     if (labels := model.labels) is not None:
         names = label_set_names(np.unique(labels).tolist(), model.label_names)
         lines += [f"label {label}: {name}" for label, name in names.items()]
-    kinds = field_kinds(model.about.get(KINDS_TEXT))
-    if kinds := {name: kind for name, kind in kinds.items() if name in model.cell_data}:
-        lines.append(f"{KINDS_TEXT}: {json.dumps(kinds)}")
     # A line break in a file's name would end the comment.
     return [" ".join(line.split()) for line in lines]
+
+
+def kind_lines(model: Model) -> list[str]:
+    """Return a line on the kinds of fields among the data of cells, for a header of a file that has
+    these; empty without.
+    """
+    kinds = field_kinds(model.about.get(KINDS_TEXT))
+    kinds = {name: kind for name, kind in kinds.items() if name in model.cell_data}
+    return [f"{KINDS_TEXT}: {json.dumps(kinds)}"] if kinds else []
 
 
 def elements(model: Model) -> tuple[Floats, Ints]:
