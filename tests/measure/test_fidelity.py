@@ -24,6 +24,7 @@ from tetopt.measure.fidelity import (
     painted_voxels,
     surface_areas,
     surface_distances,
+    voxel_cells,
 )
 
 
@@ -462,3 +463,11 @@ def test_dice_by_majority(n, is_masked):
         one, other = inside & (image.data == row.label), painted == row.label
         dice = 2 * (one & other).sum() / (one.sum() + other.sum())
         assert row.overlap.dice_majority == dice != row.overlap.dice
+
+
+def test_cells_of_voxels_that_a_mesh_keeps_cannot_be_changed():
+    image = tetopt.Image(np.zeros((8, 8, 8)))
+    mesh = tetopt.lattice_mesh(image, nodes=60)
+    with pytest.raises(ValueError, match="read-only"):
+        voxel_cells(image, mesh)[0, 0, 0] = -1
+    assert voxel_cells(image, mesh) is voxel_cells(image, mesh)

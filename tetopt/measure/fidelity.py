@@ -959,7 +959,7 @@ def voxels_of(labels: Image, mask: Image | None = None) -> VoxelRecord:
 def voxel_cells(image: Image, mesh: Mesh) -> NDArray[np.int32]:
     """Number of the cell of each voxel, -1 outside the mesh; curved cells as their straight pieces.
 
-    The last grid's are kept with the mesh, for all of its measures.
+    The last grid's are kept with the mesh, read-only, for all of its measures.
     """
     with _OWNING:
         grid = image.shape, image.affine.tobytes()
@@ -967,6 +967,7 @@ def voxel_cells(image: Image, mesh: Mesh) -> NDArray[np.int32]:
         if known is None or known[0] != grid:
             pieces, n_pieces = mesh.straight_pieces()
             owner = cell_of_voxel(image, pieces).astype(np.int32) // np.int32(n_pieces)
+            owner.setflags(write=False)
             vars(mesh)[CELLS] = known = grid, owner
         return known[1]
 
