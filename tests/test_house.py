@@ -322,11 +322,14 @@ def test_variables_are_nouns():
 
 
 def test_few_functions_have_many_parameters():
-    """More than 8 parameters are named here, each; none has more than 16."""
+    """More than 8 parameters are named in `WIDE`, each; but for `build_model`, with 19, none has
+    more than 15.
+    """
     many = {name: count for name, count, _ in functions() if count > 8}
     assert many == WIDE
-    assert len(WIDE) <= 10
-    assert max(many.values()) <= 19
+    assert len(WIDE) <= 9
+    assert many.pop("tetopt.model.build.build_model") <= 19
+    assert max(many.values()) <= 15
 
 
 def test_no_circle_of_imports():
