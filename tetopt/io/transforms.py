@@ -76,7 +76,7 @@ class Dense(NamedTuple):
     """A field of displacements, linear between voxel centres."""
 
     shifts: Floats  # (i, j, k, 3), RAS+ mm
-    affine: Floats  # (4, 4), from voxel index to RAS+ mm
+    affine: NDArray[np.floating]  # (4, 4), from voxel index to RAS+ mm
 
     def __call__(self, points: Floats) -> Floats:
         """Map points (K, 3), mm; InputError for points that the field does not cover."""
