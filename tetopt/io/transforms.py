@@ -17,10 +17,8 @@ from typing import Any, NamedTuple
 
 import nibabel
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.io import loadmat
-from scipy.ndimage import map_coordinates
-from scipy.spatial.transform import Rotation
 
 from tetopt.errors import InputError, prefix_errors
 from tetopt.image import Image, transform_vectors
@@ -97,7 +95,9 @@ class Dense(NamedTuple):
         """Map points; those beyond the field have the shift of its nearest place."""
         index = Linear(self.affine).inverse()(points).T
         parts = np.moveaxis(self.shifts, -1, 0)
-        shifts = [map_coordinates(part, index, order=1, mode="nearest") for part in parts]
+        shifts = [
+            scipy.ndimage.map_coordinates(part, index, order=1, mode="nearest") for part in parts
+        ]
         return points + np.column_stack(shifts)
 
     def inverse(self) -> Step:
@@ -223,7 +223,7 @@ def _read_items(path: str) -> list[tuple[str, NDArray, NDArray]]:
         return _read_hdf5(path)
     raw = Path(path).read_bytes()
     if path.lower().endswith(MATLAB_SUFFIX) and b"\0" in raw:
-        table = {name: each for name, each in loadmat(path).items() if name[0] != "_"}
+        table = {name: each for name, each in scipy.io.loadmat(path).items() if name[0] != "_"}
         centre = np.asarray(table.pop("fixed", []), dtype=np.float64).ravel()
         return [(kind, np.ravel(each), centre) for kind, each in table.items()]
     text = raw.decode()
@@ -278,7 +278,10 @@ def _itk_step(kind: str, values: NDArray, fixed: NDArray) -> Linear | Dense:
         x, y, z = values[:3]
         is_zyx = len(fixed) > 3 and fixed[3] != 0.0
         order, angles = ("ZYX", [z, y, x]) if is_zyx else ("ZXY", [z, x, y])
-        turn, shift = Rotation.from_euler(order, angles).as_matrix(), values[3:6]
+        turn, shift = (
+            scipy.spatial.transform.Rotation.from_euler(order, angles).as_matrix(),
+            values[3:6],
+        )
     elif name in ("VersorRigid3DTransform", "Similarity3DTransform"):
         if not (square := (values[:3] ** 2).sum()) <= 1.0 + TEXT_ROUNDING:
             raise InputError(
@@ -287,7 +290,10 @@ def _itk_step(kind: str, values: NDArray, fixed: NDArray) -> Linear | Dense:
             )
         w = np.sqrt(max(1.0 - square, 0.0))
         size = values[6] if name == "Similarity3DTransform" else 1.0
-        turn, shift = size * Rotation.from_quat([*values[:3], w]).as_matrix(), values[3:6]
+        turn, shift = (
+            size * scipy.spatial.transform.Rotation.from_quat([*values[:3], w]).as_matrix(),
+            values[3:6],
+        )
     else:
         turn, shift, fixed = np.eye(3), values, np.zeros(3)
     matrix = np.eye(4)
