@@ -18,6 +18,7 @@ from tetopt.contents.align import is_in_mask
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.errors import InputError
 from tetopt.fields.field import COLUMNS, NINE_OF_SIX, ROWS, Field, Kind
+from tetopt.geometry.simplex import centroids
 from tetopt.image import Image, check_image
 from tetopt.mesh import Mesh
 from tetopt.system.arrays import Bools, Floats, Ints
@@ -121,9 +122,9 @@ def cell_field(field: Image | Field, mesh: Mesh, mask: Image | None = None) -> C
     n_cells = len(mesh.cells)
     means = _means(features, owner[voxels], n_cells)
     del features
-    centroids = mesh.points[mesh.cells].mean(axis=1)
+    middles = centroids(mesh.points, mesh.cells)
     small = np.flatnonzero(np.bincount(owner[owner >= 0], minlength=n_cells) == 0)
-    means[:, small] = _features_at(rows, kind, grid, is_in, centroids[small])
+    means[:, small] = _features_at(rows, kind, grid, is_in, middles[small])
     is_known = np.isfinite(means[0])
     if not is_known.any():
         where = "" if mask is None else " in the mask"
@@ -133,7 +134,7 @@ def cell_field(field: Image | Field, mesh: Mesh, mask: Image | None = None) -> C
     filled = np.flatnonzero(~is_known)
     known = np.flatnonzero(is_known)
     if len(filled):
-        nearest = scipy.spatial.KDTree(centroids[known]).query(centroids[filled])[1]
+        nearest = scipy.spatial.KDTree(middles[known]).query(middles[filled])[1]
         means[:, filled] = means[:, known[nearest]]
     values, coherence = _values(means, kind)
     return CellField(values, coherence, int(is_known[small].sum()), len(filled), n_repaired)
